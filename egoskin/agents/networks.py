@@ -1,0 +1,230 @@
+"""Actor and critic networks: the only file that names what they read.
+
+Each network takes a *list* of keys. Their tensors are never concatenated: the first
+layer is a sum of one linear map for each key, which equals one linear map of the
+concatenation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from tensordict.nn import InteractionType, TensorDictModule
+from torch import Tensor, nn
+from torchrl.modules import IndependentNormal, ProbabilisticActor
+
+# Keys whose values are a skin's signals; by default they enter as they are.
+_SIGNAL_KEYS = ("signal",)
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkConfig:
+    """Size and initialisation of actor and critic."""
+
+    hidden: tuple[int, ...] = (32, 32)
+    """Units of the hidden layers, the same for actor and critic."""
+    init_std: float = 0.5
+    """Standard deviation of the action at the start."""
+    std_bounds: tuple[float, float] = (0.1, 1.0)
+    """The standard deviation never leaves these bounds."""
+    normalize: Literal["body", "all"] = "body"
+    """Running normalisation of all but the skin's signals, or of everything."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for sizes and bounds that make no network."""
+        low, high = self.std_bounds
+        if not 0 < low <= self.init_std <= high:
+            raise ValueError(
+                f"need 0 < std_bounds[0] <= init_std <= std_bounds[1], got init_std "
+                f"{self.init_std} and std_bounds ({low}, {high})"
+            )
+        if not self.hidden or min(self.hidden) < 1:
+            raise ValueError(f"hidden must be positive sizes, got {self.hidden}")
+
+
+class RunningNorm(nn.Module):
+    """Normalises features by the running mean and variance of all data seen.
+
+    Statistics are kept in float64 and change only in `update`, never in a forward
+    pass: collection and learning see the same input.
+
+    Args:
+        size: Number of features.
+    """
+
+    # Normalised values beyond this many standard deviations are cut off.
+    LIMIT = 10.0
+
+    def __init__(self, size: int) -> None:
+        super().__init__()
+        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
+        self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
+        self.register_buffer("var", torch.ones(size, dtype=torch.float64))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return (x - mean) / std, cut off at ``LIMIT``, ``[*B, size]``."""
+        shift = self.mean.to(x.dtype)
+        scale = (self.var + 1e-8).rsqrt().to(x.dtype)
+        return ((x - shift) * scale).clamp(-self.LIMIT, self.LIMIT)
+
+    @torch.no_grad()
+    def update(self, x: Tensor) -> None:
+        """Take a batch of data into the statistics, ``[*B, size]``."""
+        x = x.reshape(-1, x.shape[-1]).double()
+        n, mean, var = float(len(x)), x.mean(0), x.var(0, unbiased=False)
+        total = self.count + n
+        delta = mean - self.mean
+        # Chan et al., parallel variance: M2 = M2a + M2b + delta^2 na nb / n.
+        m2 = self.var * self.count + var * n + delta**2 * self.count * n / total
+        self.mean += delta * n / total
+        self.var.copy_(m2 / total)
+        self.count.copy_(total)
+
+
+class KeyedMLP(nn.Module):
+    """A multilayer perceptron with ELU whose input is spread over several tensors.
+
+    Args:
+        sizes: Features of each input.
+        norms: Normaliser of each input, or None.
+        hidden: Units of the hidden layers.
+        out: Number of outputs.
+        out_gain: Gain of the orthogonal initialisation of the last layer.
+    """
+
+    def __init__(
+        self,
+        sizes: Sequence[int],
+        norms: Sequence[RunningNorm | None],
+        hidden: Sequence[int],
+        out: int,
+        out_gain: float,
+    ) -> None:
+        super().__init__()
+        self.norms = nn.ModuleList(n if n is not None else nn.Identity() for n in norms)
+        self.inputs = nn.ModuleList(
+            nn.Linear(size, hidden[0], bias=i == 0) for i, size in enumerate(sizes)
+        )
+        # One orthogonal matrix over all inputs, as for their concatenation.
+        joined = torch.empty(hidden[0], sum(sizes))
+        nn.init.orthogonal_(joined, gain=2**0.5)
+        for linear, part in zip(self.inputs, joined.split(list(sizes), 1), strict=True):
+            linear.weight.data.copy_(part)
+        nn.init.zeros_(self.inputs[0].bias)
+        layers: list[nn.Module] = [nn.ELU()]
+        for before, after in zip(hidden, hidden[1:], strict=False):
+            layers += [_orthogonal(before, after, 2**0.5), nn.ELU()]
+        layers.append(_orthogonal(hidden[-1], out, out_gain))
+        self.tail = nn.Sequential(*layers)
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """Return the outputs, ``[*B, out]``, from one ``[*B, size]`` for each input."""
+        total = None
+        for x, norm, linear in zip(inputs, self.norms, self.inputs, strict=True):
+            part = linear(norm(x))
+            total = part if total is None else total + part
+        return self.tail(total)
+
+
+def _orthogonal(before: int, after: int, gain: float) -> nn.Linear:
+    layer = nn.Linear(before, after)
+    nn.init.orthogonal_(layer.weight, gain=gain)
+    nn.init.zeros_(layer.bias)
+    return layer
+
+
+class GaussianHead(nn.Module):
+    """Mean from a network, standard deviation from a bounded parameter.
+
+    Args:
+        body: Network of the mean.
+        size: Number of actions.
+        init_std: Standard deviation at the start.
+        std_bounds: Its bounds.
+    """
+
+    def __init__(
+        self,
+        body: KeyedMLP,
+        size: int,
+        init_std: float,
+        std_bounds: tuple[float, float],
+    ) -> None:
+        super().__init__()
+        self.body = body
+        self.log_std = nn.Parameter(torch.full((size,), init_std).log())
+        self._bounds = tuple(torch.tensor(std_bounds).log().tolist())
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Return (loc, scale), ``[*B, J]`` each."""
+        loc = self.body(*inputs)
+        return loc, self.log_std.exp().expand_as(loc)
+
+    @torch.no_grad()
+    def bound_std(self) -> None:
+        """Bring the standard deviation back into its bounds, after each step."""
+        self.log_std.clamp_(*self._bounds)
+
+
+class Agent(nn.Module):
+    """Actor, critic and their normalisers.
+
+    The actor reads ``actor_keys`` and writes ``loc``, ``scale``, ``action``,
+    ``action_log_prob``; the critic reads ``critic_keys`` and writes ``state_value``.
+
+    Args:
+        sizes: Number of features of each key.
+        actor_keys: What the actor reads.
+        critic_keys: What the critic reads.
+        num_actions: ``J``.
+        config: Size and initialisation.
+    """
+
+    def __init__(
+        self,
+        sizes: Mapping[str, int],
+        actor_keys: Sequence[str],
+        critic_keys: Sequence[str],
+        num_actions: int,
+        config: NetworkConfig,
+    ) -> None:
+        super().__init__()
+        self.actor_keys, self.critic_keys = list(actor_keys), list(critic_keys)
+        normalized = [
+            key
+            for key in critic_keys
+            if config.normalize == "all" or key not in _SIGNAL_KEYS
+        ]
+        self.norms = nn.ModuleDict({key: RunningNorm(sizes[key]) for key in normalized})
+
+        def network(keys: Sequence[str], out: int, gain: float) -> KeyedMLP:
+            norms = [self.norms[k] if k in self.norms else None for k in keys]
+            return KeyedMLP([sizes[k] for k in keys], norms, config.hidden, out, gain)
+
+        # A small last layer: the first actions stay near the default pose.
+        self.head = GaussianHead(
+            network(actor_keys, num_actions, 0.01),
+            num_actions,
+            config.init_std,
+            config.std_bounds,
+        )
+        self.actor = ProbabilisticActor(
+            TensorDictModule(
+                self.head, in_keys=self.actor_keys, out_keys=["loc", "scale"]
+            ),
+            in_keys=["loc", "scale"],
+            out_keys=["action"],
+            distribution_class=IndependentNormal,
+            # TorchRL's default is the mean, with which PPO learns nothing.
+            default_interaction_type=InteractionType.RANDOM,
+            return_log_prob=True,
+            log_prob_key="action_log_prob",
+        )
+        self.critic = TensorDictModule(
+            network(critic_keys, 1, 1.0),
+            in_keys=self.critic_keys,
+            out_keys=["state_value"],
+        )

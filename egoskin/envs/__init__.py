@@ -1,0 +1,1 @@
+"""Batched environments: physics, throws, rewards. No sensor and no observation."""

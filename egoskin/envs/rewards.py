@@ -1,0 +1,81 @@
+"""Reward terms of the dodgeball task. None of them reads a sensor or a ball.
+
+Adding a term is adding a weight to `RewardConfig` and a line to `reward_terms`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+# Width of the upright bonus: exp(-|g_xy|^2 / 0.2), as in common humanoid tasks.
+_UPRIGHT_WIDTH = 0.2
+
+
+@dataclass(frozen=True, kw_only=True)
+class RewardConfig:
+    """Weights of the reward terms; a cost is negative. Units of reward per step."""
+
+    survival: float = 0.1
+    """For every control step without contact or fall."""
+    upright: float = 0.03
+    """Posture: times exp(-|gravity_xy|^2 / 0.2), the horizontal part in the base."""
+    posture: float = -0.02
+    """Posture: times the mean squared deviation from the default pose [rad^2]."""
+    energy: float = -2e-5
+    """Times the mechanical power, sum |torque x velocity| [W]."""
+    drift_speed: float = -0.01
+    """Drift: times the squared planar speed of the base [m^2/s^2]."""
+    drift_distance: float = -0.01
+    """Drift: times the squared planar distance from the start [m^2], at most 4."""
+    action_rate: float = -0.002
+    """Times the mean squared change of the action since the last step."""
+    termination: float = -0.5
+    """Once when the episode is terminated, by a ball or by a fall alike."""
+
+
+TERMS = tuple(field.name for field in fields(RewardConfig))
+"""Names of the terms, in the order of `reward_terms`."""
+
+
+def reward_terms(
+    config: RewardConfig,
+    *,
+    gravity_b: Tensor,
+    joint_deviation: Tensor,
+    power: Tensor,
+    base_lin_vel_w: Tensor,
+    displacement_w: Tensor,
+    action_change: Tensor,
+    terminated: Tensor,
+) -> Tensor:
+    """Return the weighted terms of the reward; the reward is their sum.
+
+    Args:
+        config: Weights.
+        gravity_b: Unit gravity in the base frame, ``[B, 3]``.
+        joint_deviation: q - q_default [rad], ``[B, J]``.
+        power: Mechanical power of the joints [W], ``[B]``.
+        base_lin_vel_w: Base velocity [m/s], ``[B, 3]``.
+        displacement_w: Planar displacement from the start [m], ``[B, 2]``.
+        action_change: Action less the previous action, ``[B, J]``.
+        terminated: Whether the episode ends here, ``[B]`` bool.
+
+    Returns:
+        Terms in the order of `TERMS`, ``[B, R]``.
+    """
+    alive = (~terminated).to(power.dtype)
+    tilt = gravity_b[:, :2].square().sum(-1)
+    values = {
+        "survival": alive,
+        "upright": (-tilt / _UPRIGHT_WIDTH).exp(),
+        "posture": joint_deviation.square().mean(-1),
+        "energy": power,
+        "drift_speed": base_lin_vel_w[:, :2].square().sum(-1),
+        "drift_distance": displacement_w.square().sum(-1).clamp(max=4.0),
+        "action_rate": action_change.square().mean(-1),
+        "termination": 1.0 - alive,
+    }
+    return torch.stack([getattr(config, name) * values[name] for name in TERMS], -1)

@@ -1,0 +1,252 @@
+"""Throws: which ball flies from where to which point of the body, and when.
+
+A throw is made of draws that do not depend on the robot (direction, distance, height,
+speed, interval, point aimed at) and is turned into a position and a velocity for the
+pose the robot has at release. One bank of draws therefore serves every policy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from egoskin.draws import Stream, uniform
+from egoskin.kinematics import LinkKinematics, rotate
+from egoskin.robots import RobotConfig
+from egoskin.shapes import Sphere
+from egoskin.surface import sample_surface
+
+GRAVITY = 9.81
+# Points of the body that throws are aimed at: dense enough that two neighbours are
+# 2 cm apart, and fixed, so that a bank of throws means the same for every run.
+_NUM_AIM_POINTS, _AIM_SEED = 4096, 0
+# A robot that runs away faster than this share of the ball's speed is led as if it
+# ran at it; otherwise no throw could reach it.
+_MAX_LEAD_RATIO = 0.9
+
+
+@dataclass(frozen=True, kw_only=True)
+class ThrowConfig:
+    """The balls and how they are thrown; every range is drawn from uniformly."""
+
+    radius: float = 0.15
+    """Radius of the balls [m]."""
+    mass: float = 0.4
+    """Mass of each ball [kg] (a touch ends the episode, so it hardly matters)."""
+    num_balls: int = 2
+    """Balls thrown in turn, so that a slow one is not snatched away in flight."""
+    interval: tuple[float, float] = (1.0, 2.0)
+    """Time from one throw to the next [s]; the first is at the start."""
+    height: tuple[float, float] = (2.0, 3.0)
+    """Height of release above ground [m]."""
+    distance: tuple[float, float] = (4.0, 6.0)
+    """Horizontal distance of release from the base [m]."""
+    speed: tuple[float, float] = (4.0, 8.0)
+    """Initial speed [m/s]: the horizontal one if ballistic, else the whole."""
+    azimuth_deg: tuple[float, float] = (-180.0, 180.0)
+    """Direction the ball comes from, relative to the robot's heading [deg]."""
+    aim: Literal["body", "box"] = "body"
+    """A random point of the body's surface (no shins, no feet), or of a box."""
+    box_half_width: float = 0.45
+    """For aim=box: largest sideways offset from the base [m]."""
+    box_height: tuple[float, float] = (0.3, 1.8)
+    """For aim=box: height above ground [m]."""
+    lead: float = 1.0
+    """Share of the base's planar velocity by which the aim is led."""
+    flight: Literal["ballistic", "straight"] = "ballistic"
+    """With gravity, or without weight at constant speed."""
+    on_ground: Literal["inactive", "bounce"] = "inactive"
+    """A ball that has touched the ground is out of play, or rolls on and counts."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for ranges and counts that cannot be thrown."""
+        ranges = ("interval", "height", "distance", "speed", "box_height")
+        for name in (*ranges, "azimuth_deg"):
+            low, high = getattr(self, name)
+            if not low <= high:
+                raise ValueError(f"{name} must be (low, high), got ({low}, {high})")
+            if name != "azimuth_deg" and low <= 0:
+                raise ValueError(f"{name} must be positive, got ({low}, {high})")
+        if self.num_balls < 1:
+            raise ValueError(f"num_balls must be at least 1, got {self.num_balls}")
+        if self.mass <= 0:
+            raise ValueError(f"mass must be positive, got {self.mass}")
+        if self.lead < 0:
+            raise ValueError(f"lead must not be negative, got {self.lead}")
+
+    @property
+    def balls(self) -> tuple[Sphere, ...]:
+        """The shapes in play."""
+        return (Sphere(radius=self.radius),) * self.num_balls
+
+
+@dataclass(frozen=True, kw_only=True)
+class Draw:
+    """The random part of throws, independent of the robot, ``[n]`` each."""
+
+    azimuth: Tensor
+    """Direction the ball comes from, relative to the heading [rad]."""
+    distance: Tensor
+    """Horizontal distance of release from the base [m]."""
+    height: Tensor
+    """Height of release [m]."""
+    speed: Tensor
+    """Initial speed [m/s]."""
+    interval: Tensor
+    """Time until the next throw [s]."""
+    target: Tensor
+    """Two uniform numbers in [0, 1) that choose the point aimed at, ``[n, 2]``."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Release:
+    """Thrown balls, ``[n, 3]`` each, in the world."""
+
+    position: Tensor
+    """Where the ball is released [m]."""
+    velocity: Tensor
+    """Its velocity [m/s]."""
+
+
+class Thrower:
+    """Draws throws and aims them.
+
+    Args:
+        config: The throws.
+        robot: The robot they are aimed at.
+        timestep: Physics time step [s].
+    """
+
+    def __init__(
+        self, config: ThrowConfig, robot: RobotConfig, timestep: float
+    ) -> None:
+        self.config = config
+        self._timestep = timestep
+        self._robot = robot
+
+    @cached_property
+    def _aim_points(self) -> tuple[LinkKinematics, Tensor, Tensor]:
+        """Kinematics of the links aimed at; link index and position of each point."""
+        robot = self._robot
+        links = [
+            name
+            for name in robot.links
+            if name not in robot.untargeted_links
+            and any(shape.link == name for shape in robot.primitives)
+        ]
+        points = sample_surface(robot, links, _NUM_AIM_POINTS, _AIM_SEED)
+        index = [links.index(robot.links[i]) for i in points.link]
+        return (
+            LinkKinematics(robot.chain, links),
+            torch.tensor(index),
+            torch.from_numpy(points.position).float(),
+        )
+
+    def aim_link(self, draw: Draw) -> list[str]:
+        """Return the name of the link each throw is aimed at (``aim="body"``)."""
+        kinematics, link, _ = self._aim_points
+        return [kinematics.links[i] for i in link[self._point_index(draw)].tolist()]
+
+    def draw(self, seed: int, row: Tensor, episode: Tensor, throw: Tensor) -> Draw:
+        """Return the random part of the n-th throws of some episodes.
+
+        Args:
+            seed: Seed of the run or of the bank.
+            row: Global agent row, ``[n]`` int64.
+            episode: Episode of that row, ``[n]`` int64.
+            throw: Index of the throw in the episode, ``[n]`` int64.
+
+        Returns:
+            Draws, a pure function of the arguments.
+        """
+        u = uniform(seed, Stream.THROW, row, episode, throw, 7)
+        config = self.config
+
+        def scale(column: int, bounds: tuple[float, float]) -> Tensor:
+            low, high = bounds
+            return low + (high - low) * u[:, column]
+
+        return Draw(
+            azimuth=torch.deg2rad(scale(0, config.azimuth_deg)),
+            distance=scale(1, config.distance),
+            height=scale(2, config.height),
+            speed=scale(3, config.speed),
+            interval=scale(4, config.interval),
+            target=u[:, 5:7],
+        )
+
+    def release(
+        self, draw: Draw, base_pose: Tensor, base_lin_vel_w: Tensor, joint_pos: Tensor
+    ) -> Release:
+        """Return position and velocity of balls thrown at robots as they are now.
+
+        A row's result is the same whichever rows are computed with it if their
+        number is a multiple of 16 (`egoskin.kinematics.pad_rows`).
+
+        Args:
+            draw: Draws of ``n`` throws.
+            base_pose: Base pose in the world, ``[n, 7]``.
+            base_lin_vel_w: Base velocity in the world [m/s], ``[n, 3]``.
+            joint_pos: Joint positions [rad], ``[n, J]``.
+
+        Returns:
+            The balls at release.
+        """
+        forward = rotate(
+            base_pose[:, 3:],
+            base_pose.new_tensor([1.0, 0, 0]).expand(len(base_pose), 3),
+        )
+        heading = torch.atan2(forward[:, 1], forward[:, 0])
+        bearing = heading + draw.azimuth
+        side = torch.stack((bearing.cos(), bearing.sin()), -1)
+        start = torch.cat(
+            (base_pose[:, :2] + draw.distance[:, None] * side, draw.height[:, None]), -1
+        )
+        target = self._target(draw, base_pose, joint_pos, side)
+
+        ballistic = self.config.flight == "ballistic"
+        run = self.config.lead * base_lin_vel_w
+        run = torch.cat((run[:, :2], torch.zeros_like(run[:, 2:])), -1)
+        run_speed = run.square().sum(-1).sqrt()
+        limit = _MAX_LEAD_RATIO * draw.speed / run_speed.clamp(min=1e-6)
+        run = run * limit.clamp(max=1.0)[:, None]
+        # Time T of arrival at the moving target: |r + v T| = s T, over the plane for
+        # a ballistic throw (s is its horizontal speed), in space for a straight one.
+        gap = target - start
+        used = 2 if ballistic else 3
+        r, v = gap[:, :used], run[:, :used]
+        rv, rr = (r * v).sum(-1), (r * r).sum(-1)
+        a = draw.speed.square() - (v * v).sum(-1)
+        time = (rv + (rv * rv + a * rr).sqrt()) / a
+        velocity = gap / time[:, None] + run
+        if ballistic:
+            # z(T) = z0 + vz T - g T (T + dt) / 2 meets the target: the integrator is
+            # semi-implicit, it falls g T dt / 2 (4 cm in a second) below the parabola.
+            velocity[:, 2] += 0.5 * GRAVITY * (time + self._timestep)
+        return Release(position=start, velocity=velocity)
+
+    def _point_index(self, draw: Draw) -> Tensor:
+        index = (draw.target[:, 0] * _NUM_AIM_POINTS).long()
+        return index.clamp(max=_NUM_AIM_POINTS - 1)
+
+    def _target(
+        self, draw: Draw, base_pose: Tensor, joint_pos: Tensor, side: Tensor
+    ) -> Tensor:
+        """Point in the world that each throw is aimed at [m], ``[n, 3]``."""
+        if self.config.aim == "box":
+            offset = (2 * draw.target[:, :1] - 1) * self.config.box_half_width
+            across = torch.stack((-side[:, 1], side[:, 0]), -1)
+            low, high = self.config.box_height
+            z = low + (high - low) * draw.target[:, 1:]
+            return torch.cat((base_pose[:, :2] + offset * across, z), -1)
+        kinematics, link, local = self._aim_points
+        index = self._point_index(draw)
+        position, rotation = kinematics.poses_b(joint_pos)
+        row = torch.arange(len(index))
+        turn, shift = rotation[row, link[index]], position[row, link[index]]
+        point_b = (turn * local[index][:, None, :]).sum(-1) + shift
+        return base_pose[:, :3] + rotate(base_pose[:, 3:], point_b)

@@ -1,0 +1,281 @@
+"""The one place where environment, sensors and observations meet."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import Compose, EnvBase, ExcludeTransform, TransformedEnv
+
+from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
+from egoskin.observations import Privileged, Proprioception
+from egoskin.robots import ROBOTS, RobotConfig
+from egoskin.sensors import (
+    Binary,
+    FieldSensor,
+    Localization,
+    Proximity,
+    Skin,
+    place_area_uniform,
+)
+from egoskin.transform import RowTransform
+from egoskin.workers import WorkerPool, default_num_workers
+
+# Raw state that neither the networks nor the metrics read: it stays in the workers.
+_RAW_KEYS = (
+    "base_pose",
+    "base_lin_vel_w",
+    "base_ang_vel_b",
+    "joint_pos",
+    "joint_vel",
+    "object_pose",
+    "object_lin_vel_w",
+    "object_active",
+    "tactile",
+    "displacement_w",
+    "previous_action",
+    "distance",
+    "object_detected",
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SkinConfig:
+    """Where the sensors sit."""
+
+    path: Path | None = None
+    """Skin file; None places sensors at random on the upper body."""
+    num_sensors: int = 64
+    """Number of sensors to place (ignored with a file)."""
+    seed: int = 0
+    """Seed of the placement (ignored with a file)."""
+
+    def build(self, robot: RobotConfig) -> Skin:
+        """Return the skin, checked against the robot.
+
+        Raises:
+            ValueError: If the file is no skin of this robot.
+        """
+        if self.path is None:
+            return place_area_uniform(robot, self.num_sensors, self.seed)
+        skin = Skin.load(self.path)
+        try:
+            skin.check_links(robot.links)
+        except ValueError as error:
+            raise ValueError(f"skin file {self.path}: {error}") from error
+        return skin
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorConfig:
+    """What the sensors of the skin measure, and what the actor is given of it."""
+
+    coverage: Literal["field", "none"] = "field"
+    """Spherical field, or no sensor at all (a blind robot)."""
+    signal: Literal["localization", "proximity", "binary"] = "proximity"
+    """Ball position if any sensor detects it; distance / range; or in range or not."""
+    range: float = 2.0
+    """Detection range [m], to the ball's surface; "inf" is allowed."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a range that is not positive."""
+        if not self.range > 0:
+            raise ValueError(f"the sensor range must be positive, got {self.range}")
+
+    def transforms(
+        self, robot: RobotConfig, skin: Skin, task: DodgeballConfig
+    ) -> list[RowTransform]:
+        """Return the transforms that write ``signal`` (none for a blind robot)."""
+        if self.coverage == "none":
+            return []
+        sensor = FieldSensor(skin, robot.chain, task.throws.balls, self.range)
+        signals = {
+            "localization": Localization,
+            "proximity": partial(Proximity, self.range),
+            "binary": Binary,
+        }
+        return [sensor, signals[self.signal]()]
+
+
+@dataclass(frozen=True, kw_only=True)
+class EnvConfig:
+    """Robot, task, skin, sensors: everything an environment is made of."""
+
+    robot: Literal["h1_2"] = "h1_2"
+    """Robot by name."""
+    task: DodgeballConfig = field(default_factory=DodgeballConfig)
+    """The dodgeball task."""
+    skin: SkinConfig = field(default_factory=SkinConfig)
+    """Where the sensors sit."""
+    sensor: SensorConfig = field(default_factory=SensorConfig)
+    """What they measure."""
+    privileged: Literal["objects", "velocity"] = "objects"
+    """What the critic alone sees: also the balls, or (the paper's) the velocity."""
+
+    @property
+    def robot_config(self) -> RobotConfig:
+        """The robot."""
+        return ROBOTS[self.robot]
+
+    @property
+    def actor_keys(self) -> list[str]:
+        """Keys the actor reads."""
+        blind = self.sensor.coverage == "none"
+        return ["observation"] if blind else ["observation", "signal"]
+
+    @property
+    def critic_keys(self) -> list[str]:
+        """Keys the critic reads."""
+        return [*self.actor_keys, "privileged_observation"]
+
+
+def make_worker_env(
+    config: EnvConfig,
+    skin: Skin,
+    *,
+    num_envs: int,
+    seed: int,
+    row_offset: int = 0,
+    num_threads: int = 1,
+    hold: bool = False,
+    keep_raw: bool = False,
+) -> TransformedEnv:
+    """Return the batched environment of one process, with its transforms.
+
+    Args:
+        config: What the environment is made of.
+        skin: The sensors.
+        num_envs: Number of rows.
+        seed: Seed of all draws.
+        row_offset: Global index of the first row.
+        num_threads: Physics threads.
+        hold: Whether the robot is held rigid in its default pose.
+        keep_raw: Whether the raw state stays in the output.
+    """
+    robot = config.robot_config
+    env = DodgeballEnv(
+        robot,
+        config.task,
+        num_envs=num_envs,
+        seed=seed,
+        row_offset=row_offset,
+        num_threads=num_threads,
+        hold=hold,
+    )
+    default = torch.from_numpy(robot.default_joint_pos)
+    transforms = [
+        Proprioception(default),
+        Privileged(config.privileged, len(robot.joints), config.task.throws.num_balls),
+        *config.sensor.transforms(robot, skin, config.task),
+    ]
+    if not keep_raw:
+        sensed = set(env.observation_spec.keys()).union(
+            *(map(str, t.out_keys) for t in transforms)
+        )
+        transforms.append(ExcludeTransform(*(k for k in _RAW_KEYS if k in sensed)))
+    return TransformedEnv(env, Compose(*transforms))
+
+
+def make_env(
+    config: EnvConfig,
+    skin: Skin,
+    *,
+    num_envs: int,
+    seed: int,
+    num_workers: int | None = None,
+    hold: bool = False,
+) -> WorkerPool:
+    """Return a ParallelEnv of ``num_workers`` processes, ``[W, num_envs / W]`` rows.
+
+    Args:
+        config: What the environment is made of.
+        skin: The sensors.
+        num_envs: Number of agents in all.
+        seed: Seed of all draws; results do not depend on the number of workers.
+        num_workers: Processes; by default the largest divisor of ``num_envs`` not
+            above the cores.
+        hold: Whether the robots are held rigid in their default pose.
+
+    Raises:
+        ValueError: If the workers do not divide the agents.
+    """
+    workers = check_num_workers(num_envs, num_workers)
+    rows = num_envs // workers
+    return WorkerPool(
+        [
+            partial(
+                make_worker_env,
+                config,
+                skin,
+                num_envs=rows,
+                seed=seed,
+                row_offset=i * rows,
+                hold=hold,
+            )
+            for i in range(workers)
+        ]
+    )
+
+
+def check_num_workers(num_envs: int, num_workers: int | None) -> int:
+    """Return the number of workers.
+
+    Raises:
+        ValueError: If it does not divide the number of agents; the text lists what
+            does.
+    """
+    if num_envs < 1:
+        raise ValueError(f"num_envs must be at least 1, got {num_envs}")
+    if num_workers is None:
+        return default_num_workers(num_envs)
+    if num_workers < 1 or num_envs % num_workers:
+        limit = max(64, num_workers)
+        fit = [n for n in range(1, min(num_envs, limit) + 1) if num_envs % n == 0]
+        raise ValueError(
+            f"num_workers must divide num_envs ({num_envs}), got {num_workers}; "
+            f"valid: {', '.join(map(str, fit))}"
+        )
+    return num_workers
+
+
+def save_env_state(
+    env: WorkerPool | EnvBase, root: TensorDictBase
+) -> dict[str, Tensor]:
+    """Return the state of all rows, to continue from bit for bit.
+
+    Args:
+        env: What `make_env` returned, stepped at least once or reset.
+        root: The tensordict the next step would start from.
+    """
+    states = list(env.simulation_state())
+    merged = {k: torch.cat([s[k] for s in states]) for k in states[0]}
+    flat = root.reshape(-1)
+    return {
+        **{f"simulation/{k}": v for k, v in merged.items()},
+        **{f"root/{k}": v.clone() for k, v in flat.items()},
+    }
+
+
+def load_env_state(env: WorkerPool, state: dict[str, Tensor]) -> TensorDictBase:
+    """Put an environment into a saved state; return the root tensordict to go on with.
+
+    Args:
+        env: A fresh environment of `make_env`, of any number of workers.
+        state: What `save_env_state` returned.
+    """
+    simulation = {
+        k.removeprefix("simulation/"): v
+        for k, v in state.items()
+        if k.startswith("simulation/")
+    }
+    root = env.reset()
+    list(env.load_simulation_state(simulation))
+    for key in root.keys():
+        value = state[f"root/{key}"]
+        root.set(key, value.reshape(root[key].shape).clone())
+    return root

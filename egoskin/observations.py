@@ -1,0 +1,118 @@
+"""What the actor feels of its own body, and what the critic alone is told."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from tensordict import NestedKey
+from torch import Tensor
+from torchrl.data import Composite, TensorSpec, Unbounded
+
+from egoskin.kinematics import rotate_inverse
+from egoskin.transform import RowTransform
+
+
+class Proprioception(RowTransform):
+    """Base angular velocity, joint positions and velocities, gravity.
+
+    Reads ``base_pose``, ``base_ang_vel_b``, ``joint_pos`` and ``joint_vel``; writes
+    ``observation [*B, 6 + 2 J]``: angular velocity [rad/s] 3, q - q_default [rad] J,
+    joint velocities [rad/s] J, unit gravity in the base frame 3.
+
+    Args:
+        default_joint_pos: Default pose [rad], ``[J]``.
+        in_keys: Keys of the inputs, in the order above.
+        out_keys: Key of the observation.
+    """
+
+    def __init__(
+        self,
+        default_joint_pos: Tensor,
+        in_keys: Sequence[NestedKey] = (
+            "base_pose",
+            "base_ang_vel_b",
+            "joint_pos",
+            "joint_vel",
+        ),
+        out_keys: Sequence[NestedKey] = ("observation",),
+    ) -> None:
+        super().__init__(in_keys, out_keys)
+        self.register_buffer("_default", default_joint_pos.float())
+
+    def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """Return the observation, ``[B, 6 + 2 J]``."""
+        base_pose, base_ang_vel_b, joint_pos, joint_vel = inputs
+        down = base_pose.new_tensor([0.0, 0.0, -1.0]).expand_as(base_ang_vel_b)
+        gravity_b = rotate_inverse(base_pose[:, 3:], down)
+        deviation = joint_pos - self._default
+        return (torch.cat((base_ang_vel_b, deviation, joint_vel, gravity_b), -1),)
+
+    def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
+        """Return the spec of the observation."""
+        size = 6 + 2 * len(self._default)
+        return (Unbounded(shape=(*spec.shape, size), dtype=torch.float32),)
+
+
+class Privileged(RowTransform):
+    """What the critic is told in training; the same for every skin.
+
+    Reads ``base_pose``, ``base_lin_vel_w`` and, unless told of the velocity alone,
+    ``displacement_w``, ``previous_action``, ``object_pose``, ``object_lin_vel_w`` and
+    ``object_active``. Writes ``privileged_observation``: base velocity [m/s] 3; then
+    displacement from the start [m] 3, previous action J, and for each object position
+    relative to the base [m] 3, velocity relative to the base [m/s] 3 and active flag,
+    zero where inactive. Vectors are in the base frame.
+
+    Args:
+        content: "objects" for everything above, "velocity" for the paper's critic.
+        num_joints: ``J``.
+        num_objects: ``O``.
+        out_keys: Key of the observation.
+    """
+
+    _VELOCITY_KEYS = ("base_pose", "base_lin_vel_w")
+    _OBJECT_KEYS = (
+        "displacement_w",
+        "previous_action",
+        "object_pose",
+        "object_lin_vel_w",
+        "object_active",
+    )
+
+    def __init__(
+        self,
+        content: Literal["objects", "velocity"],
+        num_joints: int,
+        num_objects: int,
+        out_keys: Sequence[NestedKey] = ("privileged_observation",),
+    ) -> None:
+        in_keys = self._VELOCITY_KEYS
+        self._size = 3
+        if content == "objects":
+            in_keys = (*in_keys, *self._OBJECT_KEYS)
+            self._size += 3 + num_joints + 7 * num_objects
+        super().__init__(in_keys, out_keys)
+
+    def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """Return the privileged observation, ``[B, P]``."""
+        base_pose, base_lin_vel_w, *rest = inputs
+        quat = base_pose[:, 3:]
+        parts = [rotate_inverse(quat, base_lin_vel_w)]
+        if rest:
+            displacement_w, previous_action, pose, velocity, active = rest
+            planar = torch.nn.functional.pad(displacement_w, (0, 1))
+            parts += [rotate_inverse(quat, planar), previous_action]
+            flag = active[..., None].to(pose.dtype)
+            turn = quat[:, None].expand(-1, pose.shape[1], -1)
+            position = rotate_inverse(turn, pose[..., :3] - base_pose[:, None, :3])
+            speed = rotate_inverse(turn, velocity - base_lin_vel_w[:, None])
+            parts.append(
+                torch.cat((position * flag, speed * flag, flag), -1).flatten(1)
+            )
+        return (torch.cat(parts, -1),)
+
+    def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
+        """Return the spec of the observation."""
+        return (Unbounded(shape=(*spec.shape, self._size), dtype=torch.float32),)

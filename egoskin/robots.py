@@ -1,0 +1,336 @@
+"""Robots: model file, kinematic chain, and the facts that no model file holds.
+
+Adding a robot is adding a `RobotConfig` here and its MJCF to ``assets/``. Names are
+resolved to indices once, in the properties of the configuration.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytorch_kinematics as pk
+import torch
+from pytorch_kinematics import frame as pk_frame
+
+ASSETS = Path(__file__).parent / "assets"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gain:
+    """PD gain of one joint: torque = kp (q* - q) - kd qdot."""
+
+    kp: float
+    """Stiffness [N m/rad]."""
+    kd: float
+    """Damping [N m s/rad]."""
+
+
+def resolve(table: Mapping[str, object], names: tuple[str, ...], what: str) -> list:
+    """Return the value of each name from a table keyed by name patterns.
+
+    Args:
+        table: Values by shell pattern (``*_knee_joint``).
+        names: Names to look up.
+        what: What the table holds, for the error text.
+
+    Returns:
+        One value for each name.
+
+    Raises:
+        ValueError: If a name matches no pattern or several, or a pattern matches
+            nothing.
+    """
+    values = []
+    for name in names:
+        matches = [p for p in table if fnmatch.fnmatchcase(name, p)]
+        if len(matches) != 1:
+            raise ValueError(
+                f"{what}: {name!r} must match exactly one of the patterns "
+                f"{', '.join(table)}; it matches {matches or 'none'}"
+            )
+        values.append(table[matches[0]])
+    for pattern in table:
+        if not fnmatch.filter(names, pattern):
+            raise ValueError(f"{what}: {pattern!r} matches none of {', '.join(names)}")
+    return values
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Primitive:
+    """A sphere, capsule or box fixed to a link."""
+
+    link: str
+    """Body that carries it."""
+    kind: str
+    """"sphere", "capsule" or "box"."""
+    size: np.ndarray
+    """MuJoCo's sizes [m], ``[3]``: radius; radius, half length; half extents."""
+    position: np.ndarray
+    """Centre in the link frame [m], ``[3]``."""
+    rotation: np.ndarray
+    """Orientation in the link frame (a capsule's axis is z), ``[3, 3]``."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RobotConfig:
+    """A legged robot with a floating base and position-controlled hinge joints."""
+
+    name: str
+    """Name by which configurations refer to the robot."""
+    model_path: Path
+    """MJCF of the robot alone: no floor, no actuators, no sensors."""
+    base: str
+    """Root body, which carries the free joint; the *robot's centre frame*."""
+    default_pose: Mapping[str, float]
+    """Joint positions [rad] of the default pose by joint name pattern; else 0."""
+    gains: Mapping[str, Mapping[str, Gain]]
+    """Named sets of PD gains by joint name pattern."""
+    feet: tuple[str, ...]
+    """Links that may touch the ground."""
+    skin_links: tuple[str, ...]
+    """Links that carry the proximity skin (the upper body)."""
+    untargeted_links: tuple[str, ...]
+    """Links that throws are not aimed at."""
+
+    @cached_property
+    def model(self) -> mujoco.MjModel:
+        """The robot alone, compiled."""
+        return mujoco.MjModel.from_xml_path(str(self.model_path))
+
+    def spec(self) -> mujoco.MjSpec:
+        """Return a fresh, editable specification of the robot."""
+        return mujoco.MjSpec.from_file(str(self.model_path))
+
+    @cached_property
+    def links(self) -> tuple[str, ...]:
+        """Bodies of the robot in MuJoCo's order (without the world)."""
+        return tuple(self.model.body(i).name for i in range(1, self.model.nbody))
+
+    @cached_property
+    def joints(self) -> tuple[str, ...]:
+        """Actuated hinge joints, in MuJoCo's order (without the free joint)."""
+        model = self.model
+        if model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
+            raise ValueError(f"{self.name}: the first joint must be the free joint")
+        if (model.jnt_type[1:] != mujoco.mjtJoint.mjJNT_HINGE).any():
+            raise ValueError(f"{self.name}: all joints but the first must be hinges")
+        return tuple(model.joint(i).name for i in range(1, model.njnt))
+
+    @cached_property
+    def default_joint_pos(self) -> np.ndarray:
+        """Joint positions of the default pose [rad], ``[J]``."""
+        rest = {
+            name: 0.0
+            for name in self.joints
+            if not any(fnmatch.fnmatchcase(name, p) for p in self.default_pose)
+        }
+        table = {**self.default_pose, **rest}
+        return np.array(resolve(table, self.joints, "default_pose"))
+
+    @cached_property
+    def torque_limit(self) -> np.ndarray:
+        """Largest torque of each joint [N m], ``[J]`` (``actuatorfrcrange``)."""
+        return self.model.jnt_actfrcrange[1:, 1].copy()
+
+    def joint_gains(self, gain_set: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return (kp [N m/rad], kd [N m s/rad]) of a named gain set, ``[J]`` each.
+
+        Raises:
+            ValueError: If the robot has no gain set of that name.
+        """
+        if gain_set not in self.gains:
+            raise ValueError(
+                f"{self.name} has no gain set {gain_set!r}; it has "
+                f"{', '.join(self.gains)}"
+            )
+        gains = resolve(self.gains[gain_set], self.joints, f"gains[{gain_set!r}]")
+        return np.array([g.kp for g in gains]), np.array([g.kd for g in gains])
+
+    @cached_property
+    def default_base_height(self) -> float:
+        """Height of the base when the default pose stands on the ground [m]."""
+        model, data = self.model, mujoco.MjData(self.model)
+        data.qpos[7:] = self.default_joint_pos
+        mujoco.mj_kinematics(model, data)
+        lowest = min(_lowest_point(model, data, g) for g in range(model.ngeom))
+        return float(data.qpos[2] - lowest)
+
+    @cached_property
+    def primitives(self) -> tuple[Primitive, ...]:
+        """The collision shapes, with their poses in the frames of their links."""
+        model, kinds = self.model, mujoco.mjtGeom
+        names = {
+            int(kinds.mjGEOM_SPHERE): "sphere",
+            int(kinds.mjGEOM_CAPSULE): "capsule",
+            int(kinds.mjGEOM_BOX): "box",
+        }
+        shapes = []
+        for geom in range(model.ngeom):
+            kind = names.get(int(model.geom_type[geom]))
+            if kind is None:
+                raise ValueError(
+                    f"geom {model.geom(geom).name!r} is no sphere, capsule or box"
+                )
+            rotation = np.zeros(9)
+            mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
+            shapes.append(
+                Primitive(
+                    link=model.body(int(model.geom_bodyid[geom])).name,
+                    kind=kind,
+                    size=model.geom_size[geom].copy(),
+                    position=model.geom_pos[geom].copy(),
+                    rotation=rotation.reshape(3, 3),
+                )
+            )
+        return tuple(shapes)
+
+    @cached_property
+    def chain(self) -> pk.Chain:
+        """Kinematic chain from the base, for pytorch-kinematics.
+
+        `pytorch_kinematics.build_chain_from_mjcf` fails with MuJoCo 4 (its table of
+        joint types is keyed by an enum that no longer equals an integer) and keeps
+        the root's offset; the chain is therefore built from the compiled model.
+        """
+        return build_chain(self.model, self.base)
+
+
+def _lowest_point(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
+    """Height of the lowest point of a primitive geom [m]."""
+    size, kind = model.geom_size[geom], model.geom_type[geom]
+    z_row = data.geom_xmat[geom].reshape(3, 3)[2]
+    if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
+        reach = size[0]
+    elif kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
+        reach = size[0] + size[1] * abs(z_row[2])
+    elif kind == mujoco.mjtGeom.mjGEOM_BOX:
+        reach = float(np.abs(z_row) @ size)
+    else:
+        name = model.geom(geom).name
+        raise ValueError(f"geom {name!r} is no sphere, capsule or box")
+    return float(data.geom_xpos[geom, 2] - reach)
+
+
+def build_chain(model: mujoco.MjModel, base: str) -> pk.Chain:
+    """Return the pytorch-kinematics chain of a MuJoCo model from a body downwards.
+
+    Args:
+        model: Compiled model with hinge joints at the origin of their bodies.
+        base: Root of the chain. Its own pose and free joint are not part of it.
+
+    Returns:
+        A chain whose frames are named after the bodies and whose joint order is that
+        of the model.
+
+    Raises:
+        ValueError: If a joint below the base is no hinge, has an offset or a
+            reference angle, or shares its body.
+    """
+
+    def build(body_id: int, is_root: bool) -> pk_frame.Frame:
+        body = model.body(body_id)
+        joint = pk_frame.Joint(f"{body.name}_fixed")
+        offset = None
+        if not is_root:
+            offset = pk.Transform3d(pos=body.pos.tolist(), rot=body.quat.tolist())
+            if body.jntnum[0] > 1:
+                raise ValueError(f"body {body.name!r} has several joints")
+            if body.jntnum[0] == 1:
+                hinge = model.joint(int(body.jntadr[0]))
+                reference = model.qpos0[int(hinge.qposadr[0])]
+                if hinge.type[0] != int(mujoco.mjtJoint.mjJNT_HINGE):
+                    raise ValueError(f"joint {hinge.name!r} is not a hinge")
+                if hinge.pos.any() or reference != 0:
+                    raise ValueError(
+                        f"joint {hinge.name!r} has pos {hinge.pos} and ref "
+                        f"{reference}; pytorch-kinematics supports only 0"
+                    )
+                joint = pk_frame.Joint(
+                    hinge.name,
+                    axis=torch.tensor(hinge.axis),
+                    joint_type="revolute",
+                    limits=tuple(hinge.range),
+                )
+        frame = pk_frame.Frame(
+            body.name, link=pk_frame.Link(body.name, offset=offset), joint=joint
+        )
+        frame.children = [
+            build(child, False)
+            for child in range(1, model.nbody)
+            if model.body_parentid[child] == body_id
+        ]
+        return frame
+
+    return pk.Chain(build(model.body(base).id, True))
+
+
+_ARMS = tuple(
+    f"{side}_{part}_link"
+    for side in ("left", "right")
+    for part in (
+        "shoulder_pitch",
+        "shoulder_roll",
+        "shoulder_yaw",
+        "elbow",
+        "wrist_roll",
+        "wrist_pitch",
+        "wrist_yaw",
+    )
+)
+_SHINS_AND_FEET = tuple(
+    f"{side}_{part}_link"
+    for side in ("left", "right")
+    for part in ("knee", "ankle_pitch", "ankle_roll")
+)
+
+H1_2 = RobotConfig(
+    name="h1_2",
+    model_path=ASSETS / "h1_2.xml",
+    base="pelvis",
+    # Stance of Unitree's training code for the H1-2.
+    default_pose={
+        "*_hip_pitch_joint": -0.16,
+        "*_knee_joint": 0.36,
+        "*_ankle_pitch_joint": -0.2,
+        "*_shoulder_pitch_joint": 0.4,
+        "*_elbow_joint": 0.3,
+    },
+    gains={
+        # Unitree's figures for the real robot.
+        "real": {
+            "*_hip_*_joint": Gain(kp=200.0, kd=2.5),
+            "*_knee_joint": Gain(kp=300.0, kd=4.0),
+            "*_ankle_*_joint": Gain(kp=40.0, kd=2.0),
+            "torso_joint": Gain(kp=300.0, kd=3.0),
+            "*_shoulder_*_joint": Gain(kp=120.0, kd=2.0),
+            "*_elbow_joint": Gain(kp=80.0, kd=1.0),
+        },
+        # kp = I w^2, kd = 2 zeta I w with the reflected rotor inertia I, w = 10 Hz
+        # and damping ratio zeta = 2.
+        "rotor_inertia": {
+            "*_hip_*_joint": Gain(kp=98.7, kd=6.3),
+            "*_knee_joint": Gain(kp=157.7, kd=10.1),
+            "*_ankle_*_joint": Gain(kp=19.7, kd=1.3),
+            "torso_joint": Gain(kp=98.7, kd=6.3),
+            "*_shoulder_pitch_joint": Gain(kp=19.7, kd=1.3),
+            "*_shoulder_roll_joint": Gain(kp=19.7, kd=1.3),
+            "*_shoulder_yaw_joint": Gain(kp=7.9, kd=0.5),
+            "*_elbow_joint": Gain(kp=7.9, kd=0.5),
+        },
+    },
+    feet=tuple(
+        f"{s}_ankle_{a}_link" for s in ("left", "right") for a in ("pitch", "roll")
+    ),
+    skin_links=("torso_link", *_ARMS),
+    untargeted_links=_SHINS_AND_FEET,
+)
+"""Unitree H1-2 without hands, wrists locked: 21 joints."""
+
+ROBOTS = {H1_2.name: H1_2}
+"""Robots by name, for configurations and policy files."""
