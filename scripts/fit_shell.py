@@ -5,8 +5,8 @@ A point of a mesh is *outer* if at least ``min_openness`` of the cosine-weighted
 over its outward hemisphere leave the robot without meeting any mesh: 0.15 rejects the
 floor of a round pit deeper than 1.2 diameters. A point of a primitive is outer if no
 other primitive of the robot contains it. Distances run between the outer points of
-one region, nearest to nearest, both ways. Points stand for surfaces, so a figure is a
-little too high, never too low: on a perfect fit it is half the points' spacing.
+one region, nearest to nearest, both ways. Points stand for surfaces, so a figure is
+too high, never too low: a perfect fit gives half the spacing of the points.
 
     python scripts/fit_shell.py --meshes DIR
 
@@ -20,22 +20,31 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 import trimesh
 import tyro
+from mujoco import mjtGeom as Kind
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 Array = NDArray[np.float64]
 Scene = tuple[mujoco.MjModel, mujoco.MjData]
+Span = tuple[float, float]  # lowest and highest z in the world [m]
+Frame = Any  # a body or geom view of MjData: has xpos [3] and xmat [9]
 
 MODEL = Path(__file__).parents[1] / "egoskin" / "assets" / "h1_2.xml"
 
 # Unitree's default pose [rad]; every other joint is at 0.
-POSE = dict(hip_pitch=-0.16, knee=0.36, ankle_pitch=-0.2, shoulder_pitch=0.4, elbow=0.3)
+POSE = {
+    "hip_pitch": -0.16,
+    "knee": 0.36,
+    "ankle_pitch": -0.2,
+    "shoulder_pitch": 0.4,
+    "elbow": 0.3,
+}
 
 # The torso's mesh carries neck and head. Its trunk is a box that ends here [m].
 NECK_HEIGHT = 0.485
@@ -64,7 +73,7 @@ class Options:
     model: Path = MODEL
     """The robot's MJCF, with primitive shapes."""
     samples: int = 8000
-    """Points drawn on the links of a region, on the meshes and on the primitives."""
+    """Points drawn on the meshes of a region; primitives, which are cheap, get more."""
     min_openness: float = 0.15
     """Share of the rays that must escape for a mesh point to be outer, 0 to 1."""
     limit_mm: float = 15.0
@@ -108,26 +117,22 @@ def default_pose(model: mujoco.MjModel) -> mujoco.MjData:
     return data
 
 
-def place(mesh: trimesh.Trimesh, position: Array, rotation: Array) -> trimesh.Trimesh:
-    """The mesh, turned by a rotation (``[9]``, row by row) and moved, in place."""
+def place(mesh: trimesh.Trimesh, frame: Frame) -> trimesh.Trimesh:
+    """The mesh, moved in place from a body's or geom's frame into the world's."""
     transform = np.eye(4)
-    transform[:3, :3], transform[:3, 3] = rotation.reshape(3, 3), position
+    transform[:3, :3], transform[:3, 3] = frame.xmat.reshape(3, 3), frame.xpos
     return mesh.apply_transform(transform)
 
 
 def mesh_scene(model: mujoco.MjModel, data: mujoco.MjData, meshes: Path) -> Scene:
-    """A static scene of every link's mesh where the pose puts it, for ray casts.
-
-    Raises:
-        FileNotFoundError: If a link of the robot has no mesh file.
-    """
+    """A static scene of every link's mesh where the pose puts it, for ray casts."""
     spec = mujoco.MjSpec()
     for body in range(1, model.nbody):
         link = model.body(body).name
         mesh = spec.add_mesh(name=link, file=str(mesh_file(meshes, link).resolve()))
         # A shell has an inertia even where its surface is not closed.
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-        geom = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=link)
+        geom = spec.worldbody.add_geom(type=Kind.mjGEOM_MESH, meshname=link)
         geom.pos, geom.quat = data.xpos[body], data.xquat[body]
         geom.contype = geom.conaffinity = 0  # spares the convex hulls
     scene = spec.compile()
@@ -139,10 +144,7 @@ def mesh_scene(model: mujoco.MjModel, data: mujoco.MjData, meshes: Path) -> Scen
 def openness(scene: Scene, points: Array, normals: Array) -> Array:
     """Share of the cosine-weighted outward rays that meet no mesh, ``[N]``.
 
-    Args:
-        scene: From :func:`mesh_scene`.
-        points: Points on the meshes, world frame [m], ``[N, 3]``.
-        normals: Unit outward normals there, ``[N, 3]``.
+    Points on the meshes [m] and unit normals there are ``[N, 3]``, world frame.
     """
     # Even spread over the unit sphere along a golden-angle spiral.
     k = np.arange(RAYS) + 0.5
@@ -169,41 +171,45 @@ def primitive_mesh(kind: int, size: Array) -> trimesh.Trimesh:
     Raises:
         ValueError: If the geom type is another one.
     """
-    if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
+    if kind == Kind.mjGEOM_SPHERE:
         return trimesh.creation.icosphere(subdivisions=4, radius=size[0])
-    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
+    if kind == Kind.mjGEOM_CAPSULE:
         mesh = trimesh.creation.capsule(2 * size[1], size[0], count=[64, 64])
         return mesh.apply_translation(-mesh.bounds.mean(axis=0))
-    if kind == mujoco.mjtGeom.mjGEOM_BOX:
+    if kind == Kind.mjGEOM_BOX:
         return trimesh.creation.box(2 * size)
-    name = mujoco.mjtGeom(kind).name
-    raise ValueError(f"the shell must be spheres, capsules and boxes, got {name}")
+    raise ValueError(f"expected spheres, capsules and boxes, got {Kind(kind).name}")
 
 
 def contains(kind: int, size: Array, points: Array) -> NDArray[np.bool_]:
     """Whether a sphere, capsule or box about the origin holds the points, ``[N]``."""
-    if kind == mujoco.mjtGeom.mjGEOM_BOX:
+    if kind == Kind.mjGEOM_BOX:
         return np.all(np.abs(points) < size - TOUCH, axis=1)
-    half = size[1] if kind == mujoco.mjtGeom.mjGEOM_CAPSULE else 0.0
+    half = size[1] if kind == Kind.mjGEOM_CAPSULE else 0.0
     # Distance to the capsule's core segment, which runs along z.
     z = points[:, 2] - np.clip(points[:, 2], -half, half)
     return np.hypot(np.hypot(points[:, 0], points[:, 1]), z) < size[0] - TOUCH
 
 
+def draw(mesh: trimesh.Trimesh, span: Span, count: int, seed: int) -> tuple:
+    """Points even by area (``[count, 3]``) in a span of heights, and their faces."""
+    # Enough for a span that holds a tenth of the area.
+    points, faces = trimesh.sample.sample_surface(mesh, 10 * count, seed=seed)
+    within = np.flatnonzero((points[:, 2] >= span[0]) & (points[:, 2] < span[1]))
+    return points[within[:count]], faces[within[:count]]
+
+
 def primitive_points(
-    model: mujoco.MjModel, data: mujoco.MjData, links: list[str], options: Options
+    robot: Scene, links: list[str], span: Span, options: Options
 ) -> tuple[Array, NDArray[np.int64]]:
     """Outer points (world [m], ``[N, 3]``) of the links' primitives and their geoms."""
+    model, data = robot
     kind, size = model.geom_type, model.geom_size
     bodies = [model.body(link).id for link in links]
     geoms = np.flatnonzero(np.isin(model.geom_bodyid, bodies))
-    meshes = [
-        place(primitive_mesh(kind[g], size[g]), data.geom_xpos[g], data.geom_xmat[g])
-        for g in geoms
-    ]
-    points, faces = trimesh.sample.sample_surface(
-        trimesh.util.concatenate(meshes), options.samples, seed=options.seed
-    )
+    meshes = [place(primitive_mesh(kind[g], size[g]), data.geom(g)) for g in geoms]
+    mesh = trimesh.util.concatenate(meshes)
+    points, faces = draw(mesh, span, 5 * options.samples, options.seed)
     owner = np.repeat(geoms, [len(mesh.faces) for mesh in meshes])[faces]
     outer = np.ones(len(points), dtype=bool)
     for g in range(model.ngeom):
@@ -213,46 +219,38 @@ def primitive_points(
 
 
 def mesh_points(
-    data: mujoco.MjData, scene: Scene, links: list[str], options: Options
+    robot: Scene, scene: Scene, links: list[str], span: Span, options: Options
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Points (world [m], ``[N, 3]``) of the links' meshes, and which are outer."""
-    meshes = [trimesh.load_mesh(mesh_file(options.meshes, link)) for link in links]
-    frames = [data.body(link) for link in links]
-    mesh = trimesh.util.concatenate(
-        [place(m, f.xpos, f.xmat) for m, f in zip(meshes, frames, strict=True)]
-    )
+    files = {link: mesh_file(options.meshes, link) for link in links}
+    meshes = [place(trimesh.load_mesh(f), robot[1].body(k)) for k, f in files.items()]
+    mesh = trimesh.util.concatenate(meshes)
     # Not the primitives' seed: equal draws on equal surfaces would hide the spacing.
-    points, faces = trimesh.sample.sample_surface(
-        mesh, options.samples, seed=options.seed + 1
-    )
+    points, faces = draw(mesh, span, options.samples, options.seed + 1)
     share = openness(scene, points, mesh.face_normals[faces])
     return points, share >= options.min_openness
 
 
 def measure(options: Options) -> Iterator[Fit]:
-    """Yields the fit of each region.
-
-    Raises:
-        FileNotFoundError: If the mesh directory or a link's mesh is missing.
-        ValueError: If the robot has a shape that is no sphere, capsule or box.
-    """
+    """Yields the fit of each region; raises as its parts do."""
     model = mujoco.MjModel.from_xml_path(str(options.model))
     data = default_pose(model)
     scene = mesh_scene(model, data, options.meshes)
     # The pose is upright, so heights in the torso's frame are heights in the world.
     neck = data.body("torso_link").xpos[2] + NECK_HEIGHT
-    heights = {"torso": (-np.inf, neck), "head": (neck, np.inf)}
+    spans = {"torso": (-np.inf, neck), "head": (neck, np.inf)}
     for region, links in REGIONS.items():
-        low, high = heights.get(region, (-np.inf, np.inf))
-        ours, owner = primitive_points(model, data, links, options)
-        mesh, outer = mesh_points(data, scene, links, options)
-        here = (ours[:, 2] >= low) & (ours[:, 2] < high)
-        there = (mesh[:, 2] >= low) & (mesh[:, 2] < high)
-        a, b = ours[here], mesh[there & outer]
-        ours_to_mesh, mesh_to_ours = cKDTree(b).query(a)[0], cKDTree(a).query(b)[0]
-        inner_share = 1.0 - float(outer[there].mean())
-        num_primitives = len(np.unique(owner[here]))
-        yield Fit(region, ours_to_mesh, mesh_to_ours, inner_share, num_primitives)
+        span = spans.get(region, (-np.inf, np.inf))
+        ours, owner = primitive_points((model, data), links, span, options)
+        points, outer = mesh_points((model, data), scene, links, span, options)
+        mesh = points[outer]
+        yield Fit(
+            region=region,
+            ours_to_mesh=cKDTree(mesh).query(ours)[0],
+            mesh_to_ours=cKDTree(ours).query(mesh)[0],
+            inner_share=1.0 - float(outer.mean()),
+            num_primitives=len(np.unique(owner)),
+        )
 
 
 def main(options: Options) -> int:

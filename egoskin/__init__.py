@@ -1,0 +1,63 @@
+"""egoskin: which proximity skin makes avoidance easy to learn?
+
+TensorDict keys, by who writes them. ``*B`` batch, ``J`` joints, ``L`` links, ``O``
+objects, ``S`` sensors; suffix ``_w`` world frame, ``_b`` base frame; quaternions are
+(w, x, y, z).
+
+=========================== ============= ============================= ==============
+key                         shape         content                       read by
+=========================== ============= ============================= ==============
+from `egoskin.envs.dodgeball.DodgeballEnv` (all its keys: its docstring)
+``base_pose``               ``[*B, 7]``   pose in the world [m]         sensors
+``joint_pos``               ``[*B, J]``   joint positions [rad]         sensors
+``object_pose``             ``[*B, O, 7]`` pose in the world [m]        sensors
+``object_active``           ``[*B, O]``   bool: in play                 sensors
+``tactile``                 ``[*B, L]``   bool: link touched something  -
+``reward``, ``done``, ...   ``[*B, 1]``   TorchRL's                     PPO
+from `egoskin.sensors.FieldSensor`
+``distance``                ``[*B, S]``   [m], inf: nothing in range    signals
+``object_detected``         ``[*B, O]``   bool: by any sensor           signals
+from `egoskin.sensors.Proximity`, ``Binary`` or ``Localization``
+``signal``                  ``[*B, S]``   or ``[*B, 3]`` (localization) actor, critic
+from `egoskin.observations`
+``observation``             ``[*B, 6+2J]`` proprioception               actor, critic
+``privileged_observation``  ``[*B, P]``   told in training only         critic
+from `egoskin.agents.networks.Agent`
+``action``                  ``[*B, J]``   see DodgeballEnv              env
+``action_log_prob``         ``[*B]``      of the action                 PPO
+``loc``, ``scale``          ``[*B, J]``   of the action's Gaussian      PPO
+``state_value``             ``[*B, 1]``   value of the state            PPO
+=========================== ============= ============================= ==============
+"""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING, Any
+
+# Threads of torch that wait in a busy loop take the cores from the physics. Read by
+# OpenMP when torch is first imported; whoever sets it himself is obeyed.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+if TYPE_CHECKING:
+    from egoskin.make import EnvConfig, make_env, make_worker_env
+    from egoskin.policies import Policy, load_policy
+
+_EXPORTS = {
+    "EnvConfig": "egoskin.make",
+    "make_env": "egoskin.make",
+    "make_worker_env": "egoskin.make",
+    "Policy": "egoskin.policies",
+    "load_policy": "egoskin.policies",
+}
+
+__all__ = ["EnvConfig", "Policy", "load_policy", "make_env", "make_worker_env"]
+
+
+def __getattr__(name: str) -> Any:
+    """Return a public name, importing its module when it is first asked for."""
+    if name not in _EXPORTS:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib import import_module
+
+    return getattr(import_module(_EXPORTS[name]), name)

@@ -1,0 +1,84 @@
+"""Named tensors with a JSON header in one file, written atomically.
+
+The format is safetensors: loading runs no code from the file.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+_HEADER = "egoskin"
+
+
+def save_tensors(
+    path: Path, tensors: Mapping[str, Tensor], header: Mapping[str, Any]
+) -> None:
+    """Write tensors and a header; the file is complete or as it was before.
+
+    Args:
+        path: File to write or replace.
+        tensors: Tensors by name.
+        header: JSON values.
+
+    Raises:
+        OSError: If it cannot be written; what stood there before is intact.
+    """
+    content = save(
+        {key: value.detach().cpu().contiguous() for key, value in tensors.items()},
+        metadata={_HEADER: json.dumps(header)},
+    )
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        with open(partial, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Return (tensors by name, header) of a file that `save_tensors` wrote.
+
+    Raises:
+        ValueError: If the file is missing, truncated or another format; the text
+            names it.
+    """
+    if not path.is_file():
+        raise ValueError(f"no such file: {path}")
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {key: file.get_tensor(key) for key in file.keys()}
+    except SafetensorError as error:
+        raise ValueError(
+            f"{path} is truncated or no checkpoint of egoskin ({error})"
+        ) from error
+    if _HEADER not in metadata:
+        raise ValueError(f"{path} was not written by egoskin")
+    return tensors, json.loads(metadata[_HEADER])
+
+
+def prefixed(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the tensors with a prefix and a slash before each name."""
+    return {f"{prefix}/{key}": value for key, value in tensors.items()}
+
+
+def part(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the tensors under a prefix, without it."""
+    start = f"{prefix}/"
+    return {k.removeprefix(start): v for k, v in tensors.items() if k.startswith(start)}

@@ -1,0 +1,257 @@
+"""A fixed bank of throws -> how well a policy dodges, with intervals.
+
+The bank of seed ``s`` is the draws of episode 0 of rows 0 to ``episodes - 1``: azimuth,
+distance, height, speed, interval, link and point aimed at. Draws are counter-based, so
+nothing is stored, and every policy, skin and number of workers meets the same throws.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+
+from egoskin.envs.throws import ThrowConfig
+from egoskin.make import EnvConfig, make_env
+from egoskin.sensors import Skin
+
+# Success is survival to this age; survival time is restricted to the other [s].
+SUCCESS_AGE, LONGEST = 3.0, 10.0
+# Two-sided 95 % quantile of the normal distribution.
+_Z = 1.959964
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """A mean with its 95 % interval."""
+
+    mean: float
+    """Mean."""
+    low: float
+    """Lower end of the interval."""
+    high: float
+    """Upper end of the interval."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Avoided:
+    """Balls avoided per ball that arrived; None if none arrived."""
+
+    first_ball: float | None
+    """The first, thrown while the robot still stands."""
+    later_balls: float | None
+    """All others, as long as the episode lasts."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluation:
+    """How a policy fares on a bank of throws.
+
+    ``success.mean + ended_by_ball + ended_by_fall + diverged`` is 1.
+    """
+
+    success: Estimate
+    """Share of episodes without contact, fall or divergence for 3 s (Wilson)."""
+    survival_time: Estimate
+    """Mean survival time [s], restricted to 10 s."""
+    ended_by_ball: float
+    """Share of episodes ended by a ball within 3 s."""
+    ended_by_fall: float
+    """Share ended by a fall within 3 s."""
+    diverged: float
+    """Share whose simulation failed within 3 s."""
+    rigid_success: float
+    """Success on the same bank of the robot held rigid in its default pose."""
+    avoided: Avoided
+    """Balls avoided per ball that arrived, within 10 s."""
+    episodes: int
+    """Size of the bank."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Episodes:
+    """How each episode of a bank ended, ``[N]`` each."""
+
+    steps: Tensor
+    """Length [control steps]."""
+    hit: Tensor
+    """Ended by a ball, bool."""
+    fallen: Tensor
+    """Ended by a fall (and no ball), bool."""
+    diverged: Tensor
+    """Ended by a failed simulation alone, bool."""
+    arrived: Tensor
+    """Balls that arrived: the first, later ones, ``[N, 2]``."""
+    avoided: Tensor
+    """Of these without a touch, ``[N, 2]``."""
+
+
+def wilson(successes: int, n: int) -> Estimate:
+    """Return a share with its 95 % Wilson interval."""
+    p, z2 = successes / n, _Z**2
+    centre = (p + z2 / (2 * n)) / (1 + z2 / n)
+    half = _Z / (1 + z2 / n) * math.sqrt(p * (1 - p) / n + z2 / (4 * n**2))
+    return Estimate(mean=p, low=min(centre - half, p), high=max(centre + half, p))
+
+
+def mean_estimate(values: Tensor) -> Estimate:
+    """Return the mean of samples ``[N]`` with its 95 % normal interval."""
+    values = values.double()
+    mean = float(values.mean())
+    half = _Z * float(values.std()) / math.sqrt(len(values)) if len(values) > 1 else 0.0
+    return Estimate(mean=mean, low=mean - half, high=mean + half)
+
+
+@torch.no_grad()
+def play_bank(
+    policy: nn.Module | TensorDictModuleBase | None,
+    config: EnvConfig,
+    skin: Skin,
+    *,
+    bank_seed: int,
+    episodes: int,
+    num_workers: int | None = None,
+    hold: bool = False,
+    on_step: Callable[[int, int], None] | None = None,
+) -> Episodes:
+    """Return how the episodes of a bank end.
+
+    Args:
+        policy: Writes ``action`` into a TensorDict; None is the zero action.
+        config: Robot, task, sensors.
+        skin: The skin.
+        bank_seed: Seed of the bank.
+        episodes: Number of episodes, all played side by side.
+        num_workers: Processes; the result does not depend on it.
+        hold: Whether the robot is held rigid in its default pose.
+        on_step: Called with (steps done, episodes still running).
+    """
+    env = make_env(
+        config,
+        skin,
+        num_envs=episodes,
+        seed=bank_seed,
+        num_workers=num_workers,
+        hold=hold,
+    )
+    steps = torch.zeros(episodes, dtype=torch.int64)
+    running = torch.ones(episodes, dtype=torch.bool)
+    ends = {k: torch.zeros(episodes, dtype=torch.bool) for k in ("hit", "fallen")}
+    ends["diverged"] = ends["hit"].clone()
+    balls = {k: torch.zeros(episodes, 2) for k in ("balls_arrived", "balls_avoided")}
+    try:
+        root: TensorDictBase = env.reset()
+        for step in range(1, config.task.episode_steps + 1):
+            flat = root.reshape(-1)
+            if policy is None:
+                action = torch.zeros(episodes, env.action_spec.shape[-1])
+            else:
+                action = policy(flat)["action"]
+            root["action"] = action.reshape(*root.batch_size, -1)
+            data, root = env.step_and_maybe_reset(root)
+            after = data["next"].reshape(-1)
+            steps[running] = step
+            for key, value in balls.items():
+                value[running] = after[key][running]
+            ended = running & after["done"][:, 0]
+            for key, value in ends.items():
+                value[ended] = after[key][ended, 0]
+            running &= ~ended
+            if on_step is not None:
+                on_step(step, int(running.sum()))
+            if not running.any():
+                break
+    finally:
+        env.close()
+    return Episodes(
+        steps=steps,
+        hit=ends["hit"],
+        fallen=ends["fallen"] & ~ends["hit"],
+        diverged=ends["diverged"] & ~ends["fallen"] & ~ends["hit"],
+        arrived=balls["balls_arrived"],
+        avoided=balls["balls_avoided"],
+    )
+
+
+def standard_task(config: EnvConfig) -> EnvConfig:
+    """Return the configuration with the standard throw and episodes of 10 s."""
+    task = dataclasses.replace(
+        config.task, throws=ThrowConfig(), episode_length_s=LONGEST
+    )
+    return dataclasses.replace(config, task=task)
+
+
+def summarize(played: Episodes, rigid: Episodes, control_hz: float) -> Evaluation:
+    """Return the figures of a bank from how its episodes ended.
+
+    Args:
+        played: Episodes of the policy.
+        rigid: Episodes of the rigid robot on the same bank.
+        control_hz: Control rate [Hz].
+    """
+    n, limit = len(played.steps), round(SUCCESS_AGE * control_hz)
+    early = played.steps <= limit
+
+    def failed(episodes: Episodes) -> Tensor:
+        ended = episodes.hit | episodes.fallen | episodes.diverged
+        return ended & (episodes.steps <= limit)
+
+    def avoided(which: int) -> float | None:
+        arrived = float(played.arrived[:, which].sum())
+        return float(played.avoided[:, which].sum()) / arrived if arrived else None
+
+    return Evaluation(
+        success=wilson(n - int(failed(played).sum()), n),
+        survival_time=mean_estimate(played.steps / control_hz),
+        ended_by_ball=float((played.hit & early).double().mean()),
+        ended_by_fall=float((played.fallen & early).double().mean()),
+        diverged=float((played.diverged & early).double().mean()),
+        rigid_success=1.0 - float(failed(rigid).double().mean()),
+        avoided=Avoided(first_ball=avoided(0), later_balls=avoided(1)),
+        episodes=n,
+    )
+
+
+def evaluate(
+    policy: nn.Module | TensorDictModuleBase | None,
+    config: EnvConfig,
+    skin: Skin,
+    *,
+    bank_seed: int,
+    episodes: int,
+    num_workers: int | None = None,
+    on_step: Callable[[int, int], None] | None = None,
+) -> Evaluation:
+    """Return how a policy fares on a bank of throws, beside the rigid robot.
+
+    Args:
+        policy: Writes ``action`` into a TensorDict; None is the zero action.
+        config: Robot, task (its throws are those of the bank), sensors.
+        skin: The skin.
+        bank_seed: Seed of the bank.
+        episodes: Size of the bank.
+        num_workers: Processes; the result does not depend on it.
+        on_step: Called with (steps done, episodes still running).
+    """
+
+    def play(who: Any, hold: bool) -> Episodes:
+        return play_bank(
+            who,
+            config,
+            skin,
+            bank_seed=bank_seed,
+            episodes=episodes,
+            num_workers=num_workers,
+            hold=hold,
+            on_step=None if hold else on_step,
+        )
+
+    control_hz = config.task.physics.control_hz
+    return summarize(play(policy, False), play(None, True), control_hz)

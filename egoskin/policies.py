@@ -1,0 +1,176 @@
+"""Trained policies as self-contained files, for people who never train.
+
+A policy file holds weights, normaliser, skin, sensor and task. A checkpoint of a run
+holds the same and more, and is read alike.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+
+from egoskin.agents.networks import Agent, NetworkConfig
+from egoskin.checkpoint import load_tensors, part, prefixed, save_tensors
+from egoskin.cli import from_plain, to_plain
+from egoskin.make import EnvConfig
+from egoskin.sensors import Skin
+
+CHECKPOINT_NAME = "checkpoint.safetensors"
+"""Name of the latest checkpoint in a run folder."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class PolicySpec:
+    """Everything needed to build an agent and the environment it was made for."""
+
+    env: EnvConfig
+    """Robot, task, sensors."""
+    skin: Skin
+    """The sensors of the skin."""
+    network: NetworkConfig
+    """Size of the networks."""
+    sizes: Mapping[str, int]
+    """Number of features of each key read."""
+    num_actions: int
+    """Number of actions ``J``."""
+    frames: int = 0
+    """Environment steps it was trained for."""
+
+    def build_agent(self) -> Agent:
+        """Return a fresh agent."""
+        return Agent(
+            self.sizes,
+            self.env.actor_keys,
+            self.env.critic_keys,
+            self.num_actions,
+            self.network,
+        )
+
+    def header(self) -> dict[str, Any]:
+        """Return the specification as JSON values."""
+        return {
+            "env": to_plain(self.env),
+            "skin": self.skin.to_dict(),
+            "network": to_plain(self.network),
+            "sizes": dict(self.sizes),
+            "num_actions": self.num_actions,
+            "frames": self.frames,
+        }
+
+    @classmethod
+    def from_header(cls, header: Mapping[str, Any], what: str) -> PolicySpec:
+        """Return the specification that `header` described.
+
+        Raises:
+            ValueError: If it is no such description.
+        """
+        missing = [f.name for f in dataclasses.fields(cls) if f.name not in header]
+        if missing:
+            raise ValueError(f"{what} holds no policy: {missing[0]!r} is missing")
+        return cls(
+            env=from_plain(EnvConfig, header["env"], what),
+            skin=Skin.from_dict(header["skin"]),
+            network=from_plain(NetworkConfig, header["network"], what),
+            sizes=header["sizes"],
+            num_actions=header["num_actions"],
+            frames=header["frames"],
+        )
+
+
+def agent_tensors(agent: Agent) -> dict[str, Tensor]:
+    """Return all parameters and buffers of an agent by name, each once."""
+    return {**dict(agent.named_parameters()), **dict(agent.named_buffers())}
+
+
+@torch.no_grad()
+def load_agent_tensors(agent: Agent, tensors: Mapping[str, Tensor], what: str) -> None:
+    """Copy tensors into an agent.
+
+    Raises:
+        ValueError: If a name or shape does not fit.
+    """
+    own = agent_tensors(agent)
+    for name, value in tensors.items():
+        if name not in own or own[name].shape != value.shape:
+            raise ValueError(f"{what}: tensor {name!r} does not fit the networks")
+        own[name].copy_(value)
+
+
+def save_policy(path: Path, agent: Agent, spec: PolicySpec) -> None:
+    """Write the actor of an agent as a self-contained policy file."""
+    tensors = {
+        name: value
+        for name, value in agent_tensors(agent).items()
+        if not name.startswith("critic.")
+    }
+    save_tensors(path, prefixed("agent", tensors), {"policy": spec.header()})
+
+
+class Policy(nn.Module):
+    """A trained actor that writes its mean action.
+
+    Args:
+        agent: Agent whose actor is used.
+        spec: What it was made for.
+    """
+
+    def __init__(self, agent: Agent, spec: PolicySpec) -> None:
+        super().__init__()
+        self._head = agent.head.requires_grad_(False)
+        self.spec = spec
+        self.in_keys, self.out_keys = list(agent.actor_keys), ["action"]
+
+    @property
+    def env_config(self) -> EnvConfig:
+        """Robot, task and sensors the policy was trained with."""
+        return self.spec.env
+
+    @property
+    def skin(self) -> Skin:
+        """The skin it was trained with."""
+        return self.spec.skin
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``action [*B, J]`` from the keys in ``in_keys``.
+
+        Raises:
+            KeyError: If a key is missing; the text names what is needed.
+        """
+        missing = [k for k in self.in_keys if k not in tensordict.keys()]
+        if missing:
+            raise KeyError(
+                f"the policy reads {', '.join(self.in_keys)}; {missing[0]!r} is missing"
+            )
+        loc, _ = self._head(*(tensordict[key] for key in self.in_keys))
+        return tensordict.set("action", loc)
+
+
+def load_policy(path: str | Path) -> Policy:
+    """Return the policy of a policy file, a checkpoint or a run folder.
+
+    Args:
+        path: The file, or a run folder (its latest checkpoint).
+
+    Returns:
+        A module that reads `Policy.in_keys` of a TensorDict and writes the mean
+        ``action``; `Policy.env_config` and `Policy.skin` say what it was made for.
+
+    Raises:
+        ValueError: If there is no policy; the text says why.
+    """
+    path = Path(path)
+    if path.is_dir():
+        if not (path / CHECKPOINT_NAME).is_file():
+            raise ValueError(f"{path} is no run folder: it has no {CHECKPOINT_NAME}")
+        path = path / CHECKPOINT_NAME
+    tensors, header = load_tensors(path)
+    spec = PolicySpec.from_header(header.get("policy", {}), str(path))
+    agent = spec.build_agent()
+    load_agent_tensors(agent, part("agent", tensors), str(path))
+    return Policy(agent, spec)

@@ -1,0 +1,53 @@
+"""A progress line that is readable on a terminal and in a file."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Mapping
+
+# In a file a line is written this often [s]; a terminal shows every rollout.
+_FILE_INTERVAL = 10.0
+
+
+class ProgressLine:
+    """Frames, time left, speed, survival and success of a training run.
+
+    Args:
+        frames: Frames done before.
+        total: Frames at the end.
+    """
+
+    def __init__(self, frames: int, total: int) -> None:
+        self._first, self._total = frames, total
+        self._start = time.monotonic()
+        self._shown = float("-inf")
+        self._live = sys.stdout.isatty()
+
+    def update(self, metrics: Mapping[str, float]) -> None:
+        """Show the state after a rollout."""
+        now, frames = time.monotonic(), metrics["frames"]
+        text = (
+            f"{frames / 1e6:8.2f} M / {self._total / 1e6:.1f} M frames  "
+            f"{frames / self._total:6.1%}  ETA {self._left(now, frames)}  "
+            f"{metrics['time/steps_per_s']:8,.0f} steps/s  "
+            f"survival {metrics['episode/survival_s']:5.2f} s  "
+            f"success {metrics['episode/success']:6.1%}  "
+            f"reward {metrics['reward/mean']:+.4f}"
+        )
+        if self._live:
+            print(f"\r{text}\x1b[K", end="", flush=True)
+        elif now - self._shown >= _FILE_INTERVAL or frames >= self._total:
+            print(text, flush=True)
+            self._shown = now
+
+    def finish(self) -> None:
+        """Leave the line."""
+        if self._live:
+            print(flush=True)
+
+    def _left(self, now: float, frames: float) -> str:
+        done = frames - self._first
+        seconds = (now - self._start) * max(self._total - frames, 0) / max(done, 1)
+        hours, rest = divmod(round(seconds), 3600)
+        return f"{hours:d}:{rest // 60:02d}:{rest % 60:02d}"

@@ -1,0 +1,614 @@
+"""Pictures of an episode: the robot, its sensors, the balls, and what is detected.
+
+Headless: on Linux the OpenGL context is EGL's unless ``MUJOCO_GL`` asks for another, so
+neither a display nor an environment variable is needed, whatever was imported first.
+
+Contract: the picture is drawn from the keys of the environment alone (``base_pose``,
+``joint_pos``, ``object_pose``, ``object_active``, ``distance``), never from live
+simulation; a stored tensordict with these keys can be drawn just as well.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+from PIL import Image, ImageDraw, ImageFont
+from tensordict import TensorDictBase
+from torchrl.envs import step_mdp
+
+from egoskin.make import EnvConfig, make_worker_env
+from egoskin.robots import RobotConfig
+from egoskin.sensors import Skin
+from egoskin.shapes import Sphere
+
+Policy = Callable[[TensorDictBase], TensorDictBase]
+"""Writes ``action`` into the tensordict it is given, and returns it."""
+
+# Colours (r, g, b, a). A line has the colour of the kind of sensor that detects: blue
+# for fields; yellow, (1, 0.8, 0.1), is kept for rays.
+_IDLE_RGBA = (0.16, 0.2, 0.3, 1.0)
+_LIT_RGBA = (0.1, 0.95, 1.0, 1.0)
+_FIELD_LINE_RGB = (0.1, 0.35, 1.0)
+_BALL_RGBA = (0.95, 0.35, 0.08, 1.0)
+# Drawn radii [m]: a sensor at rest, one that detects, a line.
+_IDLE_RADIUS, _LIT_RADIUS, _LINE_RADIUS = 0.014, 0.021, 0.006
+# Lines fade with their length, from opaque at 0 to the faintest at this [m].
+_FADE_LENGTH, _FAINTEST = 2.5, 0.25
+# The camera's point of attention follows the base with this time constant [s] and
+# stays at this height [m].
+_FOLLOW_TIME, _LOOK_HEIGHT = 0.4, 1.0
+
+
+class RenderingError(ValueError):
+    """No OpenGL context can be made; the text says how to get one."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraConfig:
+    """Where the camera is, relative to the robot that it follows."""
+
+    distance: float = 6.0
+    """Distance to the robot [m]."""
+    azimuth_deg: float = 30.0
+    """Bearing of the camera, from the robot's heading at the start [deg]."""
+    elevation_deg: float = 16.0
+    """Angle by which the camera looks down [deg]."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Frame:
+    """One picture of an episode and what there is to say about it."""
+
+    image: np.ndarray
+    """Picture without text, ``[height, width, 3]`` uint8."""
+    time: float
+    """Age of the episode [s]."""
+    gap: float
+    """From the robot's surface to that of the nearest ball in play [m], or inf."""
+    num_detecting: int
+    """Number of sensors that detect something."""
+    num_sensors: int
+    """Number of sensors (0 for a blind robot)."""
+    ending: str | None
+    """Why the episode ends here ("hit", "fall", ...); None while it goes on."""
+
+
+def render_episode(
+    config: EnvConfig,
+    skin: Skin,
+    policy: Policy | None,
+    *,
+    seed: int = 0,
+    row: int = 0,
+    max_seconds: float | None = None,
+    fps: float = 30.0,
+    size: tuple[int, int] = (960, 540),
+    camera: CameraConfig | None = None,
+    hold: bool = False,
+) -> list[Frame]:
+    """Return the pictures of one episode.
+
+    Draws are functions of (seed, global row), so ``seed`` and ``row`` name an episode
+    of an evaluation bank: its start and its throws are those of that row. (The motion
+    is too, but for rounding: a network's result depends on the batch size in its last
+    bits.)
+
+    Args:
+        config: What the environment is made of.
+        skin: The sensors.
+        policy: Maps the tensordict of one row to the same with ``action [1, J]``; None
+            for action 0, the default pose as position target.
+        seed: Seed of all draws, the bank's for an episode of a bank.
+        row: Global row of the episode.
+        max_seconds: Stop at this age at the latest [s]; None for the whole episode.
+        fps: Pictures for each second of simulated time, at most the control rate.
+        size: Width and height of the pictures [px].
+        camera: Where the camera is.
+        hold: Whether the robot is held rigid in its default pose.
+
+    Returns:
+        Frames in order of time: the start, then ``fps`` for each second, and always the
+        step that ends the episode.
+
+    Raises:
+        RenderingError: If no OpenGL context can be made.
+        ValueError: If a number is out of range.
+    """
+    hz = config.task.physics.control_hz
+    if not 0 < fps <= hz:
+        raise ValueError(f"fps must be in (0, {hz:g}], the control rate, got {fps:g}")
+    if row < 0:
+        raise ValueError(f"the episode's row must not be negative, got {row}")
+    if max_seconds is not None and not max_seconds * hz >= 1:
+        raise ValueError(
+            f"max_seconds must be at least one control step, {1 / hz:.3g} s, "
+            f"got {max_seconds:g}"
+        )
+    if max_seconds is None:
+        steps = config.task.episode_steps
+    else:
+        steps = round(max_seconds * hz)
+    env = make_worker_env(
+        config, skin, num_envs=1, seed=seed, row_offset=row, hold=hold, keep_raw=True
+    )
+    painter = Painter(
+        config.robot_config,
+        None if config.sensor.coverage == "none" else skin,
+        config.task.throws.balls,
+        size=size,
+        camera=camera,
+    )
+    with painter, torch.no_grad():
+        td = env.reset()
+        frames = [painter.draw(td[0], time=0.0)]
+        for step in range(1, steps + 1):
+            if policy is None:
+                td["action"] = torch.zeros_like(env.action_spec.zero())
+            else:
+                td = policy(td)
+            td = env.step(td)
+            state = td["next"][0]
+            ending = _ending(state)
+            if ending is None and step == steps:
+                ending = "cut"
+            due = int(step * fps / hz) > int((step - 1) * fps / hz)
+            if due or ending:
+                frames.append(painter.draw(state, time=step / hz, ending=ending))
+            if ending:
+                break
+            td = step_mdp(td)
+    env.close()
+    return frames
+
+
+def _ending(state: TensorDictBase) -> str | None:
+    """Why the episode of a row is over; None if it is not."""
+    if state["truncated"].item():
+        return "time limit"
+    names = {"hit": "hit", "fallen": "fall", "diverged": "diverged"}
+    reasons = [name for key, name in names.items() if state[key].item()]
+    return " + ".join(reasons) or None
+
+
+class Painter:
+    """Draws states of one robot with its sensors and balls.
+
+    A context manager: it holds an OpenGL context.
+
+    Args:
+        robot: The robot.
+        skin: Sensors to draw; None for none.
+        objects: Shape of each object, ``O`` of them.
+        size: Width and height of the pictures [px].
+        camera: Where the camera is.
+
+    Raises:
+        RenderingError: If no OpenGL context can be made.
+        ValueError: If the size is not positive and even.
+    """
+
+    def __init__(
+        self,
+        robot: RobotConfig,
+        skin: Skin | None,
+        objects: Sequence[Sphere],
+        *,
+        size: tuple[int, int] = (960, 540),
+        camera: CameraConfig | None = None,
+    ) -> None:
+        if min(size) < 2 or size[0] % 2 or size[1] % 2:
+            # H.264 stores colour for blocks of 2 x 2 pixels.
+            raise ValueError(f"size must be two positive even numbers, got {size}")
+        self._skin, self._objects = skin, tuple(objects)
+        self._model = _build_model(robot, objects, size)
+        self._data = mujoco.MjData(self._model)
+        self._camera_config = camera or CameraConfig()
+        self._camera = mujoco.MjvCamera()
+        self._last_time: float | None = None
+        model = self._model
+        self._link_of_sensor = [
+            model.body(name).id for name in (skin.links if skin else ())
+        ]
+        self._object_geoms = [model.geom(f"object_{i}").id for i in range(len(objects))]
+        self._robot_geoms = [
+            geom
+            for geom in range(model.ngeom)
+            if model.body_rootid[model.geom_bodyid[geom]] == model.body(robot.base).id
+        ]
+        most = model.ngeom + 2 * len(self._link_of_sensor) + 100
+        self._canvas = _Canvas(model, size, most)
+
+    def __enter__(self) -> Painter:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._canvas.close()
+
+    def draw(
+        self, state: TensorDictBase, *, time: float, ending: str | None = None
+    ) -> Frame:
+        """Return the picture of a state.
+
+        Args:
+            state: One row with ``base_pose [7]``, ``joint_pos [J]``,
+                ``object_pose [O, 7]``, ``object_active [O]`` and, with a skin,
+                ``distance [S]`` [m], infinite for a sensor that detects nothing.
+            time: Age of the episode [s]; the camera follows the base with time and
+                starts anew when time goes back.
+            ending: Why the episode ends here, for the frame.
+        """
+        active = state["object_active"].numpy()
+        self._place(state, active)
+        self._follow(state["base_pose"].double().numpy(), time)
+        self._canvas.update(self._data, self._camera)
+        detecting = np.zeros(0, dtype=bool)
+        if self._skin is not None:
+            detecting = np.isfinite(state["distance"].numpy())
+            self._draw_sensors(detecting, state["object_pose"], active)
+        return Frame(
+            image=self._canvas.read(),
+            time=time,
+            gap=self._gap(active),
+            num_detecting=int(detecting.sum()),
+            num_sensors=len(detecting),
+            ending=ending,
+        )
+
+    def _place(self, state: TensorDictBase, active: np.ndarray) -> None:
+        """Put the robot and the balls of the visual model where the state says."""
+        robot_q = torch.cat((state["base_pose"], state["joint_pos"]))
+        self._data.qpos[:] = robot_q.double().numpy()
+        pose = state["object_pose"].double().numpy()
+        self._data.mocap_pos[:], self._data.mocap_quat[:] = pose[:, :3], pose[:, 3:]
+        # What is transparent is not drawn.
+        self._model.geom_rgba[self._object_geoms, 3] = active
+        mujoco.mj_kinematics(self._model, self._data)
+        mujoco.mj_comPos(self._model, self._data)
+        mujoco.mj_camlight(self._model, self._data)
+
+    def _follow(self, base_pose: np.ndarray, time: float) -> None:
+        """Move the camera's point of attention towards the base."""
+        camera, config = self._camera, self._camera_config
+        goal = np.array([*base_pose[:2], _LOOK_HEIGHT])
+        if self._last_time is None or time < self._last_time:
+            w, _, _, z = base_pose[3:]
+            # An upright base: its heading is twice the angle of (w, z).
+            heading = math.degrees(2 * math.atan2(z, w))
+            camera.lookat[:] = goal
+            camera.distance = config.distance
+            # MuJoCo's azimuth is the direction in which the camera looks.
+            camera.azimuth = heading + config.azimuth_deg + 180.0
+            camera.elevation = -config.elevation_deg
+        else:
+            weight = 1 - math.exp((self._last_time - time) / _FOLLOW_TIME)
+            camera.lookat[:] += weight * (goal - camera.lookat)
+        self._last_time = time
+
+    def _draw_sensors(
+        self, detecting: np.ndarray, object_pose: torch.Tensor, active: np.ndarray
+    ) -> None:
+        """Add the sensors, and a line from each that detects to what it detects."""
+        assert self._skin is not None
+        rotation = self._data.xmat[self._link_of_sensor].reshape(-1, 3, 3)
+        offset = (rotation @ self._skin.position[:, :, None])[..., 0]
+        points = self._data.xpos[self._link_of_sensor] + offset
+        for point, is_lit in zip(points, detecting, strict=True):
+            radius = _LIT_RADIUS if is_lit else _IDLE_RADIUS
+            rgba = _LIT_RGBA if is_lit else _IDLE_RGBA
+            self._canvas.add_sphere(point, radius, rgba, glows=bool(is_lit))
+        if not (detecting.any() and active.any()):
+            return
+        points = points[detecting]
+        poses = object_pose.double().numpy()[active]
+        shapes = [s for s, on in zip(self._objects, active, strict=True) if on]
+        ends = np.stack(
+            [closest_point(s, p, points) for s, p in zip(shapes, poses, strict=True)]
+        )
+        length = np.linalg.norm(ends - points, axis=-1)
+        nearest = length.argmin(0)
+        for i, point in enumerate(points):
+            fade = max(1 - length[nearest[i], i] / _FADE_LENGTH, _FAINTEST)
+            self._canvas.add_line(
+                point, ends[nearest[i], i], _LINE_RADIUS, (*_FIELD_LINE_RGB, fade)
+            )
+
+    def _gap(self, active: np.ndarray) -> float:
+        """Smallest distance between robot and balls in play [m], inf if none is."""
+        far = 100.0
+        gaps = [
+            mujoco.mj_geomDistance(self._model, self._data, ours, ball, far, None)
+            for ball, is_active in zip(self._object_geoms, active, strict=True)
+            if is_active
+            for ours in self._robot_geoms
+        ]
+        return min(gaps, default=math.inf)
+
+
+def closest_point(shape: Sphere, pose: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return the closest points of an object's surface.
+
+    Args:
+        shape: The object's shape.
+        pose: Its pose in the world, position [m] and quaternion, ``[7]``.
+        points: Query points in the world [m], ``[n, 3]``.
+
+    Returns:
+        Points in the world [m], ``[n, 3]``; the query itself where it is inside.
+    """
+    rotation = np.zeros(9)
+    mujoco.mju_quat2Mat(rotation, pose[3:])
+    rotation = rotation.reshape(3, 3)
+    local = torch.tensor((points - pose[:3]) @ rotation, requires_grad=True)
+    with torch.enable_grad():
+        distance = shape.signed_distance(*local.unbind(-1)).clamp(min=0.0)
+        (gradient,) = torch.autograd.grad(distance.sum(), local)
+    # x* = x - d grad d, as the gradient of a distance has length 1
+    closest = (local - distance[:, None] * gradient).detach().numpy()
+    return closest @ rotation.T + pose[:3]
+
+
+def _build_model(
+    robot: RobotConfig, objects: Sequence[Sphere], size: tuple[int, int]
+) -> mujoco.MjModel:
+    """The robot in a studio: tiled floor, sky, light, balls that go where put."""
+    spec = robot.spec()
+    world = spec.worldbody
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = size
+    spec.visual.headlight.ambient = [0.38, 0.38, 0.4]
+    spec.visual.headlight.diffuse = [0.35, 0.35, 0.35]
+    spec.visual.headlight.specular = [0.05, 0.05, 0.05]
+    spec.visual.quality.shadowsize = 4096
+    spec.visual.rgba.haze = [0.86, 0.88, 0.91, 1]
+    # Extent scales near plane, fog and shadow of the scene [m].
+    spec.stat.extent, spec.stat.center = 3.0, [0, 0, 1]
+    spec.visual.map.znear, spec.visual.map.zfar = 0.02, 40.0
+    spec.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=[0.72, 0.77, 0.84],
+        rgb2=[0.86, 0.88, 0.91],
+        width=256,
+        height=1536,
+    )
+    spec.add_texture(
+        name="tiles",
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        rgb1=[0.60, 0.62, 0.65],
+        rgb2=[0.68, 0.70, 0.73],
+        mark=mujoco.mjtMark.mjMARK_EDGE,
+        markrgb=[0.78, 0.79, 0.81],
+        width=512,
+        height=512,
+    )
+    # A texture is two tiles wide: tiles of 0.5 m.
+    tiles = spec.add_material(name="tiles", texuniform=True, texrepeat=[1, 1])
+    tiles.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "tiles"
+    tiles.reflectance = 0.08
+    world.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.05], material="tiles"
+    )
+    # The light moves with the base: its shadow map covers only what is near it.
+    spec.body(robot.base).add_light(
+        pos=[1.0, -1.5, 4.0],
+        dir=[-0.25, 0.35, -1.0],
+        mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACK,
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        castshadow=True,
+        diffuse=[0.55, 0.55, 0.53],
+        specular=[0.2, 0.2, 0.2],
+    )
+    for i, shape in enumerate(objects):
+        body = world.add_body(name=f"ball_{i}", mocap=True)
+        shape.add_geom(body, name=f"object_{i}", rgba=_BALL_RGBA)
+    return spec.compile()
+
+
+class _Canvas:
+    """An off-screen picture of a MuJoCo model to which shapes can be added.
+
+    `mujoco.Renderer` is bound to the backend that ``MUJOCO_GL`` named when mujoco was
+    first imported; this one is not.
+    """
+
+    def __init__(
+        self, model: mujoco.MjModel, size: tuple[int, int], max_geoms: int
+    ) -> None:
+        self._model, self._size = model, size
+        self._gl = _gl_context(size)
+        self._scene = mujoco.MjvScene(model, max_geoms)
+        self._option, self._perturb = mujoco.MjvOption(), mujoco.MjvPerturb()
+        self._rect = mujoco.MjrRect(0, 0, *size)
+        scale = mujoco.mjtFontScale.mjFONTSCALE_100
+        self._context = mujoco.MjrContext(model, scale.value)
+        offscreen = mujoco.mjtFramebuffer.mjFB_OFFSCREEN
+        mujoco.mjr_setBuffer(offscreen.value, self._context)
+
+    def close(self) -> None:
+        """Give the OpenGL context back."""
+        self._gl.make_current()
+        self._context.free()
+        self._gl.free()
+
+    def update(self, data: mujoco.MjData, camera: mujoco.MjvCamera) -> None:
+        """Set the scene from simulation data; shapes added before are gone."""
+        mujoco.mjv_updateScene(
+            self._model,
+            data,
+            self._option,
+            self._perturb,
+            camera,
+            mujoco.mjtCatBit.mjCAT_ALL.value,
+            self._scene,
+        )
+
+    def add_sphere(
+        self,
+        position: np.ndarray,
+        radius: float,
+        rgba: Sequence[float],
+        *,
+        glows: bool,
+    ) -> None:
+        """Add a sphere (metres, world)."""
+        geom = self._next_geom(mujoco.mjtGeom.mjGEOM_SPHERE, rgba, glows=glows)
+        geom.size[:] = radius
+        geom.pos[:] = position
+
+    def add_line(
+        self, start: np.ndarray, end: np.ndarray, radius: float, rgba: Sequence[float]
+    ) -> None:
+        """Add a thin capsule between two points (metres, world)."""
+        kind = mujoco.mjtGeom.mjGEOM_CAPSULE
+        geom = self._next_geom(kind, rgba, glows=True)
+        mujoco.mjv_connector(geom, kind, radius, start, end)
+
+    def _next_geom(
+        self, kind: mujoco.mjtGeom, rgba: Sequence[float], *, glows: bool
+    ) -> mujoco.MjvGeom:
+        scene = self._scene
+        assert scene.ngeom < scene.maxgeom
+        geom = scene.geoms[scene.ngeom]
+        mujoco.mjv_initGeom(
+            geom, kind, np.zeros(3), np.zeros(3), np.eye(3).ravel(), np.float32(rgba)
+        )
+        geom.category = mujoco.mjtCatBit.mjCAT_DECOR
+        geom.emission = float(glows)
+        scene.ngeom += 1
+        return geom
+
+    def read(self) -> np.ndarray:
+        """Return the picture, ``[height, width, 3]`` uint8."""
+        self._gl.make_current()
+        width, height = self._size
+        image = np.empty((height, width, 3), np.uint8)
+        mujoco.mjr_render(self._rect, self._scene, self._context)
+        mujoco.mjr_readPixels(image, None, self._rect, self._context)
+        # OpenGL's first row is the lowest.
+        return image[::-1].copy()
+
+
+def _gl_context(size: tuple[int, int]) -> Any:
+    """A current OpenGL context; raises RenderingError if there is none to be had."""
+    backend = os.environ.get("MUJOCO_GL", "")
+    try:
+        if sys.platform == "linux" and not backend:
+            backend = "egl"
+            # Importing it fails where the system's library is missing.
+            from mujoco.egl import GLContext
+        else:
+            from mujoco import GLContext
+        context = GLContext(*size)
+        context.make_current()
+    # PyOpenGL reports a missing library as an attribute that None does not have.
+    except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
+        raise RenderingError(no_gl_text(backend)) from error
+    return context
+
+
+def no_gl_text(backend: str) -> str:
+    """Return what to tell a user for whom an OpenGL backend does not work."""
+    return (
+        f"cannot render: no OpenGL context from {backend or 'the default backend'!r}; "
+        "install one (Debian: `apt-get install libegl1`, or `apt-get install "
+        "libosmesa6` and set MUJOCO_GL=osmesa)"
+    )
+
+
+def annotate(frame: Frame, width: int | None = None) -> np.ndarray:
+    """Return a frame's picture with its figures written into it.
+
+    Args:
+        frame: The frame.
+        width: Width to scale to [px]; None for the picture's own.
+
+    Returns:
+        Picture, ``[height, width, 3]`` uint8.
+    """
+    picture = Image.fromarray(frame.image)
+    if width is not None:
+        height = round(width * picture.height / picture.width)
+        picture = picture.resize((width, height), Image.Resampling.LANCZOS)
+    parts = [f"{frame.time:5.2f} s"]
+    if math.isfinite(frame.gap):
+        parts.append(f"ball at {max(frame.gap, 0.0):.2f} m")
+    if frame.num_sensors:
+        parts.append(f"{frame.num_detecting} of {frame.num_sensors} sensors")
+    pen = ImageDraw.Draw(picture)
+    unit = picture.height / 24
+    _write(pen, (0.7 * unit, 0.5 * unit), "    ".join(parts), unit, (20, 24, 32))
+    if frame.ending is not None:
+        is_failure = frame.ending not in ("time limit", "cut")
+        colour = (200, 20, 20) if is_failure else (20, 24, 32)
+        place = (0.7 * unit, 2.0 * unit)
+        _write(pen, place, frame.ending.upper(), 2.4 * unit, colour)
+    return np.asarray(picture)
+
+
+def _write(
+    pen: ImageDraw.ImageDraw,
+    place: tuple[float, float],
+    text: str,
+    size: float,
+    colour: tuple[int, int, int],
+) -> None:
+    """Write text with a pale outline, legible on any background."""
+    font = ImageFont.load_default(size)
+    outline = max(1, round(size / 14))
+    pen.text(
+        place, text, colour, font, stroke_width=outline, stroke_fill=(245, 246, 248)
+    )
+
+
+def pick_moments(frames: Sequence[Frame], count: int) -> list[int]:
+    """Return the indices of the frames that tell the episode best, in order.
+
+    The first and the last, the closest approaches (at most half of them), and then
+    always the frame that is farthest from those picked already.
+
+    Args:
+        frames: Frames in order of time.
+        count: Number of frames wanted; fewer if there are fewer.
+    """
+    gaps = np.array([np.inf, *(f.gap for f in frames), np.inf])
+    inner = gaps[1:-1]
+    is_minimum = np.isfinite(inner) & (inner <= gaps[:-2]) & (inner <= gaps[2:])
+    minima = np.flatnonzero(is_minimum)
+    closest = minima[inner[minima].argsort()][: count // 2]
+    picked = list(dict.fromkeys([0, len(frames) - 1, *closest.tolist()]))[:count]
+    index = np.arange(len(frames))
+    while len(picked) < min(count, len(frames)):
+        away = np.abs(index[:, None] - np.array(picked)).min(1)
+        picked.append(int(away.argmax()))
+    return sorted(picked)
+
+
+def contact_sheet(
+    frames: Sequence[Frame], *, count: int = 12, columns: int = 3, width: int = 640
+) -> np.ndarray:
+    """Return a grid of the moments that tell an episode best.
+
+    Args:
+        frames: Frames in order of time.
+        count: Number of pictures.
+        columns: Pictures in each line.
+        width: Width of each picture [px].
+
+    Returns:
+        Picture, ``[rows * height, columns * width, 3]`` uint8, white where no picture
+        is.
+    """
+    cells = [annotate(frames[i], width) for i in pick_moments(frames, count)]
+    while len(cells) % columns:
+        cells.append(np.full_like(cells[0], 255))
+    lines = [cells[i : i + columns] for i in range(0, len(cells), columns)]
+    return np.concatenate([np.concatenate(line, axis=1) for line in lines])

@@ -1,0 +1,330 @@
+"""A training run is a folder: configuration, metrics, checkpoints, policies.
+
+    config.json              the resolved configuration
+    versions.json            packages, machine, git state, command of each start
+    metrics.csv              one line for each rollout; TensorBoard files beside it
+    checkpoint.safetensors   everything needed to go on, at most a minute old
+    policies/<frames>.safetensors   self-contained policies, from the first on
+
+Contract: a checkpoint is written atomically, and metrics written after it are dropped
+on resume, so that a log has neither a gap nor a repetition.
+"""
+
+from __future__ import annotations
+
+import csv
+import datetime
+import importlib.metadata
+import json
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import torch
+import tyro
+from torch import Tensor
+from torch.utils.tensorboard.writer import SummaryWriter
+
+from egoskin.agents.ppo import PPOConfig
+from egoskin.checkpoint import load_tensors, save_tensors
+from egoskin.cli import changed_fields, from_plain, to_plain
+from egoskin.make import EnvConfig, check_num_workers
+from egoskin.policies import CHECKPOINT_NAME
+
+_PACKAGES = ("egoskin", "torch", "torchrl", "tensordict", "mujoco", "numpy")
+_PACKAGES += ("pytorch-kinematics", "gymnasium")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainConfig:
+    """Train a robot to dodge balls by what its skin feels."""
+
+    env: Annotated[EnvConfig, tyro.conf.arg(name="")] = field(default_factory=EnvConfig)
+    """Robot, task, skin, sensors."""
+    ppo: PPOConfig = field(default_factory=PPOConfig)
+    """Networks and PPO."""
+    seed: int = 0
+    """Seed of everything random: throws, starts, networks, actions."""
+    total_frames: int = 65_536_000
+    """Environment steps of the whole run (the paper's 1000 epochs)."""
+    num_envs: int = 4096
+    """Agents simulated in parallel."""
+    num_workers: int | None = None
+    """Processes that simulate; None: the largest divisor of num_envs <= cores."""
+    device: str = "cpu"
+    """Device of the learner ("cpu", "cuda", "cuda:1")."""
+    learner_threads: int | None = None
+    """Threads of the learner; None: one for each core."""
+    run_dir: Path | None = None
+    """Folder of the run; None: a new one under runs/, named after time and sensor."""
+    snapshot_frames: int = 5_000_000
+    """Environment steps between the policies kept for learning curves."""
+    resume: Path | None = None
+    """Run folder to go on with; only --total-frames may be changed, to a later end."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for values with which no run can start."""
+        for name in ("total_frames", "snapshot_frames"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if not 0 <= self.seed < 2**32:
+            raise ValueError(f"seed must be in [0, 2**32), got {self.seed}")
+        if self.learner_threads is not None and self.learner_threads < 1:
+            raise ValueError(
+                f"learner_threads must be at least 1, got {self.learner_threads}"
+            )
+        check_num_workers(self.num_envs, self.num_workers)
+        frames = self.num_envs * self.ppo.rollout_steps
+        if frames < self.ppo.num_mini_batches:
+            raise ValueError(
+                f"a rollout of {frames} frames cannot be split into "
+                f"{self.ppo.num_mini_batches} minibatches"
+            )
+
+    @property
+    def frames_per_batch(self) -> int:
+        """Environment steps of one rollout."""
+        return self.num_envs * self.ppo.rollout_steps
+
+    def learner_device(self) -> torch.device:
+        """Return the device of the learner.
+
+        Raises:
+            ValueError: If there is no such device.
+        """
+        valid = ["cpu", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]
+        try:
+            device = torch.device(self.device)
+        except RuntimeError:
+            device = None
+        if device is None or (
+            device.type != "cpu"
+            and not (device.type == "cuda" and (device.index or 0) < len(valid) - 1)
+        ):
+            raise ValueError(
+                f"no device {self.device!r} here; available: {', '.join(valid)}"
+            )
+        return device
+
+
+# What a run's stored configuration leaves out: it says how a run was called.
+_CALL_FIELDS = ("run_dir", "resume")
+
+
+def parse_config(args: list[str]) -> TrainConfig:
+    """Return the configuration of a command line.
+
+    With ``--resume RUN`` the stored configuration of the run is the default, and no
+    field but ``total_frames`` may differ from it.
+
+    Args:
+        args: Arguments, without the program's name.
+
+    Raises:
+        ValueError: If a field is changed that may not be, or the end lies before the
+            one planned.
+    """
+    config = tyro.cli(TrainConfig, args=args)
+    if config.resume is None:
+        return config
+    stored = Run.open(config.resume).config
+    config = tyro.cli(TrainConfig, args=args, default=stored)
+    assert config.resume is not None
+    before, after = to_plain(stored), to_plain(config)
+    for name in _CALL_FIELDS:
+        before.pop(name), after.pop(name)
+    if config.run_dir is not None:
+        raise ValueError("--run-dir cannot be changed on resume")
+    changed = [n for n in changed_fields(before, after) if n != "total_frames"]
+    if changed:
+        names = ", ".join(n.removeprefix("env.") for n in changed)
+        raise ValueError(
+            f"a resumed run keeps its configuration; changed: {names}. Only "
+            "--total-frames may be, to a later end"
+        )
+    if config.total_frames < stored.total_frames:
+        raise ValueError(
+            f"--total-frames {config.total_frames} is before the planned end "
+            f"{stored.total_frames}"
+        )
+    return config
+
+
+class Run:
+    """An open run folder.
+
+    Args:
+        path: The folder.
+        config: Its configuration.
+    """
+
+    def __init__(self, path: Path, config: TrainConfig) -> None:
+        self.path, self.config = path, config
+        self._writer: SummaryWriter | None = None
+        self._columns: list[str] | None = None
+
+    @classmethod
+    def create(cls, config: TrainConfig) -> Run:
+        """Return a new run folder.
+
+        Raises:
+            ValueError: If the folder holds anything already.
+        """
+        path = config.run_dir
+        if path is None:
+            sensor = config.env.sensor
+            kind = "blind"
+            if sensor.coverage != "none":
+                kind = f"{sensor.coverage}-{sensor.signal}-{sensor.range:g}m"
+            stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
+            path = Path("runs") / f"{stamp}-{kind}-seed{config.seed}"
+        if path.exists() and (not path.is_dir() or any(path.iterdir())):
+            raise ValueError(
+                f"{path} exists already; choose another --run-dir, or go on with it "
+                f"by --resume {path}"
+            )
+        (path / "policies").mkdir(parents=True)
+        run = cls(path, config)
+        run.write_config()
+        return run
+
+    @classmethod
+    def open(cls, path: Path) -> Run:
+        """Return an existing run folder.
+
+        Raises:
+            ValueError: If it is none.
+        """
+        file = path / "config.json"
+        if not file.is_file():
+            raise ValueError(f"{path} is no run folder: it has no config.json")
+        try:
+            content = json.loads(file.read_text())
+        except json.JSONDecodeError as error:
+            raise ValueError(f"{file} is not JSON: {error}") from error
+        return cls(path, from_plain(TrainConfig, content, str(file)))
+
+    def write_config(self) -> None:
+        """Write the configuration (again, with a later end)."""
+        content = to_plain(self.config)
+        for name in _CALL_FIELDS:
+            content[name] = None
+        partial = self.path / ".config.json.partial"
+        partial.write_text(json.dumps(content, indent=2) + "\n")
+        os.replace(partial, self.path / "config.json")
+
+    def record_start(self) -> None:
+        """Append versions, machine, git state and command of this start."""
+        file = self.path / "versions.json"
+        starts = json.loads(file.read_text()) if file.exists() else []
+        starts.append(
+            {
+                "time": datetime.datetime.now(datetime.timezone.utc).isoformat(),
+                "command": sys.argv,
+                "python": platform.python_version(),
+                "machine": f"{platform.system()} {platform.machine()}",
+                "cores": os.cpu_count(),
+                "packages": {p: _version(p) for p in _PACKAGES},
+                "git": _git_state(),
+            }
+        )
+        file.write_text(json.dumps(starts, indent=2) + "\n")
+
+    @property
+    def checkpoint_path(self) -> Path:
+        """The latest checkpoint."""
+        return self.path / CHECKPOINT_NAME
+
+    def policy_path(self, frames: int) -> Path:
+        """The policy kept after a number of environment steps."""
+        return self.path / "policies" / f"{frames:012d}.safetensors"
+
+    def save_checkpoint(
+        self, tensors: Mapping[str, Tensor], header: Mapping[str, Any]
+    ) -> None:
+        """Replace the checkpoint; everything logged so far is on disk before it."""
+        if self._writer is not None:
+            self._writer.flush()
+        save_tensors(self.checkpoint_path, tensors, header)
+
+    def load_checkpoint(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Return what `save_checkpoint` wrote last."""
+        return load_tensors(self.checkpoint_path)
+
+    def start_metrics(self, frames: int) -> None:
+        """Open the logs, dropping what was logged after a number of frames."""
+        file = self.path / "metrics.csv"
+        if file.exists():
+            with open(file, newline="") as source:
+                rows = list(csv.DictReader(source))
+            kept = [row for row in rows if row["frames"] and int(row["frames"]) <= frames]
+            if kept:
+                self._columns = list(kept[0])
+                partial = file.with_suffix(".partial")
+                with open(partial, "w", newline="") as target:
+                    writer = csv.DictWriter(target, self._columns)
+                    writer.writeheader()
+                    writer.writerows(kept)
+                os.replace(partial, file)
+            else:
+                file.unlink()
+        self._writer = SummaryWriter(
+            str(self.path), purge_step=frames + 1 if frames else None
+        )
+
+    def log(self, metrics: Mapping[str, float]) -> None:
+        """Append a line of metrics; the first fixes the columns.
+
+        Args:
+            metrics: Values by name; "frames" is the x axis.
+        """
+        assert self._writer is not None, "start_metrics first"
+        first = self._columns is None
+        if self._columns is None:
+            self._columns = list(metrics)
+        with open(self.path / "metrics.csv", "a", newline="") as file:
+            writer = csv.DictWriter(file, self._columns)
+            if first:
+                writer.writeheader()
+            writer.writerow(dict(metrics))
+        frames = int(metrics["frames"])
+        for name, value in metrics.items():
+            if name != "frames":
+                self._writer.add_scalar(name, value, frames)
+
+    def close(self) -> None:
+        """Close the logs."""
+        if self._writer is not None:
+            self._writer.close()
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _git_state() -> dict[str, Any] | None:
+    """Commit of the source tree and whether it was changed; None outside git."""
+
+    def git(*args: str) -> str:
+        return subprocess.run(
+            ["git", "-C", str(Path(__file__).parent), *args],
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout.strip()
+
+    try:
+        return {
+            "commit": git("rev-parse", "HEAD"),
+            "changed": bool(git("status", "--porcelain", "--untracked-files=no")),
+        }
+    except (OSError, subprocess.CalledProcessError):
+        return None
