@@ -21,12 +21,13 @@ Entry = Tensor | float
 """One matrix entry: a ``[B]`` tensor, or a constant of the robot."""
 
 
-def pad_rows(rows: Tensor, multiple: int = 16) -> Tensor:
+def pad_rows(rows: Tensor, multiple: int = 32) -> Tensor:
     """Return row indices padded to a multiple by repeating the first.
 
-    Vectorised ``sin`` and ``cos`` round differently in the scalar tail of an array
-    than in its body. Subsets of rows are padded, so that a row's result does not
-    depend on which other rows happen to be computed with it.
+    Vectorised functions (``atan2``) round differently in the scalar tail of an array
+    than in its body, which goes by two vectors: 32 float32 numbers with AVX-512.
+    Subsets of rows are padded, so that a row's result does not depend on which other
+    rows happen to be computed with it.
 
     Args:
         rows: Indices, ``[n]`` int64, n >= 1.

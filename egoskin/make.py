@@ -10,7 +10,12 @@ from typing import Literal
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs import Compose, EnvBase, ExcludeTransform, TransformedEnv
+from torchrl.envs import (
+    Compose,
+    EnvBase,
+    ExcludeTransform,
+    TransformedEnv,
+)
 
 from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
 from egoskin.observations import Privileged, Proprioception
@@ -117,6 +122,10 @@ class EnvConfig:
     privileged: Literal["objects", "velocity"] = "objects"
     """What the critic alone sees: also the balls, or (the paper's) the velocity."""
 
+    def __post_init__(self) -> None:
+        """Raise ValueError if the robot lacks the gain set asked for."""
+        self.robot_config.joint_gains(self.task.physics.gains)
+
     @property
     def robot_config(self) -> RobotConfig:
         """The robot."""
@@ -144,6 +153,7 @@ def make_worker_env(
     num_threads: int = 1,
     hold: bool = False,
     keep_raw: bool = False,
+    bare: bool = False,
 ) -> TransformedEnv:
     """Return the batched environment of one process, with its transforms.
 
@@ -156,6 +166,8 @@ def make_worker_env(
         num_threads: Physics threads.
         hold: Whether the robot is held rigid in its default pose.
         keep_raw: Whether the raw state stays in the output.
+        bare: Whether to leave out observations and sensors (to measure what they
+            cost).
     """
     robot = config.robot_config
     env = DodgeballEnv(
@@ -189,6 +201,7 @@ def make_env(
     seed: int,
     num_workers: int | None = None,
     hold: bool = False,
+    bare: bool = False,
 ) -> WorkerPool:
     """Return a ParallelEnv of ``num_workers`` processes, ``[W, num_envs / W]`` rows.
 
@@ -200,6 +213,7 @@ def make_env(
         num_workers: Processes; by default the largest divisor of ``num_envs`` not
             above the cores.
         hold: Whether the robots are held rigid in their default pose.
+        bare: Whether to leave out observations and sensors.
 
     Raises:
         ValueError: If the workers do not divide the agents.
@@ -216,6 +230,7 @@ def make_env(
                 seed=seed,
                 row_offset=i * rows,
                 hold=hold,
+                bare=bare,
             )
             for i in range(workers)
         ]

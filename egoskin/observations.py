@@ -39,20 +39,20 @@ class Proprioception(RowTransform):
         out_keys: Sequence[NestedKey] = ("observation",),
     ) -> None:
         super().__init__(in_keys, out_keys)
-        self.register_buffer("_default", default_joint_pos.float())
+        self.register_buffer("_default", default_joint_pos)
 
     def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Return the observation, ``[B, 6 + 2 J]``."""
         base_pose, base_ang_vel_b, joint_pos, joint_vel = inputs
         down = base_pose.new_tensor([0.0, 0.0, -1.0]).expand_as(base_ang_vel_b)
         gravity_b = rotate_inverse(base_pose[:, 3:], down)
-        deviation = joint_pos - self._default
+        deviation = joint_pos - self._default.to(joint_pos.dtype)
         return (torch.cat((base_ang_vel_b, deviation, joint_vel, gravity_b), -1),)
 
     def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
         """Return the spec of the observation."""
-        size = 6 + 2 * len(self._default)
-        return (Unbounded(shape=(*spec.shape, size), dtype=torch.float32),)
+        size, dtype = 6 + 2 * len(self._default), spec[self.in_keys[2]].dtype
+        return (Unbounded(shape=(*spec.shape, size), dtype=dtype),)
 
 
 class Privileged(RowTransform):
@@ -69,7 +69,11 @@ class Privileged(RowTransform):
         content: "objects" for everything above, "velocity" for the paper's critic.
         num_joints: ``J``.
         num_objects: ``O``.
+        in_keys: Keys of the inputs, in the order above.
         out_keys: Key of the observation.
+
+    Raises:
+        ValueError: If the number of in keys is not that of the content.
     """
 
     _VELOCITY_KEYS = ("base_pose", "base_lin_vel_w")
@@ -86,14 +90,17 @@ class Privileged(RowTransform):
         content: Literal["objects", "velocity"],
         num_joints: int,
         num_objects: int,
+        in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] = ("privileged_observation",),
     ) -> None:
-        in_keys = self._VELOCITY_KEYS
+        read = self._VELOCITY_KEYS
         self._size = 3
         if content == "objects":
-            in_keys = (*in_keys, *self._OBJECT_KEYS)
+            read = (*read, *self._OBJECT_KEYS)
             self._size += 3 + num_joints + 7 * num_objects
-        super().__init__(in_keys, out_keys)
+        if in_keys is not None and len(in_keys) != len(read):
+            raise ValueError(f"in_keys must name {', '.join(read)}, got {in_keys}")
+        super().__init__(in_keys or read, out_keys)
 
     def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Return the privileged observation, ``[B, P]``."""
@@ -115,4 +122,5 @@ class Privileged(RowTransform):
 
     def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
         """Return the spec of the observation."""
-        return (Unbounded(shape=(*spec.shape, self._size), dtype=torch.float32),)
+        dtype = spec[self.in_keys[0]].dtype
+        return (Unbounded(shape=(*spec.shape, self._size), dtype=dtype),)

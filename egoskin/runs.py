@@ -1,6 +1,7 @@
 """A training run is a folder: configuration, metrics, checkpoints, policies.
 
     config.json              the resolved configuration
+    skin.json                the sensors
     versions.json            packages, machine, git state, command of each start
     metrics.csv              one line for each rollout; TensorBoard files beside it
     checkpoint.safetensors   everything needed to go on, at most a minute old
@@ -35,6 +36,7 @@ from egoskin.checkpoint import load_tensors, save_tensors
 from egoskin.cli import changed_fields, from_plain, to_plain
 from egoskin.make import EnvConfig, check_num_workers
 from egoskin.policies import CHECKPOINT_NAME
+from egoskin.sensors import Skin
 
 _PACKAGES = ("egoskin", "torch", "torchrl", "tensordict", "mujoco", "numpy")
 _PACKAGES += ("pytorch-kinematics", "gymnasium")
@@ -71,7 +73,9 @@ class TrainConfig:
         """Raise ValueError for values with which no run can start."""
         for name in ("total_frames", "snapshot_frames"):
             if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+                raise ValueError(
+                    f"{name} must be at least 1, got {getattr(self, name)}"
+                )
         if not 0 <= self.seed < 2**32:
             raise ValueError(f"seed must be in [0, 2**32), got {self.seed}")
         if self.learner_threads is not None and self.learner_threads < 1:
@@ -169,8 +173,8 @@ class Run:
         self._columns: list[str] | None = None
 
     @classmethod
-    def create(cls, config: TrainConfig) -> Run:
-        """Return a new run folder.
+    def create(cls, config: TrainConfig, skin: Skin) -> Run:
+        """Return a new run folder that holds the configuration and the skin.
 
         Raises:
             ValueError: If the folder holds anything already.
@@ -191,6 +195,7 @@ class Run:
         (path / "policies").mkdir(parents=True)
         run = cls(path, config)
         run.write_config()
+        skin.save(run.skin_path)
         return run
 
     @classmethod
@@ -236,6 +241,11 @@ class Run:
         file.write_text(json.dumps(starts, indent=2) + "\n")
 
     @property
+    def skin_path(self) -> Path:
+        """The skin the run was started with."""
+        return self.path / "skin.json"
+
+    @property
     def checkpoint_path(self) -> Path:
         """The latest checkpoint."""
         return self.path / CHECKPOINT_NAME
@@ -262,7 +272,9 @@ class Run:
         if file.exists():
             with open(file, newline="") as source:
                 rows = list(csv.DictReader(source))
-            kept = [row for row in rows if row["frames"] and int(row["frames"]) <= frames]
+            kept = [
+                row for row in rows if row["frames"] and int(row["frames"]) <= frames
+            ]
             if kept:
                 self._columns = list(kept[0])
                 partial = file.with_suffix(".partial")

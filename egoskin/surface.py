@@ -17,6 +17,8 @@ from egoskin.robots import Primitive, RobotConfig
 
 # A sampled point is inside another primitive if it is deeper than this [m].
 _INSIDE = 1e-6
+# Rounds of sampling that must find some outer surface.
+_MAX_ROUNDS = 1000
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -106,10 +108,17 @@ def sample_surface(
         Points in random order.
 
     Raises:
-        ValueError: If n is not positive or the links carry no primitive.
+        ValueError: If n is not positive, a link is not the robot's, or the links
+            have no outer surface.
     """
     if n < 1:
         raise ValueError(f"the number of points must be positive, got {n}")
+    unknown = [name for name in links if name not in robot.links]
+    if unknown:
+        raise ValueError(
+            f"{robot.name} has no link {unknown[0]!r}; its links are "
+            f"{', '.join(robot.links)}"
+        )
     shapes = [s for s in robot.primitives if s.link in links]
     if not shapes:
         raise ValueError(f"the links {', '.join(links)} carry no collision shape")
@@ -122,7 +131,13 @@ def sample_surface(
     rng = np.random.default_rng(seed)
     weight = np.array([area(s) for s in shapes])
     kept: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-    while sum(len(k[0]) for k in kept) < n:
+    found = 0
+    while found < n:
+        if len(kept) >= _MAX_ROUNDS and found == 0:
+            raise ValueError(
+                f"the shapes of {', '.join(links)} lie inside others: they have no "
+                "outer surface"
+            )
         counts = rng.multinomial(2 * n, weight / weight.sum())
         parts = []
         for shape, count in zip(shapes, counts, strict=True):
@@ -140,5 +155,6 @@ def sample_surface(
         link, points, normals = (np.concatenate(p) for p in zip(*parts, strict=True))
         order = rng.permutation(len(link))
         kept.append((link[order], points[order], normals[order]))
+        found += len(link)
     link, points, normals = (np.concatenate(p)[:n] for p in zip(*kept, strict=True))
     return SurfacePoints(link=link, position=points, normal=normals)

@@ -1,7 +1,7 @@
 """Train a robot to dodge: the main job.
 
-    python scripts/ppo.py --sensor.signal localization --sensor.range 2 --seed 1
-    python scripts/ppo.py --resume runs/NAME --total-frames 100_000_000
+python scripts/ppo.py --sensor.signal localization --sensor.range 2 --seed 1
+python scripts/ppo.py --resume runs/NAME --total-frames 100_000_000
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import signal
 import sys
 import time
 from types import FrameType
-from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -32,6 +31,7 @@ from egoskin.policies import (
 )
 from egoskin.progress import ProgressLine
 from egoskin.runs import Run, TrainConfig, parse_config
+from egoskin.sensors import Skin
 from egoskin.survival import SurvivalCurve
 from egoskin.workers import WorkerError, WorkerPool
 
@@ -59,14 +59,15 @@ class Stop:
 class Trainer:
     """Everything that a checkpoint holds, and how to go on from it."""
 
-    def __init__(self, config: TrainConfig, run: Run, env: WorkerPool) -> None:
+    def __init__(
+        self, config: TrainConfig, run: Run, env: WorkerPool, skin: Skin
+    ) -> None:
         self.config, self.run, self.env = config, run, env
         device = config.learner_device()
-        self.skin = config.env.skin.build(config.env.robot_config)
         spec = env.observation_spec
         self.spec = PolicySpec(
             env=config.env,
-            skin=self.skin,
+            skin=skin,
             network=config.ppo.network,
             sizes={key: spec[key].shape[-1] for key in config.env.critic_keys},
             num_actions=env.action_spec.shape[-1],
@@ -109,9 +110,7 @@ class Trainer:
         """What the environment said during a rollout, ``[T, N]``."""
         self.survival.decay()
         for info in infos:
-            self.survival.update(
-                info["episode_step"][:, 0], info["terminated"][:, 0]
-            )
+            self.survival.update(info["episode_step"][:, 0], info["terminated"][:, 0])
         hz = self.config.env.task.physics.control_hz
         ended = float(infos["terminated"].sum())
         terms = infos["reward_terms"].mean((0, 1)).tolist()
@@ -207,9 +206,12 @@ def main(args: list[str]) -> None:
     config.learner_device()
     if config.learner_threads is not None:
         torch.set_num_threads(config.learner_threads)
-    skin = config.env.skin.build(config.env.robot_config)
-    resumed = config.resume is not None
-    run = Run(config.resume, config) if resumed else Run.create(config)
+    if config.resume is not None:
+        run = Run(config.resume, config)
+        skin = Skin.load(run.skin_path)
+    else:
+        skin = config.env.skin.build(config.env.robot_config)
+        run = Run.create(config, skin)
     workers = check_num_workers(config.num_envs, config.num_workers)
     print(
         f"run {run.path}: {config.num_envs} agents on {workers} workers, learner on "
@@ -224,8 +226,11 @@ def main(args: list[str]) -> None:
         num_workers=config.num_workers,
     )
     try:
-        trainer = Trainer(config, run, env)
-        trainer.load() if resumed else trainer.start()
+        trainer = Trainer(config, run, env, skin)
+        if config.resume is None:
+            trainer.start()
+        else:
+            trainer.load()
         run.write_config()
         run.record_start()
         run.start_metrics(trainer.frames)

@@ -116,6 +116,8 @@ class DodgeballEnv(EnvBase):
     """
 
     batch_locked = True
+    physics_class: type[Physics] = Physics
+    """The backend."""
 
     def __init__(
         self,
@@ -208,7 +210,7 @@ class DodgeballEnv(EnvBase):
                 objects_bounce=throws.on_ground == "bounce",
                 object_mass=throws.mass,
             )
-            self._physics = Physics(
+            self._physics = self.physics_class(
                 scene,
                 self.robot,
                 self.batch_size[0],

@@ -241,11 +241,13 @@ class Physics:
         self._qpos, self._qvel = bind("qpos"), bind("qvel")
         self._ctrl, self._sensordata = bind("ctrl"), bind("sensordata")
         self._torque = bind("actuator_force")
+        self.num_envs = num_envs
         self._num_links = len(robot.links)
         self._num_joints = len(robot.joints)
-        self._num_objects = (model.nq - 7 - self._num_joints) // 3
+        self.num_objects = (model.nq - 7 - self._num_joints) // 3
         kp, kd = robot.joint_gains(config.gains)
         self._kd_over_kp = torch.from_numpy(kd / kp).float()
+        self._last_target = torch.zeros(num_envs, self._num_joints)
         joints = slice(7, 7 + self._num_joints)
         self._robot_q, self._object_q = slice(0, joints.stop), slice(joints.stop, None)
         self._robot_v = slice(0, joints.stop - 1)
@@ -267,17 +269,8 @@ class Physics:
         Returns:
             Contacts, power and failures of the step.
         """
-        ctrl = target
-        if self.config.target_velocity == "finite_difference":
-            # kp (q* - q) + kd (qdot* - qdot) = kp ((q* + kd/kp qdot*) - q) - kd qdot
-            velocity = (target - self._last_target) * self.config.control_hz
-            ctrl = target + self._kd_over_kp * velocity
-            self._last_target.copy_(target)
-        self._ctrl[:] = ctrl.numpy()
-        parked = ~active.numpy()
-        if parked.any():
-            self._objects(self._object_q)[parked] = _PARKING
-            self._objects(self._object_v)[parked] = 0.0
+        self.park(~active)
+        self.set_target(target)
         held = self._qpos[:, self._robot_q].copy() if self._hold else None
         warnings = self._failure_count()
         found = np.zeros(self._sensordata.shape, dtype=bool)
@@ -296,7 +289,7 @@ class Physics:
         speed = np.abs(self._qvel[:, self._robot_v]).max(1)
         # The comparison is also False for NaN.
         diverged = errors | (self._failure_count() > warnings) | ~(speed < _MAX_SPEED)
-        links, objects = self._num_links, self._num_objects
+        links, objects = self._num_links, self.num_objects
         contact = torch.from_numpy(found)
         return StepResult(
             object_contact=contact[:, :links],
@@ -306,6 +299,26 @@ class Physics:
             power=torch.from_numpy(power / self.config.substeps).float(),
             diverged=torch.from_numpy(diverged),
         )
+
+    def set_target(self, target: Tensor) -> None:
+        """Set the position targets of the PD law [rad], ``[B, J]``."""
+        ctrl = target
+        if self.config.target_velocity == "finite_difference":
+            # kp (q* - q) + kd (qdot* - qdot) = kp ((q* + kd/kp qdot*) - q) - kd qdot
+            velocity = (target - self._last_target) * self.config.control_hz
+            ctrl = target + self._kd_over_kp * velocity
+            self._last_target.copy_(target)
+        self._ctrl[:] = ctrl.numpy()
+
+    def park(self, objects: Tensor) -> None:
+        """Take objects out of play, ``[B, O]`` bool: they wait at rest far above."""
+        parked = objects.numpy()
+        self._objects(self._object_q)[parked] = _PARKING
+        self._objects(self._object_v)[parked] = 0.0
+
+    def step_raw(self) -> None:
+        """Advance one control step and look at nothing: what physics alone costs."""
+        self._batch.step(nstep=self.config.substeps)
 
     def reset(self, rows: np.ndarray, base_pose: Tensor, joint_pos: Tensor) -> None:
         """Put the robots of some rows at rest into a pose and park their objects.
@@ -318,7 +331,7 @@ class Physics:
         self._batch.reset(rows, stage=mujoco.mjtStage.mjSTAGE_NONE)
         robot = torch.cat((base_pose, joint_pos), -1).double().numpy()
         self._qpos[rows, self._robot_q] = robot
-        self._qpos[rows, self._object_q] = np.tile(_PARKING, self._num_objects)
+        self._qpos[rows, self._object_q] = np.tile(_PARKING, self.num_objects)
         if self.config.target_velocity == "finite_difference":
             self._last_target[torch.from_numpy(rows)] = joint_pos
 
@@ -375,7 +388,7 @@ class Physics:
     def _objects(self, part: slice) -> np.ndarray:
         """Live view of object positions or velocities, ``[B, O, 3]``."""
         array = self._qpos if part == self._object_q else self._qvel
-        view = array[:, part].reshape(len(array), self._num_objects, 3)
+        view = array[:, part].reshape(len(array), self.num_objects, 3)
         assert np.shares_memory(view, array)
         return view
 

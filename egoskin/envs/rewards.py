@@ -24,7 +24,7 @@ class RewardConfig:
     """Posture: times exp(-|gravity_xy|^2 / 0.2), the horizontal part in the base."""
     posture: float = -0.02
     """Posture: times the mean squared deviation from the default pose [rad^2]."""
-    energy: float = -5e-6
+    energy: float = -1e-6
     """Times the mechanical power, sum |torque x velocity| [W]."""
     drift_speed: float = -0.01
     """Drift: times the squared planar speed of the base [m^2/s^2]."""

@@ -77,7 +77,9 @@ class FieldSensor(RowTransform):
         self.objects = tuple(objects)
         links = tuple(dict.fromkeys(skin.links))
         self._kinematics = LinkKinematics(chain, links)
-        sensors = [[i for i, on in enumerate(skin.links) if on == l] for l in links]
+        sensors = [
+            [i for i, on in enumerate(skin.links) if on == link] for link in links
+        ]
         self._offsets = [skin.position[group].tolist() for group in sensors]
         # Points come link by link; the signal is in the order of the skin.
         order = torch.tensor([i for group in sensors for i in group])
@@ -95,6 +97,11 @@ class FieldSensor(RowTransform):
     def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Return (distance ``[B, S]`` [m], detected ``[B, O]``)."""
         base_pose, joint_pos, object_pose, active = inputs
+        if object_pose.shape[1] != len(self.objects):
+            raise ValueError(
+                f"the sensor was made for {len(self.objects)} objects, "
+                f"{self.in_keys[2]!r} holds {object_pose.shape[1]}"
+            )
         points = self._kinematics.points_b(joint_pos, self._offsets)
         nearest = torch.full_like(points[0], torch.inf)
         detected = []
@@ -111,6 +118,8 @@ class FieldSensor(RowTransform):
         """Return the specs of distance and detection."""
         batch, objects = spec.shape, len(self.objects)
         return (
-            Unbounded(shape=(*batch, self.num_sensors), dtype=torch.float32),
+            Unbounded(
+                shape=(*batch, self.num_sensors), dtype=spec[self.in_keys[1]].dtype
+            ),
             BinarySpec(shape=(*batch, objects), dtype=torch.bool),
         )

@@ -28,7 +28,8 @@ def place_area_uniform(
         normal.
 
     Raises:
-        ValueError: If the number is not positive or a link carries no shape.
+        ValueError: If the number is not positive, a link is not the robot's, or none
+            of the links shows any surface.
     """
     covered = tuple(links or robot.skin_links)
     points = sample_surface(robot, covered, num_sensors, seed)
@@ -38,5 +39,5 @@ def place_area_uniform(
         # What the file can hold, so that a saved skin is the same skin.
         position=points.position.round(6),
         normal=points.normal.round(6),
-        provenance={"placement": "area_uniform", "seed": seed, "links": covered},
+        provenance={"placement": "area_uniform", "seed": seed, "links": list(covered)},
     )

@@ -32,6 +32,9 @@ class Proximity(RowTransform):
             d / (d + 1 m).
         in_keys: Key of the distance.
         out_keys: Key of the signal.
+
+    Raises:
+        ValueError: If the range is not positive.
     """
 
     def __init__(
@@ -41,6 +44,8 @@ class Proximity(RowTransform):
         out_keys: Sequence[NestedKey] = ("signal",),
     ) -> None:
         super().__init__(in_keys, out_keys)
+        if not max_range > 0:
+            raise ValueError(f"max_range must be positive, got {max_range}")
         self.max_range = float(max_range)
 
     def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:

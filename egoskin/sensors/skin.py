@@ -26,6 +26,15 @@ _CONVENTIONS = {
 _UNIT_TOLERANCE = 1e-3
 
 
+def _is_vector(value: object) -> bool:
+    """Whether a JSON value is a list of three numbers."""
+    return (
+        isinstance(value, Sequence)
+        and len(value) == 3
+        and all(type(v) in (int, float) for v in value)
+    )
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Skin:
     """Sensors on a robot.
@@ -73,7 +82,7 @@ class Skin:
         for index, name in enumerate(self.links):
             if name not in known:
                 close = difflib.get_close_matches(name, known, n=1)
-                hint = f"; did you mean {close[0]!r}?" if close else ""
+                hint = f"; did you mean {close[0]!r}?" if close else "."
                 raise ValueError(
                     f"sensor {index} sits on {name!r}, which {self.robot} does not "
                     f"have{hint} Its links are {', '.join(known)}"
@@ -118,11 +127,9 @@ class Skin:
             ValueError: If the content is not such a description; the text names the
                 sensor and the field.
         """
-        if content.get("format") != _FORMAT:
-            raise ValueError(
-                f"not a skin: 'format' must be {_FORMAT!r}, got "
-                f"{content.get('format')!r}"
-            )
+        if not isinstance(content, Mapping) or content.get("format") != _FORMAT:
+            got = content.get("format") if isinstance(content, Mapping) else content
+            raise ValueError(f"not a skin: 'format' must be {_FORMAT!r}, got {got!r}")
         for name in ("robot", "sensors"):
             if name not in content:
                 raise ValueError(f"a skin needs the field {name!r}")
@@ -131,8 +138,11 @@ class Skin:
                 if name not in sensor:
                     raise ValueError(f"sensor {index} lacks the field {name!r}")
             for name in ("position", "normal"):
-                if np.shape(sensor[name]) != (3,):
-                    raise ValueError(f"sensor {index}: {name!r} must be three numbers")
+                if not _is_vector(sensor[name]):
+                    raise ValueError(
+                        f"sensor {index}: {name!r} must be three numbers, got "
+                        f"{sensor[name]!r}"
+                    )
         sensors = content["sensors"]
         return cls(
             robot=content["robot"],

@@ -1,0 +1,136 @@
+"""Known answers of the generator, and that a draw depends on its name alone."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from egoskin.draws import Stream, philox, uniform
+
+WORD = st.integers(0, 2**32 - 1)
+
+
+def words(text: str) -> list[int]:
+    return [int(word, 16) for word in text.split()]
+
+
+# Source: kat_vectors of Random123, lines "philox4x32 10": counter, key, result.
+@pytest.mark.parametrize(
+    ("counter", "key", "result"),
+    [
+        (
+            "00000000 00000000 00000000 00000000",
+            "00000000 00000000",
+            "6627e8d5 e169c58d bc57ac4c 9b00dbd8",
+        ),
+        (
+            "ffffffff ffffffff ffffffff ffffffff",
+            "ffffffff ffffffff",
+            "408f276d 41c83b0e a20bc7c6 6d5451fd",
+        ),
+        (
+            "243f6a88 85a308d3 13198a2e 03707344",
+            "a4093822 299f31d0",
+            "d16cfe09 94fdcceb 5001e420 24126ea1",
+        ),
+    ],
+)
+def test_philox_gives_the_known_answers(counter, key, result):
+    first, second = words(key)
+    got = philox(torch.tensor(words(counter)), (first, second))
+    assert got.tolist() == words(result)
+
+
+@given(st.lists(WORD, min_size=4, max_size=4), WORD, WORD)
+def test_philox_of_a_batch_is_philox_of_each_element(counter, k0, k1):
+    single = philox(torch.tensor(counter), (k0, k1))
+    others = torch.arange(4 * 5).reshape(4, 5)
+    batch = torch.cat((others, torch.tensor(counter)[:, None]), 1)
+    assert torch.equal(philox(batch, (k0, k1))[:, -1], single)
+    assert ((single >= 0) & (single < 2**32)).all()
+
+
+def draw(rows, *, seed=7, stream=Stream.THROW, episode=0, counter=0, size=5):
+    rows = torch.as_tensor(rows)
+    return uniform(
+        seed,
+        stream,
+        rows,
+        torch.as_tensor(episode).expand_as(rows),
+        torch.as_tensor(counter).expand_as(rows),
+        size,
+    )
+
+
+def test_a_number_is_the_upper_24_bits_of_its_word():
+    # The first known answer: seed 0 and stream 0 are the key 0 0, row, episode,
+    # counter and block 0 the counter. 6627e8d5 >> 8 = 6627e8.
+    got = draw([0], seed=0, stream=Stream.START, size=4)
+    expected = [0x6627E8, 0xE169C5, 0xBC57AC, 0x9B00DB]
+    assert (got[0].double() * 2**24).tolist() == expected
+
+
+@given(st.lists(st.integers(0, 10**6), min_size=1, max_size=20), st.randoms())
+def test_draws_do_not_depend_on_batch_or_order(rows, random):
+    shuffled = list(rows)
+    random.shuffle(shuffled)
+    by_row = dict(zip(shuffled, draw(shuffled).tolist(), strict=True))
+    for row in rows:
+        assert by_row[row] == draw([row])[0].tolist()
+
+
+@given(st.integers(1, 20), st.integers(0, 20))
+def test_more_numbers_begin_with_the_fewer(size, extra):
+    rows = torch.arange(3)
+    longer = draw(rows, size=size + extra)
+    assert longer.shape == (3, size + extra)
+    assert torch.equal(longer[:, :size], draw(rows, size=size))
+
+
+def test_seed_stream_row_episode_and_counter_all_matter():
+    rows = torch.arange(64)
+    variants = [
+        draw(rows),
+        draw(rows, seed=8),
+        draw(rows, stream=Stream.START),
+        draw(rows, stream=Stream.SENSOR),
+        draw(rows + 64),
+        draw(rows, episode=1),
+        draw(rows, counter=1),
+    ]
+    numbers = torch.stack(variants).flatten()
+    # 2240 draws of 24 bits: 0.15 pairs are expected to agree by chance.
+    assert len(numbers.unique()) >= len(numbers) - 2
+
+
+def test_numbers_are_uniform():
+    n, bins = 2**18, 64
+    u = draw(torch.arange(n), size=4).double()
+    assert u.min() >= 0
+    assert u.max() < 1
+    # Standard error of the mean sqrt(1/12/n), of the mean square sqrt(4/45/n).
+    assert (u.mean(0) - 1 / 2).abs().max() < 5 * (1 / 12 / n) ** 0.5
+    assert (u.square().mean(0) - 1 / 3).abs().max() < 5 * (4 / 45 / n) ** 0.5
+    for column in u.T:
+        counts = torch.histc(column, bins, 0, 1)
+        chi2 = ((counts - n / bins) ** 2 / (n / bins)).sum()
+        # 63 degrees of freedom: mean 63, standard deviation sqrt(126) = 11.2.
+        assert 63 - 5 * 11.2 < chi2 < 63 + 5 * 11.2
+
+
+def test_numbers_of_neighbours_are_uncorrelated():
+    n = 2**16
+    u = draw(torch.arange(n), size=4).double() - 0.5
+    next_episode = draw(torch.arange(n), episode=1, size=4).double() - 0.5
+    pairs = [(u[:, 0], u[:, 1]), (u[:-1, 0], u[1:, 0]), (u[:, 0], next_episode[:, 0])]
+    for a, b in pairs:
+        # The correlation of n independent pairs has standard deviation 1/sqrt(n).
+        assert abs(12 * (a * b).mean()) < 5 / n**0.5
+
+
+@pytest.mark.parametrize("seed", [-1, 2**32])
+def test_seed_outside_32_bits_is_refused(seed):
+    with pytest.raises(ValueError, match=r"seed must be in \[0, 2\*\*32\), got"):
+        draw([0], seed=seed)

@@ -1,0 +1,90 @@
+"""The three signals, worked out by hand."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from egoskin.sensors import Binary, Localization, Proximity
+
+INF = math.inf
+HALF = 0.5**0.5
+
+
+def test_proximity_is_distance_over_range():
+    (signal,) = Proximity(2.0).compute(torch.tensor([[0.0, 0.5, 1.0, 2.0, INF]]))
+    assert signal.tolist() == [[0, 0.25, 0.5, 1, 1]]
+
+
+def test_proximity_of_an_infinite_range_is_d_over_d_plus_one():
+    (signal,) = Proximity(INF).compute(torch.tensor([[0.0, 1.0, 3.0, INF]]))
+    # 0/1, 1/2, 3/4, and nothing at all
+    assert signal.tolist() == [[0, 0.5, 0.75, 1]]
+
+
+@given(st.floats(0, 1e6), st.floats(0, 1e6), st.floats(0.01, 100))
+def test_proximity_grows_with_distance_and_stays_in_bounds(a, b, max_range):
+    near, far = sorted((a, b))
+    for limit in (max_range, INF):
+        (signal,) = Proximity(limit).compute(torch.tensor([[near, far]]))
+        assert 0 <= signal[0, 0] <= signal[0, 1] <= 1
+
+
+@pytest.mark.parametrize("max_range", [0.0, -2.0, math.nan])
+def test_proximity_refuses_a_range_that_is_not_positive(max_range):
+    with pytest.raises(ValueError, match="max_range must be positive, got"):
+        Proximity(max_range)
+
+
+def test_binary_is_one_for_any_distance_in_range():
+    (signal,) = Binary().compute(torch.tensor([[0.0, 1.9, INF]]))
+    assert signal.tolist() == [[1, 1, 0]]
+    assert signal.dtype == torch.float32
+
+
+def localize(base_pose, centres, detected) -> list[float]:
+    pose = torch.zeros(1, len(centres), 7, dtype=torch.float64)
+    pose[0, :, :3] = torch.tensor(centres)
+    (signal,) = Localization().compute(
+        torch.tensor([base_pose], dtype=torch.float64), pose, torch.tensor([detected])
+    )
+    return signal[0].tolist()
+
+
+UPRIGHT = [0.0, 0, 0, 1, 0, 0, 0]
+
+
+def test_localization_is_relative_to_the_base():
+    base = [1.0, 2, 3, 1, 0, 0, 0]
+    assert localize(base, [(2.0, 2, 2.5)], [True]) == [1, 0, -0.5]
+
+
+def test_localization_turns_with_the_base():
+    # Base at (1, 0, 1), turned +90 deg about z: its x axis is the world's y, its y
+    # axis the world's -x. A ball 2 m to the world's y is 2 m ahead.
+    base = [1.0, 0, 1, HALF, 0, 0, HALF]
+    assert localize(base, [(1.0, 2, 1)], [True]) == pytest.approx([2, 0, 0])
+    assert localize(base, [(0.0, 0, 1)], [True]) == pytest.approx([0, 1, 0])
+    # Pitched +90 deg about y (nose down): its x axis is the world's -z, its z the x.
+    base = [0.0, 0, 0, HALF, 0, HALF, 0]
+    assert localize(base, [(3.0, 1, -2)], [True]) == pytest.approx([2, 1, 3])
+
+
+def test_localization_is_zero_if_nothing_is_detected():
+    assert localize(UPRIGHT, [(1.0, 0, 0), (2.0, 0, 0)], [False, False]) == [0, 0, 0]
+
+
+def test_localization_gives_the_detected_ball_nearest_to_the_base():
+    balls = [(0.0, 3, 0), (1.0, 0, 0), (0.0, 0, 2)]
+    assert localize(UPRIGHT, balls, [True, True, True]) == [1, 0, 0]
+    assert localize(UPRIGHT, balls, [True, False, True]) == [0, 0, 2]
+    assert localize(UPRIGHT, balls, [True, False, False]) == [0, 3, 0]
+
+
+def test_localization_ignores_an_undetected_ball_wherever_it_is():
+    balls = [(0.0, 3, 0), (0.0, 0, 1000)]
+    assert localize(UPRIGHT, balls, [True, False]) == [0, 3, 0]

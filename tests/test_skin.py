@@ -1,0 +1,207 @@
+"""The skin, its sensor frames, its file, and the random placement."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from egoskin.robots import H1_2
+from egoskin.sensors import Skin, place_area_uniform
+
+
+def make_skin(normal, **changes) -> Skin:
+    normal = np.atleast_2d(np.asarray(normal, float))
+    fields = {
+        "robot": "h1_2",
+        "links": ("torso_link",) * len(normal),
+        "position": np.zeros_like(normal),
+        "normal": normal,
+    }
+    return Skin(**{**fields, **changes})
+
+
+UNIT = (
+    arrays(float, 3, elements=st.floats(-1, 1))
+    .filter(lambda v: np.linalg.norm(v) > 0.1)
+    .map(lambda v: v / np.linalg.norm(v))
+)
+
+
+# --- frames ---------------------------------------------------------------------
+
+
+@given(UNIT)
+def test_sensor_frames_are_right_handed_with_z_along_the_normal(normal):
+    (frame,) = make_skin(normal).rotation()
+    np.testing.assert_allclose(frame.T @ frame, np.eye(3), atol=1e-9)
+    assert np.linalg.det(frame) == pytest.approx(1)
+    np.testing.assert_array_equal(frame[:, 2], normal)
+    # x = normalise(z_link x n): horizontal in the link frame, unless n is parallel.
+    if np.hypot(*normal[:2]) > 1e-3:
+        across = np.array([-normal[1], normal[0], 0]) / np.hypot(*normal[:2])
+        np.testing.assert_allclose(frame[:, 0], across, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("normal", "x", "y"),
+    [
+        ([1, 0, 0], [0, 1, 0], [0, 0, 1]),  # z x x = y, then y = z_sensor x x_sensor
+        ([0, 1, 0], [-1, 0, 0], [0, 0, 1]),
+        ([0, 0, 1], [1, 0, 0], [0, 1, 0]),  # parallel: x_link
+        ([0, 0, -1], [1, 0, 0], [0, -1, 0]),
+    ],
+)
+def test_sensor_frames_by_hand(normal, x, y):
+    (frame,) = make_skin(normal).rotation()
+    np.testing.assert_allclose(frame, np.array([x, y, normal]).T, atol=1e-12)
+
+
+@given(st.floats(-1e-5, 1e-5), st.floats(-1e-5, 1e-5))
+def test_frames_stay_orthonormal_where_the_convention_switches(a, b):
+    normal = np.array([a, b, 1.0])
+    (frame,) = make_skin(normal / np.linalg.norm(normal)).rotation()
+    np.testing.assert_allclose(frame.T @ frame, np.eye(3), atol=1e-9)
+    assert np.linalg.det(frame) == pytest.approx(1)
+
+
+# --- file -----------------------------------------------------------------------
+
+
+def test_a_saved_skin_is_the_same_skin(skin, tmp_path):
+    skin.save(tmp_path / "skin.json")
+    loaded = Skin.load(tmp_path / "skin.json")
+    assert loaded.links == skin.links
+    assert loaded.robot == skin.robot
+    assert loaded.provenance == skin.provenance
+    np.testing.assert_array_equal(loaded.position, skin.position)
+    np.testing.assert_array_equal(loaded.normal, skin.normal)
+
+
+def test_the_file_is_json_with_one_sensor_on_each_line(skin, tmp_path):
+    path = tmp_path / "skin.json"
+    skin.save(path)
+    text = path.read_text()
+    assert json.loads(text)["conventions"]["position"].startswith("metres")
+    lines = [line for line in text.splitlines() if '"link"' in line]
+    assert len(lines) == len(skin)
+    assert json.loads(lines[3].strip().rstrip(","))["link"] == skin.links[3]
+    assert max(map(len, text.splitlines())) < 160
+
+
+def test_saving_a_loaded_skin_changes_no_byte(skin, tmp_path):
+    skin.save(tmp_path / "a.json")
+    Skin.load(tmp_path / "a.json").save(tmp_path / "b.json")
+    assert (tmp_path / "a.json").read_text() == (tmp_path / "b.json").read_text()
+
+
+SENSOR = {"link": "torso_link", "position": [0, 0, 0], "normal": [0, 0, 1]}
+
+
+def without(content: dict, name: str) -> dict:
+    return {key: value for key, value in content.items() if key != name}
+
+
+def skin_content(*sensors: dict) -> dict:
+    return {"format": "egoskin-skin-1", "robot": "h1_2", "sensors": list(sensors)}
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("{ no json", "Expecting"),
+        ("[1, 2]", r"not a skin: .* got \[1, 2\]"),
+        ({"robot": "h1_2"}, "not a skin: 'format' must be 'egoskin-skin-1', got None"),
+        (without(skin_content(SENSOR), "robot"), "needs the field 'robot'"),
+        (without(skin_content(SENSOR), "sensors"), "needs the field 'sensors'"),
+        (skin_content(), "at least one sensor"),
+        (
+            skin_content(SENSOR, without(SENSOR, "normal")),
+            "sensor 1 lacks the field 'normal'",
+        ),
+        (
+            skin_content(SENSOR, {**SENSOR, "position": [0, 1]}),
+            r"sensor 1: 'position' must be three numbers, got \[0, 1\]",
+        ),
+        (
+            skin_content({**SENSOR, "position": [0, 1, "a"]}),
+            "sensor 0: 'position' must be three numbers",
+        ),
+        (
+            skin_content(SENSOR, {**SENSOR, "normal": [0, 0, 2]}),
+            "normal of sensor 1 has length 2.0000, not 1",
+        ),
+        (
+            skin_content({**SENSOR, "position": [0, 0, float("nan")]}),
+            "position holds values that are not finite",
+        ),
+    ],
+)
+def test_a_bad_file_is_refused_with_its_name_and_its_fault(tmp_path, content, message):
+    path = tmp_path / "bad.json"
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    with pytest.raises(ValueError, match=f"bad.json: .*{message}"):
+        Skin.load(path)
+
+
+def test_a_missing_file_is_refused_with_its_name():
+    with pytest.raises(ValueError, match=r"nowhere.json: .*No such file"):
+        Skin.load(Path("nowhere.json"))
+
+
+@pytest.mark.parametrize("name", ["position", "normal"])
+def test_arrays_of_the_wrong_shape_are_refused(name):
+    with pytest.raises(ValueError, match=rf"{name} must be \(1, 3\), got \(2, 3\)"):
+        replace(make_skin([0, 0, 1]), **{name: np.zeros((2, 3))})
+
+
+def test_an_unknown_link_is_refused_with_the_closest_name():
+    skin = make_skin([[0, 0, 1]] * 2, links=("torso_link", "left_elbo_link"))
+    with pytest.raises(
+        ValueError, match=r"sensor 1 .*did you mean 'left_elbow_link'\?"
+    ):
+        skin.check_links(H1_2.links)
+    skin = make_skin([0, 0, 1], links=("xyz",))
+    with pytest.raises(
+        ValueError,
+        match=r"sensor 0 sits on 'xyz', which h1_2 does not have\. Its links",
+    ):
+        skin.check_links(H1_2.links)
+
+
+# --- placement ------------------------------------------------------------------
+
+
+def test_placement_is_decided_by_its_seed():
+    first, again, other = (place_area_uniform(H1_2, 50, seed) for seed in (1, 1, 2))
+    assert first.links == again.links
+    np.testing.assert_array_equal(first.position, again.position)
+    np.testing.assert_array_equal(first.normal, again.normal)
+    assert not np.isclose(first.position, other.position).all(-1).any()
+
+
+def test_placement_covers_the_skin_links_alone():
+    skin = place_area_uniform(H1_2, 1000, seed=0)
+    assert len(skin) == 1000
+    carrying = {shape.link for shape in H1_2.primitives}
+    assert set(skin.links) == set(H1_2.skin_links) & carrying
+    skin.check_links(H1_2.links)
+
+
+def test_placement_covers_the_links_asked_for():
+    skin = place_area_uniform(H1_2, 20, seed=0, links=["pelvis"])
+    assert set(skin.links) == {"pelvis"}
+    assert skin.provenance["links"] == ["pelvis"]
+
+
+def test_placement_refuses_what_it_cannot_place():
+    with pytest.raises(ValueError, match="must be positive, got 0"):
+        place_area_uniform(H1_2, 0, seed=0)
+    with pytest.raises(ValueError, match="no link 'chest'"):
+        place_area_uniform(H1_2, 5, seed=0, links=["torso_link", "chest"])
