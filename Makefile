@@ -18,7 +18,7 @@ test-slow: $(VENV)/dev
 check: $(VENV)/dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/pyright
+	$(BIN)/pyright --pythonpath $(BIN)/python
 
 bench: $(VENV)/run
 	$(BIN)/python scripts/bench.py loop $(ARGS)

@@ -35,9 +35,11 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING, Any
 
-# Threads of torch that wait in a busy loop take the cores from the physics. Read by
-# OpenMP when torch is first imported; whoever sets it himself is obeyed.
+# Threads of torch that wait in a busy loop take the cores from whatever else runs; on
+# a loaded machine an update then takes tens of times as long. OpenMP reads these when
+# torch is first imported, so import egoskin before it; what is set already stays.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+os.environ.setdefault("GOMP_SPINCOUNT", "0")
 
 if TYPE_CHECKING:
     from egoskin.make import EnvConfig, make_env, make_worker_env

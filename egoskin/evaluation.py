@@ -98,7 +98,8 @@ def wilson(successes: int, n: int) -> Estimate:
     p, z2 = successes / n, _Z**2
     centre = (p + z2 / (2 * n)) / (1 + z2 / n)
     half = _Z / (1 + z2 / n) * math.sqrt(p * (1 - p) / n + z2 / (4 * n**2))
-    return Estimate(mean=p, low=min(centre - half, p), high=max(centre + half, p))
+    low, high = max(centre - half, 0.0), min(centre + half, 1.0)
+    return Estimate(mean=p, low=min(low, p), high=max(high, p))
 
 
 def mean_estimate(values: Tensor) -> Estimate:

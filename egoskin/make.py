@@ -12,11 +12,11 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import (
     Compose,
-    EnvBase,
     ExcludeTransform,
     TransformedEnv,
 )
 
+from egoskin.checkpoint import part, prefixed
 from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
 from egoskin.observations import Privileged, Proprioception
 from egoskin.robots import ROBOTS, RobotConfig
@@ -258,21 +258,16 @@ def check_num_workers(num_envs: int, num_workers: int | None) -> int:
     return num_workers
 
 
-def save_env_state(
-    env: WorkerPool | EnvBase, root: TensorDictBase
-) -> dict[str, Tensor]:
+def save_env_state(env: WorkerPool, root: TensorDictBase) -> dict[str, Tensor]:
     """Return the state of all rows, to continue from bit for bit.
 
     Args:
         env: What `make_env` returned, stepped at least once or reset.
         root: The tensordict the next step would start from.
     """
-    states = list(env.simulation_state())
-    merged = {k: torch.cat([s[k] for s in states]) for k in states[0]}
-    flat = root.reshape(-1)
     return {
-        **{f"simulation/{k}": v for k, v in merged.items()},
-        **{f"root/{k}": v.clone() for k, v in flat.items()},
+        **prefixed("simulation", env.simulation_state()),
+        **prefixed("root", {k: v.clone() for k, v in root.reshape(-1).items()}),
     }
 
 
@@ -283,13 +278,8 @@ def load_env_state(env: WorkerPool, state: dict[str, Tensor]) -> TensorDictBase:
         env: A fresh environment of `make_env`, of any number of workers.
         state: What `save_env_state` returned.
     """
-    simulation = {
-        k.removeprefix("simulation/"): v
-        for k, v in state.items()
-        if k.startswith("simulation/")
-    }
     root = env.reset()
-    list(env.load_simulation_state(simulation))
+    env.load_simulation_state(part("simulation", state))
     for key in root.keys():
         value = state[f"root/{key}"]
         root.set(key, value.reshape(root[key].shape).clone())

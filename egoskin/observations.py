@@ -27,6 +27,8 @@ class Proprioception(RowTransform):
         out_keys: Key of the observation.
     """
 
+    _default: Tensor
+
     def __init__(
         self,
         default_joint_pos: Tensor,
@@ -52,7 +54,7 @@ class Proprioception(RowTransform):
     def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
         """Return the spec of the observation."""
         size, dtype = 6 + 2 * len(self._default), spec[self.in_keys[2]].dtype
-        return (Unbounded(shape=(*spec.shape, size), dtype=dtype),)
+        return (Unbounded(shape=torch.Size((*spec.shape, size)), dtype=dtype),)
 
 
 class Privileged(RowTransform):
@@ -123,4 +125,4 @@ class Privileged(RowTransform):
     def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
         """Return the spec of the observation."""
         dtype = spec[self.in_keys[0]].dtype
-        return (Unbounded(shape=(*spec.shape, self._size), dtype=dtype),)
+        return (Unbounded(shape=torch.Size((*spec.shape, self._size)), dtype=dtype),)

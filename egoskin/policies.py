@@ -124,7 +124,8 @@ class Policy(nn.Module):
         super().__init__()
         self._head = agent.head.requires_grad_(False)
         self.spec = spec
-        self.in_keys, self.out_keys = list(agent.actor_keys), ["action"]
+        self.in_keys = [str(key) for key in agent.actor_keys]
+        self.out_keys = ["action"]
 
     @property
     def env_config(self) -> EnvConfig:

@@ -20,10 +20,10 @@ from typing import Any
 import mujoco
 import numpy as np
 import torch
-from PIL import Image, ImageDraw, ImageFont
 from tensordict import TensorDictBase
 from torchrl.envs import step_mdp
 
+from egoskin.film import Frame
 from egoskin.make import EnvConfig, make_worker_env
 from egoskin.robots import RobotConfig
 from egoskin.sensors import Skin
@@ -39,12 +39,12 @@ _LIT_RGBA = (0.1, 0.95, 1.0, 1.0)
 _FIELD_LINE_RGB = (0.1, 0.35, 1.0)
 _BALL_RGBA = (0.95, 0.35, 0.08, 1.0)
 # Drawn radii [m]: a sensor at rest, one that detects, a line.
-_IDLE_RADIUS, _LIT_RADIUS, _LINE_RADIUS = 0.014, 0.021, 0.006
+_IDLE_RADIUS, _LIT_RADIUS, _LINE_RADIUS = 0.017, 0.022, 0.006
 # Lines fade with their length, from opaque at 0 to the faintest at this [m].
 _FADE_LENGTH, _FAINTEST = 2.5, 0.25
 # The camera's point of attention follows the base with this time constant [s] and
 # stays at this height [m].
-_FOLLOW_TIME, _LOOK_HEIGHT = 0.4, 1.0
+_FOLLOW_TIME, _LOOK_HEIGHT = 0.4, 1.25
 
 
 class RenderingError(ValueError):
@@ -55,30 +55,12 @@ class RenderingError(ValueError):
 class CameraConfig:
     """Where the camera is, relative to the robot that it follows."""
 
-    distance: float = 6.0
+    distance: float = 5.2
     """Distance to the robot [m]."""
     azimuth_deg: float = 30.0
     """Bearing of the camera, from the robot's heading at the start [deg]."""
-    elevation_deg: float = 16.0
+    elevation_deg: float = 10.0
     """Angle by which the camera looks down [deg]."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Frame:
-    """One picture of an episode and what there is to say about it."""
-
-    image: np.ndarray
-    """Picture without text, ``[height, width, 3]`` uint8."""
-    time: float
-    """Age of the episode [s]."""
-    gap: float
-    """From the robot's surface to that of the nearest ball in play [m], or inf."""
-    num_detecting: int
-    """Number of sensors that detect something."""
-    num_sensors: int
-    """Number of sensors (0 for a blind robot)."""
-    ending: str | None
-    """Why the episode ends here ("hit", "fall", ...); None while it goes on."""
 
 
 def render_episode(
@@ -246,8 +228,8 @@ class Painter:
             ending: Why the episode ends here, for the frame.
         """
         active = state["object_active"].numpy()
-        self._place(state, active)
         self._follow(state["base_pose"].double().numpy(), time)
+        self._place(state, active)
         self._canvas.update(self._data, self._camera)
         detecting = np.zeros(0, dtype=bool)
         if self._skin is not None:
@@ -267,7 +249,11 @@ class Painter:
         robot_q = torch.cat((state["base_pose"], state["joint_pos"]))
         self._data.qpos[:] = robot_q.double().numpy()
         pose = state["object_pose"].double().numpy()
-        self._data.mocap_pos[:], self._data.mocap_quat[:] = pose[:, :3], pose[:, 3:]
+        lamp = np.array([*self._camera.lookat[:2], 0.0])
+        half = math.radians(self._camera.azimuth) / 2
+        turn = np.array([math.cos(half), 0.0, 0.0, math.sin(half)])
+        self._data.mocap_pos[:] = [*pose[:, :3], lamp]
+        self._data.mocap_quat[:] = [*pose[:, 3:], turn]
         # What is transparent is not drawn.
         self._model.geom_rgba[self._object_geoms, 3] = active
         mujoco.mj_kinematics(self._model, self._data)
@@ -369,7 +355,8 @@ def _build_model(
     spec.visual.rgba.haze = [0.86, 0.88, 0.91, 1]
     # Extent scales near plane, fog and shadow of the scene [m].
     spec.stat.extent, spec.stat.center = 3.0, [0, 0, 1]
-    spec.visual.map.znear, spec.visual.map.zfar = 0.02, 40.0
+    spec.visual.map.znear, spec.visual.map.zfar = 0.02, 12.0
+    spec.visual.map.shadowclip = 3.0
     spec.add_texture(
         name="sky",
         type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
@@ -390,26 +377,24 @@ def _build_model(
         width=512,
         height=512,
     )
-    # A texture is two tiles wide: tiles of 0.5 m.
+    # The texture of 2 x 2 tiles is 2 m wide: tiles of 1 m.
     tiles = spec.add_material(name="tiles", texuniform=True, texrepeat=[1, 1])
     tiles.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "tiles"
-    tiles.reflectance = 0.08
     world.add_geom(
         type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.05], material="tiles"
     )
-    # The light moves with the base: its shadow map covers only what is near it.
-    spec.body(robot.base).add_light(
-        pos=[1.0, -1.5, 4.0],
-        dir=[-0.25, 0.35, -1.0],
-        mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACK,
+    for i, shape in enumerate(objects):
+        body = world.add_body(name=f"ball_{i}", mocap=True)
+        shape.add_geom(body, name=f"object_{i}", rgba=_BALL_RGBA)
+    # The light moves with the camera: its shadow map covers what is near the robot.
+    world.add_body(name="lamp", mocap=True).add_light(
+        pos=[-1.6, 1.2, 4.0],
+        dir=[0.4, -0.3, -1.0],
         type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
         castshadow=True,
         diffuse=[0.55, 0.55, 0.53],
         specular=[0.2, 0.2, 0.2],
     )
-    for i, shape in enumerate(objects):
-        body = world.add_body(name=f"ball_{i}", mocap=True)
-        shape.add_geom(body, name=f"object_{i}", rgba=_BALL_RGBA)
     return spec.compile()
 
 
@@ -522,93 +507,3 @@ def no_gl_text(backend: str) -> str:
         "install one (Debian: `apt-get install libegl1`, or `apt-get install "
         "libosmesa6` and set MUJOCO_GL=osmesa)"
     )
-
-
-def annotate(frame: Frame, width: int | None = None) -> np.ndarray:
-    """Return a frame's picture with its figures written into it.
-
-    Args:
-        frame: The frame.
-        width: Width to scale to [px]; None for the picture's own.
-
-    Returns:
-        Picture, ``[height, width, 3]`` uint8.
-    """
-    picture = Image.fromarray(frame.image)
-    if width is not None:
-        height = round(width * picture.height / picture.width)
-        picture = picture.resize((width, height), Image.Resampling.LANCZOS)
-    parts = [f"{frame.time:5.2f} s"]
-    if math.isfinite(frame.gap):
-        parts.append(f"ball at {max(frame.gap, 0.0):.2f} m")
-    if frame.num_sensors:
-        parts.append(f"{frame.num_detecting} of {frame.num_sensors} sensors")
-    pen = ImageDraw.Draw(picture)
-    unit = picture.height / 24
-    _write(pen, (0.7 * unit, 0.5 * unit), "    ".join(parts), unit, (20, 24, 32))
-    if frame.ending is not None:
-        is_failure = frame.ending not in ("time limit", "cut")
-        colour = (200, 20, 20) if is_failure else (20, 24, 32)
-        place = (0.7 * unit, 2.0 * unit)
-        _write(pen, place, frame.ending.upper(), 2.4 * unit, colour)
-    return np.asarray(picture)
-
-
-def _write(
-    pen: ImageDraw.ImageDraw,
-    place: tuple[float, float],
-    text: str,
-    size: float,
-    colour: tuple[int, int, int],
-) -> None:
-    """Write text with a pale outline, legible on any background."""
-    font = ImageFont.load_default(size)
-    outline = max(1, round(size / 14))
-    pen.text(
-        place, text, colour, font, stroke_width=outline, stroke_fill=(245, 246, 248)
-    )
-
-
-def pick_moments(frames: Sequence[Frame], count: int) -> list[int]:
-    """Return the indices of the frames that tell the episode best, in order.
-
-    The first and the last, the closest approaches (at most half of them), and then
-    always the frame that is farthest from those picked already.
-
-    Args:
-        frames: Frames in order of time.
-        count: Number of frames wanted; fewer if there are fewer.
-    """
-    gaps = np.array([np.inf, *(f.gap for f in frames), np.inf])
-    inner = gaps[1:-1]
-    is_minimum = np.isfinite(inner) & (inner <= gaps[:-2]) & (inner <= gaps[2:])
-    minima = np.flatnonzero(is_minimum)
-    closest = minima[inner[minima].argsort()][: count // 2]
-    picked = list(dict.fromkeys([0, len(frames) - 1, *closest.tolist()]))[:count]
-    index = np.arange(len(frames))
-    while len(picked) < min(count, len(frames)):
-        away = np.abs(index[:, None] - np.array(picked)).min(1)
-        picked.append(int(away.argmax()))
-    return sorted(picked)
-
-
-def contact_sheet(
-    frames: Sequence[Frame], *, count: int = 12, columns: int = 3, width: int = 640
-) -> np.ndarray:
-    """Return a grid of the moments that tell an episode best.
-
-    Args:
-        frames: Frames in order of time.
-        count: Number of pictures.
-        columns: Pictures in each line.
-        width: Width of each picture [px].
-
-    Returns:
-        Picture, ``[rows * height, columns * width, 3]`` uint8, white where no picture
-        is.
-    """
-    cells = [annotate(frames[i], width) for i in pick_moments(frames, count)]
-    while len(cells) % columns:
-        cells.append(np.full_like(cells[0], 255))
-    lines = [cells[i : i + columns] for i in range(0, len(cells), columns)]
-    return np.concatenate([np.concatenate(line, axis=1) for line in lines])

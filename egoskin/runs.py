@@ -141,7 +141,7 @@ def parse_config(args: list[str]) -> TrainConfig:
     assert config.resume is not None
     before, after = to_plain(stored), to_plain(config)
     for name in _CALL_FIELDS:
-        before.pop(name), after.pop(name)
+        del before[name], after[name]
     if config.run_dir is not None:
         raise ValueError("--run-dir cannot be changed on resume")
     changed = [n for n in changed_fields(before, after) if n != "total_frames"]

@@ -49,8 +49,9 @@ class RowTransform(Transform):
     def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
         """Return the spec of each out key, ``[*B, ...]``, from the input's spec."""
 
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Return the spec with the out keys added."""
+        assert isinstance(observation_spec, Composite)
         for key, spec in zip(
             self.out_keys, self.out_specs(observation_spec), strict=True
         ):
@@ -72,7 +73,9 @@ class RowTransform(Transform):
             next_tensordict.set(key, value.reshape(*batch, *value.shape[1:]))
         return next_tensordict
 
-    forward = _call
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the out keys into any tensordict that holds the in keys."""
+        return self._call(tensordict)
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase

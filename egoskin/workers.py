@@ -20,6 +20,7 @@ from pathlib import Path
 
 import torch
 from tensordict import TensorDictBase
+from torch import Tensor
 from torchrl.envs import EnvBase, ParallelEnv, Transform, TransformedEnv
 
 # Shorter than a hundredth of any batched step, long enough to cost no CPU [s].
@@ -120,6 +121,23 @@ class WorkerPool(ParallelEnv):
         )
         # TorchRL lowers the parent's threads for good when the workers start.
         self.num_threads = threads
+
+    def simulation_state(self) -> dict[str, Tensor]:
+        """Return the state of all rows, in the order of the workers."""
+        states = self._ask("simulation_state")
+        return {k: torch.cat([s[k] for s in states]) for k in states[0]}
+
+    def load_simulation_state(self, state: dict[str, Tensor]) -> None:
+        """Give every worker the state of all rows; each takes its own."""
+        self._ask("load_simulation_state", state)
+
+    def _ask(self, method: str, *args: object) -> list:
+        """Return what a method of every worker's environment answers."""
+        if self.is_closed:
+            self.start()
+        for channel in self.parent_channels:
+            channel.send((method, (args, {})))
+        return [channel.recv()[1] for channel in self.parent_channels]
 
     def _report(self, worker: int) -> Path:
         return self._reports / f"worker-{worker}.txt"

@@ -175,7 +175,7 @@ def mesh_points(
     mesh = trimesh.util.concatenate(meshes)
     # Enough for a span that holds a tenth of the area.
     count, seed = 10 * options.samples, options.seed
-    points, faces = trimesh.sample.sample_surface(mesh, count, seed=seed)
+    points, faces = trimesh.sample.sample_surface(mesh, count, seed=seed)[:2]
     kept = np.flatnonzero(within(points, span))[: options.samples]
     points, normals = points[kept], mesh.face_normals[faces[kept]]
     return points, openness(scene, points, normals) >= options.min_openness

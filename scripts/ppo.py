@@ -6,6 +6,10 @@ python scripts/ppo.py --resume runs/NAME --total-frames 100_000_000
 
 from __future__ import annotations
 
+import egoskin  # noqa: F401  (before torch: it says how torch's threads wait)
+
+# isort: split
+
 import dataclasses
 import math
 import signal
@@ -102,7 +106,7 @@ class Trainer:
             "time/wall_s": self.wall_s,
             "time/steps_per_s": self.config.frames_per_batch / (end - start),
             "time/collect_share": (collected - start) / (end - start),
-            **self._episode_metrics(torch.stack(infos)),
+            **self._episode_metrics(TensorDict.maybe_dense_stack(infos)),
             **{f"ppo/{name}": value for name, value in learned.items()},
         }
 
@@ -113,7 +117,7 @@ class Trainer:
             self.survival.update(info["episode_step"][:, 0], info["terminated"][:, 0])
         hz = self.config.env.task.physics.control_hz
         ended = float(infos["terminated"].sum())
-        terms = infos["reward_terms"].mean((0, 1)).tolist()
+        terms = infos["reward_terms"].mean(0).mean(0).tolist()
 
         def share_of_ends(key: str) -> float:
             return float(infos[key].sum()) / ended if ended else float("nan")

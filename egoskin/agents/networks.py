@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
+from tensordict import NestedKey
 from tensordict.nn import InteractionType, TensorDictModule
 from torch import Tensor, nn
 from torchrl.modules import IndependentNormal, ProbabilisticActor
@@ -57,6 +58,9 @@ class RunningNorm(nn.Module):
 
     # Normalised values beyond this many standard deviations are cut off.
     LIMIT = 10.0
+    count: Tensor
+    mean: Tensor
+    var: Tensor
 
     def __init__(self, size: int) -> None:
         super().__init__()
@@ -105,15 +109,14 @@ class KeyedMLP(nn.Module):
     ) -> None:
         super().__init__()
         self.norms = nn.ModuleList(n if n is not None else nn.Identity() for n in norms)
-        self.inputs = nn.ModuleList(
-            nn.Linear(size, hidden[0], bias=i == 0) for i, size in enumerate(sizes)
-        )
         # One orthogonal matrix over all inputs, as for their concatenation.
         joined = torch.empty(hidden[0], sum(sizes))
         nn.init.orthogonal_(joined, gain=2**0.5)
-        for linear, part in zip(self.inputs, joined.split(list(sizes), 1), strict=True):
+        inputs = [nn.Linear(n, hidden[0], bias=i == 0) for i, n in enumerate(sizes)]
+        for linear, part in zip(inputs, joined.split(list(sizes), 1), strict=True):
             linear.weight.data.copy_(part)
-        nn.init.zeros_(self.inputs[0].bias)
+        nn.init.zeros_(inputs[0].bias)
+        self.inputs = nn.ModuleList(inputs)
         layers: list[nn.Module] = [nn.ELU()]
         for before, after in zip(hidden, hidden[1:], strict=False):
             layers += [_orthogonal(before, after, 2**0.5), nn.ELU()]
@@ -122,11 +125,11 @@ class KeyedMLP(nn.Module):
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """Return the outputs, ``[*B, out]``, from one ``[*B, size]`` for each input."""
-        total = None
-        for x, norm, linear in zip(inputs, self.norms, self.inputs, strict=True):
-            part = linear(norm(x))
-            total = part if total is None else total + part
-        return self.tail(total)
+        first, *others = (
+            linear(norm(x))
+            for x, norm, linear in zip(inputs, self.norms, self.inputs, strict=True)
+        )
+        return self.tail(sum(others, start=first))
 
 
 def _orthogonal(before: int, after: int, gain: float) -> nn.Linear:
@@ -192,17 +195,19 @@ class Agent(nn.Module):
         config: NetworkConfig,
     ) -> None:
         super().__init__()
-        self.actor_keys, self.critic_keys = list(actor_keys), list(critic_keys)
+        self.actor_keys: list[NestedKey] = list(actor_keys)
+        self.critic_keys: list[NestedKey] = list(critic_keys)
         normalized = [
             key
             for key in critic_keys
             if config.normalize == "all" or key not in _SIGNAL_KEYS
         ]
-        self.norms = nn.ModuleDict({key: RunningNorm(sizes[key]) for key in normalized})
+        norms = {key: RunningNorm(sizes[key]) for key in normalized}
+        self.norms = nn.ModuleDict(norms)
 
         def network(keys: Sequence[str], out: int, gain: float) -> KeyedMLP:
-            norms = [self.norms[k] if k in self.norms else None for k in keys]
-            return KeyedMLP([sizes[k] for k in keys], norms, config.hidden, out, gain)
+            used = [norms.get(k) for k in keys]
+            return KeyedMLP([sizes[k] for k in keys], used, config.hidden, out, gain)
 
         # A small last layer: the first actions stay near the default pose.
         self.head = GaussianHead(

@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
-from egoskin.agents.networks import Agent, NetworkConfig
+from egoskin.agents.networks import Agent, NetworkConfig, RunningNorm
 
 # Adaptive learning rate (Unitree's and other humanoid codes): bounds and factor.
 _LR_BOUNDS, _LR_FACTOR = (1e-5, 1e-2), 1.5
@@ -111,7 +111,8 @@ def collect(
         frames.append(frame)
         bootstraps.append(_timeout_values(agent, after, device))
         infos.append(after.exclude(*inputs))
-    rollout = torch.stack(frames)
+    rollout = TensorDict.maybe_dense_stack(frames)
+    assert isinstance(rollout, TensorDict)
     last = root.select(*inputs).reshape(-1).to(device)
     agent.critic(rollout)
     following = agent.critic(last)["state_value"]
@@ -218,6 +219,7 @@ class PPO:
                 sums[name] = sums.get(name, 0.0) + value
             count += 1
         for key, norm in self.agent.norms.items():
+            assert isinstance(norm, RunningNorm)
             norm.update(data[key])
         metrics = {name: float(value) / count for name, value in sums.items()}
         metrics["explained_variance"] = float(explained)
@@ -236,8 +238,8 @@ class PPO:
         # A loss that is not finite shows in a gradient norm that is not.
         if not torch.isfinite(actor_norm + critic_norm):
             raise NonFiniteError(
-                f"loss {float(total)}, actor gradient norm {float(actor_norm)}, critic "
-                f"gradient norm {float(critic_norm)}"
+                f"loss {float(total.detach())}, actor gradient norm "
+                f"{float(actor_norm)}, critic gradient norm {float(critic_norm)}"
             )
         self.optimizer.step()
         self.agent.head.bound_std()
@@ -254,6 +256,7 @@ class PPO:
     def _adapt_learning_rate(self, batch: TensorDictBase) -> Tensor:
         """Divergence of the policy from the one that collected; adapts the rate."""
         part = batch[:_KL_FRAMES]
+        assert isinstance(part, TensorDictBase)
         old = part["loc"], part["scale"]
         new = self.agent.head(*(part[key] for key in self.agent.actor_keys))
         kl = gaussian_kl(*old, *new).mean()

@@ -32,7 +32,7 @@ class DodgeballConfig:
     """The balls and how they are thrown."""
     reward: RewardConfig = field(default_factory=RewardConfig)
     """Weights of the reward terms."""
-    action_scale: float = 0.5
+    action_scale: float = 1.0
     """q* = q_default + action_scale x torque limit / kp x action, per joint."""
     episode_length_s: float = 10.0
     """Episodes are truncated at this age [s]."""
@@ -115,7 +115,6 @@ class DodgeballEnv(EnvBase):
         hold: Whether the robot is held rigid in its start pose.
     """
 
-    batch_locked = True
     physics_class: type[Physics] = Physics
     """The backend."""
 
@@ -130,7 +129,7 @@ class DodgeballEnv(EnvBase):
         num_threads: int = 1,
         hold: bool = False,
     ) -> None:
-        super().__init__(device="cpu", batch_size=[num_envs])
+        super().__init__(device="cpu", batch_size=torch.Size([num_envs]))
         self.robot, self.config = robot, config
         self._seed, self._hold, self._num_threads = seed, hold, num_threads
         self.thrower = Thrower(config.throws, robot, config.physics.timestep)
@@ -162,10 +161,10 @@ class DodgeballEnv(EnvBase):
         joints, links = len(self.robot.joints), len(self.robot.links)
 
         def unbounded(*shape: int) -> Unbounded:
-            return Unbounded(shape=(n, *shape), dtype=torch.float32)
+            return Unbounded(shape=torch.Size((n, *shape)), dtype=torch.float32)
 
         def flag(*shape: int) -> Binary:
-            return Binary(shape=(n, *shape), dtype=torch.bool)
+            return Binary(shape=torch.Size((n, *shape)), dtype=torch.bool)
 
         self.observation_spec = Composite(
             base_pose=unbounded(7),
@@ -187,14 +186,17 @@ class DodgeballEnv(EnvBase):
             balls_arrived=unbounded(2),
             balls_avoided=unbounded(2),
             episode_step=Bounded(
-                0, self.config.episode_steps, shape=(n, 1), dtype=torch.int64
+                0,
+                self.config.episode_steps,
+                shape=torch.Size((n, 1)),
+                dtype=torch.int64,
             ),
-            shape=[n],
+            shape=torch.Size([n]),
         )
         self.action_spec = unbounded(joints)
         self.reward_spec = unbounded(1)
         self.done_spec = Composite(
-            done=flag(1), terminated=flag(1), truncated=flag(1), shape=[n]
+            done=flag(1), terminated=flag(1), truncated=flag(1), shape=torch.Size([n])
         )
 
     @property
@@ -225,7 +227,9 @@ class DodgeballEnv(EnvBase):
             self._seed = seed
             self._counters["episode"].fill_(-1)
 
-    def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
+    def _reset(
+        self, tensordict: TensorDictBase | None = None, **kwargs: object
+    ) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None:
             mask = torch.ones(self.batch_size[0], dtype=torch.bool)

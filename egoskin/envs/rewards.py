@@ -20,20 +20,18 @@ class RewardConfig:
 
     survival: float = 0.1
     """For every control step without contact or fall."""
-    upright: float = 0.03
+    upright: float = 0.01
     """Posture: times exp(-|gravity_xy|^2 / 0.2), the horizontal part in the base."""
     posture: float = -0.02
     """Posture: times the mean squared deviation from the default pose [rad^2]."""
-    energy: float = -1e-6
+    energy: float = -5e-7
     """Times the mechanical power, sum |torque x velocity| [W]."""
     drift_speed: float = -0.01
     """Drift: times the squared planar speed of the base [m^2/s^2]."""
     drift_distance: float = -0.01
     """Drift: times the squared planar distance from the start [m^2], at most 4."""
-    action_rate: float = -0.002
+    action_rate: float = -5e-4
     """Times the mean squared change of the action since the last step."""
-    termination: float = -0.5
-    """Once when the episode is terminated, by a ball or by a fall alike."""
 
 
 TERMS = tuple(field.name for field in fields(RewardConfig))
@@ -66,16 +64,14 @@ def reward_terms(
     Returns:
         Terms in the order of `TERMS`, ``[B, R]``.
     """
-    alive = (~terminated).to(power.dtype)
     tilt = gravity_b[:, :2].square().sum(-1)
     values = {
-        "survival": alive,
+        "survival": (~terminated).to(power.dtype),
         "upright": (-tilt / _UPRIGHT_WIDTH).exp(),
         "posture": joint_deviation.square().mean(-1),
         "energy": power,
         "drift_speed": base_lin_vel_w[:, :2].square().sum(-1),
         "drift_distance": displacement_w.square().sum(-1).clamp(max=4.0),
         "action_rate": action_change.square().mean(-1),
-        "termination": 1.0 - alive,
     }
     return torch.stack([getattr(config, name) * values[name] for name in TERMS], -1)

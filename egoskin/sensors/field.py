@@ -54,6 +54,8 @@ class FieldSensor(RowTransform):
         ValueError: If the range is not positive or the skin does not fit the chain.
     """
 
+    _order: Tensor
+
     def __init__(
         self,
         skin: Skin,
@@ -119,7 +121,8 @@ class FieldSensor(RowTransform):
         batch, objects = spec.shape, len(self.objects)
         return (
             Unbounded(
-                shape=(*batch, self.num_sensors), dtype=spec[self.in_keys[1]].dtype
+                shape=torch.Size((*batch, self.num_sensors)),
+                dtype=spec[self.in_keys[1]].dtype,
             ),
-            BinarySpec(shape=(*batch, objects), dtype=torch.bool),
+            BinarySpec(shape=torch.Size((*batch, objects)), dtype=torch.bool),
         )

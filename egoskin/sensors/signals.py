@@ -121,4 +121,4 @@ class Localization(RowTransform):
     def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
         """Return the spec of the signal."""
         dtype = spec[self.in_keys[0]].dtype
-        return (Unbounded(shape=(*spec.shape, 3), dtype=dtype),)
+        return (Unbounded(shape=torch.Size((*spec.shape, 3)), dtype=dtype),)

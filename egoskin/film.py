@@ -1,0 +1,207 @@
+"""Films of episodes: frames and their figures, text, contact sheets, files."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+import imageio_ffmpeg
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont, ImageOps
+
+# The last picture stands for this long [s].
+_LAST_PICTURE = 1.0
+# One palette of 256 colours for the whole film: without it a GIF flickers.
+_GIF_PALETTE = (
+    "[0:v]split[a][b];[a]palettegen=stats_mode=diff[p];[b][p]paletteuse=dither=bayer"
+    ":bayer_scale=4:diff_mode=rectangle"
+)
+FILM_SUFFIXES = (".mp4", ".gif")
+"""Kinds of film that can be written."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Frame:
+    """One picture of an episode and what there is to say about it."""
+
+    image: np.ndarray
+    """Picture without text, ``[height, width, 3]`` uint8."""
+    time: float
+    """Age of the episode [s]."""
+    gap: float
+    """From the robot's surface to that of the nearest ball in play [m], or inf."""
+    num_detecting: int
+    """Number of sensors that detect something."""
+    num_sensors: int
+    """Number of sensors (0 for a blind robot)."""
+    ending: str | None
+    """Why the episode ends here ("hit", "fall", ...); None while it goes on."""
+
+
+def annotate(frame: Frame, size: tuple[int, int] | None = None) -> np.ndarray:
+    """Return a frame's picture with its figures written into it.
+
+    Args:
+        frame: The frame.
+        size: Width and height to fill [px], what sticks out being cut off; None for
+            the picture's own.
+
+    Returns:
+        Picture, ``[height, width, 3]`` uint8.
+    """
+    picture = Image.fromarray(frame.image)
+    if size is not None:
+        picture = ImageOps.fit(picture, size, Image.Resampling.LANCZOS)
+    parts = [f"{frame.time:5.2f} s"]
+    if math.isfinite(frame.gap):
+        parts.append(f"ball at {max(frame.gap, 0.0):.2f} m")
+    if frame.num_sensors:
+        parts.append(f"{frame.num_detecting} of {frame.num_sensors} sensors")
+    pen = ImageDraw.Draw(picture)
+    unit = picture.height / 24
+    _write(pen, (0.7 * unit, 0.5 * unit), "    ".join(parts), unit, (20, 24, 32))
+    if frame.ending is not None:
+        is_failure = frame.ending not in ("time limit", "cut")
+        colour = (200, 20, 20) if is_failure else (20, 24, 32)
+        place = (0.7 * unit, 2.0 * unit)
+        _write(pen, place, frame.ending.upper(), 2.4 * unit, colour)
+    return np.asarray(picture)
+
+
+def _write(
+    pen: ImageDraw.ImageDraw,
+    place: tuple[float, float],
+    text: str,
+    size: float,
+    colour: tuple[int, int, int],
+) -> None:
+    """Write text with a pale outline, legible on any background."""
+    font = ImageFont.load_default(size)
+    outline = max(1, round(size / 14))
+    pen.text(
+        place, text, colour, font, stroke_width=outline, stroke_fill=(245, 246, 248)
+    )
+
+
+def pick_moments(frames: Sequence[Frame], count: int) -> list[int]:
+    """Return the indices of the frames that tell the episode best, in order.
+
+    The first and the last, the closest approaches (at most half of them), and then
+    always the frame that is farthest from those picked already, on a clock that runs
+    the faster the nearer a ball is.
+
+    Args:
+        frames: Frames in order of time.
+        count: Number of frames wanted; fewer if there are fewer.
+    """
+    gaps = np.array([np.inf, *(f.gap for f in frames), np.inf])
+    inner = gaps[1:-1]
+    is_minimum = np.isfinite(inner) & (inner <= gaps[:-2]) & (inner <= gaps[2:])
+    minima = np.flatnonzero(is_minimum)
+    closest = minima[inner[minima].argsort()][: count // 2]
+    picked = list(dict.fromkeys([0, len(frames) - 1, *closest.tolist()]))[:count]
+    # d clock / dt = 1 / (gap + 0.5 m), and not quite 0 with no ball in play
+    clock = (1.0 / (np.clip(inner, 0.0, 10.0) + 0.5)).cumsum()
+    while len(picked) < min(count, len(frames)):
+        away = np.abs(clock[:, None] - clock[picked]).min(1)
+        picked.append(int(away.argmax()))
+    return sorted(picked)
+
+
+def contact_sheet(
+    frames: Sequence[Frame],
+    *,
+    count: int = 12,
+    columns: int = 4,
+    size: tuple[int, int] = (560, 420),
+) -> np.ndarray:
+    """Return a grid of the moments that tell an episode best.
+
+    Args:
+        frames: Frames in order of time.
+        count: Number of pictures.
+        columns: Pictures in each line.
+        size: Width and height of each picture [px].
+
+    Returns:
+        Picture, ``[rows * height, columns * width, 3]`` uint8, white where no picture
+        is.
+    """
+    cells = [annotate(frames[i], size) for i in pick_moments(frames, count)]
+    while len(cells) % columns:
+        cells.append(np.full_like(cells[0], 255))
+    lines = [cells[i : i + columns] for i in range(0, len(cells), columns)]
+    return np.concatenate([np.concatenate(line, axis=1) for line in lines])
+
+
+def check_path(path: Path, suffixes: Sequence[str]) -> None:
+    """Raise ValueError if no such file can be written: its folder or its ending."""
+    if path.suffix.lower() not in suffixes:
+        raise ValueError(f"{path} must end in {' or '.join(suffixes)}")
+    if not path.parent.is_dir():
+        raise ValueError(f"{path}: there is no folder {path.parent}")
+
+
+def save_film(path: Path, frames: Sequence[Frame], fps: float) -> None:
+    """Write annotated frames to an MP4 (H.264) or GIF file; the last one stands.
+
+    What the file held before is replaced only once the film is complete.
+
+    Args:
+        path: File, ``.mp4`` or ``.gif``.
+        frames: Frames in order of time.
+        fps: Pictures for each second.
+
+    Raises:
+        ValueError: If the ending is another, or there is no such folder.
+    """
+    check_path(path, FILM_SUFFIXES)
+    if path.suffix.lower() == ".gif":
+        options = {
+            "codec": "gif",
+            "pix_fmt_out": "pal8",
+            "quality": None,
+            "output_params": ["-filter_complex", _GIF_PALETTE],
+        }
+    else:
+        options = {"codec": "libx264", "quality": 8}
+    height, width = frames[0].image.shape[:2]
+    part = path.with_name(f".{path.stem}.part{path.suffix}")
+    writer = imageio_ffmpeg.write_frames(
+        part,
+        (width, height),
+        fps=fps,
+        macro_block_size=2,
+        ffmpeg_log_level="error",
+        **options,
+    )
+    try:
+        with closing(writer):
+            # A generator: it takes pictures from its first yield on.
+            writer.send(None)
+            for frame in frames:
+                writer.send(annotate(frame).tobytes())
+            for _ in range(round(_LAST_PICTURE * fps)):
+                writer.send(annotate(frames[-1]).tobytes())
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def save_picture(path: Path, image: np.ndarray) -> None:
+    """Write a picture ``[height, width, 3]`` uint8 to a PNG file, whole or not at all.
+
+    Raises:
+        ValueError: If the ending is another, or there is no such folder.
+    """
+    check_path(path, (".png",))
+    part = path.with_name(f".{path.stem}.part{path.suffix}")
+    try:
+        Image.fromarray(image).save(part)
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)

@@ -1,0 +1,100 @@
+"""What the choices of the robot model cost in raw physics."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import torch
+from benchmarks.report import Row, show
+
+from egoskin.envs.physics import Physics, PhysicsConfig, build_scene
+from egoskin.envs.throws import ThrowConfig
+from egoskin.make import EnvConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhysicsBench:
+    """What the choices of the model cost: environment steps/s of raw physics.
+
+    One thread, CPU time. "stand" holds the default pose, "flail" draws new targets
+    (standard deviation 0.4 rad) in every control step and falls.
+    """
+
+    num_envs: int = 1024
+    """Simulations."""
+    steps: int = 30
+    """Control steps in each measurement."""
+    rounds: int = 5
+    """How often each variant is measured, in turn."""
+    json: Path | None = None
+    """File to write the rows to."""
+
+
+def physics_rows(config: PhysicsBench) -> list[Row]:
+    """Return the rows of the physics benchmark; ratios are to the shipped model."""
+    robot = EnvConfig().robot_config
+    joints = slice(6, 6 + len(robot.joints))
+
+    def build(name: str) -> Physics:
+        physics_config = PhysicsConfig(
+            self_collision=name != "no_self_collision",
+            substeps=4 if name == "240_hz" else 2,
+        )
+        model = build_scene(
+            robot,
+            ThrowConfig().balls,
+            physics_config,
+            weightless_objects=False,
+            objects_bounce=False,
+            object_mass=ThrowConfig().mass,
+        )
+        if name == "frictionloss":
+            model.dof_frictionloss[joints] = 0.2
+        if name == "damping":
+            model.dof_damping[joints] = 1.0
+        if name == "no_contact_sensors":
+            model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR
+        return Physics(model, robot, config.num_envs, physics_config)
+
+    names = ("shipped", "no_self_collision", "frictionloss", "damping")
+    names += ("240_hz", "no_contact_sensors")
+    variants = {name: build(name) for name in names}
+    default = torch.from_numpy(robot.default_joint_pos).float()
+    default = default.expand(config.num_envs, -1)
+    pose = torch.zeros(config.num_envs, 7)
+    pose[:, 2], pose[:, 3] = robot.default_base_height, 1.0
+    speeds: dict[str, list[float]] = {}
+    for i in range(config.rounds):
+        for motion, noise in (("stand", 0.0), ("flail", 0.4)):
+            for name, physics in variants.items():
+                show(f"round {i + 1}/{config.rounds}: {motion} {name}")
+                generator = torch.Generator().manual_seed(i)
+                physics.reset(np.arange(config.num_envs), pose, default)
+                begin = time.process_time()
+                for _ in range(config.steps):
+                    shift = torch.randn(default.shape, generator=generator)
+                    physics.set_target(default + noise * shift)
+                    physics.step_raw()
+                spent = time.process_time() - begin
+                speed = config.steps * config.num_envs / spent
+                speeds.setdefault(f"{motion}_{name}", []).append(speed)
+    show("")
+    return [
+        Row(
+            name=name,
+            value=statistics.median(values),
+            unit="environment steps/s of one core",
+            ratio=statistics.median(
+                v / base
+                for v, base in zip(
+                    values, speeds[f"{name.split('_')[0]}_shipped"], strict=True
+                )
+            ),
+        )
+        for name, values in speeds.items()
+    ]

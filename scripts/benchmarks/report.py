@@ -1,0 +1,37 @@
+"""Rows of figures, on the screen and as JSON."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """One line of the result."""
+
+    name: str
+    """Layer measured."""
+    value: float
+    """Median."""
+    unit: str
+    """Unit of the value."""
+    ratio: float
+    """Median ratio to the first row, over pairs measured in turn."""
+
+
+def show(text: str) -> None:
+    """Replace the progress line of a terminal."""
+    if sys.stderr.isatty():
+        print(f"\r{text}\x1b[K", end="", file=sys.stderr, flush=True)
+
+
+def report(rows: list[Row], path: Path | None) -> None:
+    """Print the rows, and write them as JSON where asked."""
+    for row in rows:
+        print(f"{row.name:<24} {row.value:12,.0f} {row.unit}  ratio {row.ratio:.3f}")
+    if path is not None:
+        content = {"rows": [asdict(row) for row in rows]}
+        path.write_text(json.dumps(content, indent=2) + "\n")

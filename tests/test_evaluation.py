@@ -1,0 +1,135 @@
+"""Evaluation: figures by hand, the same bank for all, intervals."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from egoskin.envs.dodgeball import DodgeballConfig
+from egoskin.envs.throws import ThrowConfig
+from egoskin.evaluation import (
+    Episodes,
+    evaluate,
+    mean_estimate,
+    play_bank,
+    standard_task,
+    summarize,
+    wilson,
+)
+from egoskin.make import EnvConfig
+
+
+def test_wilson_interval_by_hand():
+    # n = 100, p = 0.1, z = 1.96: centre 0.1148, half-width 0.0596 (a table's values).
+    estimate = wilson(10, 100)
+    assert estimate.mean == 0.1
+    assert estimate.low == pytest.approx(0.0552, abs=1e-4)
+    assert estimate.high == pytest.approx(0.1744, abs=1e-4)
+    assert wilson(0, 50).low == 0.0
+    assert wilson(50, 50).high == 1.0
+
+
+def test_mean_interval_by_hand():
+    # Values 1, 2, 3: mean 2, deviation 1, half-width 1.96 / sqrt(3).
+    estimate = mean_estimate(torch.tensor([1.0, 2.0, 3.0]))
+    assert estimate.mean == 2.0
+    assert estimate.high - 2.0 == pytest.approx(1.959964 / math.sqrt(3))
+
+
+def flags(*values: int) -> torch.Tensor:
+    return torch.tensor(values) > 0
+
+
+def test_figures_of_five_episodes_by_hand():
+    # At 60 Hz 3 s are 180 steps: a ball at 100, a fall at 180, a ball at 181 (after
+    # the 3 s: a success), a divergence at 5, and one that lasts the 10 s.
+    played = Episodes(
+        steps=torch.tensor([100, 180, 181, 5, 600]),
+        hit=flags(1, 0, 1, 0, 0),
+        fallen=flags(0, 1, 0, 0, 0),
+        diverged=flags(0, 0, 0, 1, 0),
+        arrived=torch.tensor([[1.0, 0], [1, 0], [1, 1], [0, 0], [1, 5]]),
+        avoided=torch.tensor([[0.0, 0], [1, 0], [1, 0], [0, 0], [1, 5]]),
+    )
+    rigid = Episodes(
+        steps=torch.full((5,), 50),
+        hit=flags(1, 1, 1, 1, 0),
+        fallen=flags(0, 0, 0, 0, 0),
+        diverged=flags(0, 0, 0, 0, 0),
+        arrived=torch.zeros(5, 2),
+        avoided=torch.zeros(5, 2),
+    )
+    result = summarize(played, rigid, control_hz=60.0)
+    assert result.success.mean == 0.4
+    shares = (result.ended_by_ball, result.ended_by_fall, result.diverged)
+    assert shares == pytest.approx((0.2, 0.2, 0.2))
+    assert result.success.mean + sum(shares) == pytest.approx(1.0)
+    assert result.rigid_success == pytest.approx(0.2)
+    mean = (100 + 180 + 181 + 5 + 600) / 5 / 60
+    assert result.survival_time.mean == pytest.approx(mean)
+    assert result.avoided.first_ball == pytest.approx(3 / 4)
+    assert result.avoided.later_balls == pytest.approx(5 / 6)
+
+
+def test_nothing_arrived_is_not_a_share():
+    none = torch.zeros(1, dtype=torch.bool)
+    empty = Episodes(
+        steps=torch.tensor([3]),
+        hit=none,
+        fallen=~none,
+        diverged=none,
+        arrived=torch.zeros(1, 2),
+        avoided=torch.zeros(1, 2),
+    )
+    assert summarize(empty, empty, 60.0).avoided.first_ball is None
+
+
+def test_the_standard_throw_replaces_the_throw_of_the_run():
+    own = ThrowConfig(lead=0.0, flight="straight", speed=(1.0, 2.0))
+    config = EnvConfig(task=DodgeballConfig(throws=own, action_scale=0.3))
+    standard = standard_task(config)
+    assert standard.task.throws == ThrowConfig()
+    assert standard.task.action_scale == 0.3
+
+
+def make_case() -> dict:
+    config = standard_task(EnvConfig())
+    return {
+        "config": config,
+        "skin": config.skin.build(config.robot_config),
+        "episodes": 64,
+    }
+
+
+def test_a_bank_gives_the_same_figures_for_1_2_and_4_workers():
+    case = make_case()
+    torch.manual_seed(0)
+    weights = 0.5 * torch.randn(64, 21)
+
+    def policy(td):
+        # Reads the signal, so that sensors take part.
+        return td.set("action", td["signal"] @ weights - weights.sum(0))
+
+    class Module(torch.nn.Module):
+        def forward(self, td):
+            return policy(td)
+
+    results = [
+        evaluate(Module(), **case, bank_seed=3, num_workers=n) for n in (1, 2, 4)
+    ]
+    assert results[0] == results[1] == results[2]
+    assert results[0].episodes == 64
+    # Every standard throw meets a robot that does not move.
+    assert results[0].rigid_success <= 0.01
+
+
+def test_another_bank_seed_is_another_bank():
+    case = make_case()
+    first, again, other = (
+        play_bank(None, **case, bank_seed=seed, num_workers=1, hold=True).steps
+        for seed in (0, 0, 1)
+    )
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)

@@ -1,0 +1,111 @@
+"""Networks: joined inputs, normalisers, bounded deviation, what the actor samples."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from egoskin.agents.networks import Agent, KeyedMLP, NetworkConfig, RunningNorm
+
+SIZES = {"observation": 6, "signal": 5, "privileged_observation": 4}
+ACTOR = ["observation", "signal"]
+CRITIC = [*ACTOR, "privileged_observation"]
+
+
+def make_agent(**changes: object) -> Agent:
+    torch.manual_seed(0)
+    return Agent(SIZES, ACTOR, CRITIC, 3, NetworkConfig(**changes))
+
+
+def make_batch(n: int = 64) -> TensorDict:
+    generator = torch.Generator().manual_seed(1)
+    return TensorDict(
+        {k: torch.randn(n, s, generator=generator) for k, s in SIZES.items()}, [n]
+    )
+
+
+def test_separate_inputs_equal_one_layer_of_their_concatenation():
+    torch.manual_seed(0)
+    net = KeyedMLP([4, 3], [None, None], [8, 8], 2, 1.0)
+    x, y = torch.randn(5, 4), torch.randn(5, 3)
+    joined = torch.nn.Linear(7, 8)
+    with torch.no_grad():
+        joined.weight.copy_(torch.cat([layer.weight for layer in net.inputs], 1))
+        joined.bias.copy_(net.inputs[0].bias)
+    torch.testing.assert_close(net(x, y), net.tail(joined(torch.cat((x, y), 1))))
+
+
+def test_networks_are_two_layers_of_32_by_default():
+    agent = make_agent()
+    shapes = [tuple(p.shape) for n, p in agent.head.body.named_parameters()]
+    expected = [(32, 6), (32,), (32, 5), (32, 32), (32,), (3, 32), (3,)]
+    assert sorted(shapes) == sorted(expected)
+
+
+def test_running_norm_equals_the_statistics_of_all_data():
+    norm = RunningNorm(3)
+    parts = [torch.randn(n, 3) * 5 + 2 for n in (7, 100, 1)]
+    for part in parts:
+        norm.update(part)
+    data = torch.cat(parts).double()
+    torch.testing.assert_close(norm.mean, data.mean(0))
+    torch.testing.assert_close(norm.var, data.var(0, unbiased=False))
+    expected = (parts[1].double() - norm.mean) / norm.var.sqrt()
+    torch.testing.assert_close(norm(parts[1]).double(), expected, atol=1e-4, rtol=1e-4)
+
+
+def test_a_forward_pass_leaves_the_normaliser_as_it_is():
+    agent, batch = make_agent(), make_batch()
+    before = agent.norms["observation"].mean.clone()
+    agent.actor(batch)
+    agent.critic(batch)
+    assert torch.equal(agent.norms["observation"].mean, before)
+
+
+def test_signals_enter_unnormalised_unless_asked():
+    assert set(make_agent().norms) == {"observation", "privileged_observation"}
+    assert set(make_agent(normalize="all").norms) == set(SIZES)
+
+
+def test_the_actor_does_not_see_what_only_the_critic_is_told():
+    agent, batch = make_agent(), make_batch()
+    changed = batch.clone()
+    changed["privileged_observation"] += 1.0
+    values = [agent.critic(b.clone())["state_value"] for b in (batch, changed)]
+    means = [agent.head(*(b[k] for k in ACTOR))[0] for b in (batch, changed)]
+    assert torch.equal(*means)
+    assert not torch.equal(*values)
+
+
+def test_the_actor_samples_with_its_standard_deviation():
+    # TorchRL's default would be the mean: every action equal to loc.
+    agent = make_agent(init_std=0.5)
+    with torch.no_grad():
+        out = agent.actor(make_batch(20000))
+    noise = (out["action"] - out["loc"]) / out["scale"]
+    assert noise.std() == pytest.approx(1.0, abs=0.02)
+    normal = torch.distributions.Normal(out["loc"], out["scale"])
+    expected = normal.log_prob(out["action"]).sum(-1)
+    torch.testing.assert_close(out["action_log_prob"], expected)
+
+
+def test_the_standard_deviation_stays_in_its_bounds():
+    agent = make_agent(std_bounds=(0.2, 0.8))
+    with torch.no_grad():
+        agent.head.log_std.copy_(torch.tensor([-5.0, 0.0, 5.0]))
+    agent.head.bound_std()
+    torch.testing.assert_close(agent.head.log_std.exp(), torch.tensor([0.2, 0.8, 0.8]))
+
+
+@pytest.mark.parametrize(
+    ("field", "text"),
+    [
+        ({"init_std": 2.0}, "init_std"),
+        ({"std_bounds": (0.0, 1.0)}, "std_bounds"),
+        ({"hidden": ()}, "hidden"),
+    ],
+)
+def test_bad_sizes_are_refused(field: dict, text: str):
+    with pytest.raises(ValueError, match=text):
+        NetworkConfig(**field)

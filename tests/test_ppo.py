@@ -1,0 +1,200 @@
+"""PPO: bootstrapping by hand, what a rollout holds, that the update improves."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from egoskin.agents.networks import Agent, NetworkConfig
+from egoskin.agents.ppo import (
+    PPO,
+    NonFiniteError,
+    PPOConfig,
+    add_advantages,
+    collect,
+    gaussian_kl,
+)
+
+
+class CountingEnv(EnvBase):
+    """Observes its age; row 0 times out at age 2, row 1 terminates at age 3."""
+
+    batch_locked = True
+
+    def __init__(self) -> None:
+        super().__init__(batch_size=[2])
+        self.observation_spec = Composite(
+            observation=Unbounded(shape=(2, 1)), shape=(2,)
+        )
+        self.action_spec = Unbounded(shape=(2, 1))
+        self.reward_spec = Unbounded(shape=(2, 1))
+        self.age = torch.zeros(2, 1)
+
+    def _set_seed(self, seed: int | None) -> None:
+        pass
+
+    def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDict:
+        mask = torch.ones(2, 1, dtype=torch.bool)
+        if tensordict is not None and "_reset" in tensordict:
+            mask = tensordict["_reset"]
+        self.age = torch.where(mask, 0.0, self.age)
+        return TensorDict({"observation": self.age.clone()}, [2])
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        self.age = self.age + 1
+        truncated = self.age >= torch.tensor([[2.0], [99.0]])
+        terminated = self.age >= torch.tensor([[99.0], [3.0]])
+        return TensorDict(
+            {
+                "observation": self.age.clone(),
+                "reward": torch.ones(2, 1),
+                "terminated": terminated,
+                "truncated": truncated,
+                "done": terminated | truncated,
+            },
+            [2],
+        )
+
+
+def counting_agent() -> Agent:
+    """An agent whose value of an observation x is 10 x + 1."""
+    agent = Agent(
+        {"observation": 1}, ["observation"], ["observation"], 1, NetworkConfig()
+    )
+    critic = torch.nn.Linear(1, 1)
+    with torch.no_grad():
+        critic.weight.fill_(10.0)
+        critic.bias.fill_(1.0)
+    agent.critic.module = critic
+    return agent
+
+
+def column(values: list[float]) -> Tensor:
+    return torch.tensor(values, dtype=torch.float32)
+
+
+def truncating_spec(env: EnvBase) -> EnvBase:
+    env.add_truncated_keys()
+    return env
+
+
+def test_a_timeout_bootstraps_from_its_terminal_observation():
+    env, agent = truncating_spec(CountingEnv()), counting_agent()
+    rollout, root, infos = collect(env, agent, env.reset(), 4)
+    # Ages seen by row 0: 0 1 | 0 1 ; its time-outs end at age 2, so V = 21 is what
+    # both second steps bootstrap from, not V(0) = 1 of the episode after the reset.
+    assert rollout["state_value"][:, 0, 0].tolist() == [1.0, 11.0, 1.0, 11.0]
+    assert rollout["next_state_value"][:, 0, 0].tolist() == [11.0, 21.0, 11.0, 21.0]
+    # Row 1: ages 0 1 2 | 0; its end at age 3 is a termination; the last step goes on
+    # to age 1, V = 11.
+    assert rollout["state_value"][:, 1, 0].tolist() == [1.0, 11.0, 21.0, 1.0]
+    assert rollout["next_state_value"][[0, 1, 3], 1, 0].tolist() == [11.0, 21.0, 11.0]
+    assert rollout["terminated"][:, 1, 0].tolist() == [False, False, True, False]
+    assert root["observation"].tolist() == [[0.0], [1.0]]
+    assert len(infos) == 4
+    # Nothing but the values of the next states is kept.
+    assert "next" not in rollout.keys()
+
+
+def test_advantages_of_a_timeout_and_a_termination_by_hand():
+    env, agent = truncating_spec(CountingEnv()), counting_agent()
+    rollout, _, _ = collect(env, agent, env.reset(), 4)
+    add_advantages(rollout, gamma=0.5, gae_lambda=0.5)
+    # delta = r + 0.5 V' - V; advantage = delta + 0.25 advantage', cut at an end.
+    # Row 0: 1 + 5.5 - 1 = 5.5; time-out 1 + 10.5 - 11 = 0.5; then the same again.
+    #   advantages 5.5 + 0.25 * 0.5 = 5.625, 0.5; targets A + V: 6.625, 11.5.
+    # Row 1: 5.5; 1 + 10.5 - 11 = 0.5; termination 1 + 0 - 21 = -20; 1 + 5.5 - 1 = 5.5
+    #   advantages -20; 0.5 - 5 = -4.5; 5.5 - 1.125 = 4.375; 5.5.
+    target = rollout["value_target"][..., 0]
+    assert target[:, 0].tolist() == [6.625, 11.5, 6.625, 11.5]
+    assert target[:, 1].tolist() == [5.375, 6.5, 1.0, 6.5]
+    raw = target - rollout["state_value"][..., 0]
+    expected = (raw - raw.mean()) / (raw.std() + 1e-8)
+    torch.testing.assert_close(rollout["advantage"][..., 0], expected)
+
+
+def test_gaussian_kl_equals_torch_distributions():
+    generator = torch.Generator().manual_seed(0)
+    loc0, loc1 = torch.randn(2, 5, 3, generator=generator)
+    scale0, scale1 = torch.rand(2, 5, 3, generator=generator) + 0.1
+    expected = torch.distributions.kl_divergence(
+        torch.distributions.Normal(loc0, scale0),
+        torch.distributions.Normal(loc1, scale1),
+    ).sum(-1)
+    torch.testing.assert_close(gaussian_kl(loc0, scale0, loc1, scale1), expected)
+
+
+def bandit_rollout(agent: Agent) -> TensorDict:
+    """One-step episodes whose reward is highest at the action (1, 1)."""
+    rollout = TensorDict({"observation": torch.randn(16, 256, 3)}, [16, 256])
+    with torch.no_grad():
+        agent.actor(rollout)
+        agent.critic(rollout)
+    miss = (rollout["action"] - 1).square().sum(-1, keepdim=True)
+    rollout["reward"] = -miss
+    rollout["next_state_value"] = torch.zeros(16, 256, 1)
+    rollout["done"] = rollout["terminated"] = torch.ones(16, 256, 1, dtype=torch.bool)
+    return rollout
+
+
+def bandit_agent() -> Agent:
+    torch.manual_seed(0)
+    keys = ["observation"]
+    return Agent({"observation": 3}, keys, keys, 2, NetworkConfig())
+
+
+def test_updates_move_the_mean_action_to_the_best():
+    agent = bandit_agent()
+    ppo = PPO(agent, PPOConfig())
+    for _ in range(40):
+        metrics = ppo.update(bandit_rollout(agent))
+    loc, _ = agent.head(torch.randn(1000, 3))
+    assert (loc - 1).abs().mean() < 0.15
+    assert metrics["action_std"] < 0.5
+
+
+def test_the_learning_rate_follows_the_divergence_or_stays():
+    agent = bandit_agent()
+    ppo = PPO(agent, PPOConfig(desired_kl=1e-9))
+    ppo.update(bandit_rollout(agent))
+    assert ppo.learning_rate == pytest.approx(1e-5)
+    agent = bandit_agent()
+    ppo = PPO(agent, PPOConfig(desired_kl=None))
+    metrics = ppo.update(bandit_rollout(agent))
+    assert ppo.learning_rate == 1e-3
+    assert "kl" not in metrics
+
+
+def test_gradients_of_actor_and_critic_are_clipped_separately():
+    agent = bandit_agent()
+    ppo = PPO(agent, PPOConfig(max_grad_norm=1e-3, ppo_epochs=1, num_mini_batches=1))
+    ppo.update(bandit_rollout(agent))
+    for module in (agent.head, agent.critic):
+        grads = [p.grad for p in module.parameters() if p.grad is not None]
+        norm = torch.stack([g.norm() for g in grads]).norm()
+        assert norm == pytest.approx(1e-3, rel=1e-3)
+
+
+def test_a_loss_that_is_not_finite_stops_before_the_weights_change():
+    agent = bandit_agent()
+    ppo = PPO(agent, PPOConfig())
+    rollout = bandit_rollout(agent)
+    rollout["reward"][3, 5] = float("nan")
+    before = {k: v.clone() for k, v in agent.state_dict().items()}
+    with pytest.raises(NonFiniteError, match="gradient norm"):
+        ppo.update(rollout)
+    for key, value in agent.state_dict().items():
+        assert torch.equal(value, before[key]), key
+
+
+@pytest.mark.parametrize(
+    "field",
+    [{"gamma": 1.5}, {"clip_epsilon": 0.0}, {"desired_kl": -1.0}, {"ppo_epochs": 0}],
+)
+def test_values_outside_their_range_are_refused(field: dict):
+    with pytest.raises(ValueError, match=next(iter(field))):
+        PPOConfig(**field)

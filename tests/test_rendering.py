@@ -1,0 +1,296 @@
+"""Pictures of episodes: what must show, what must not, and where they come from."""
+
+from __future__ import annotations
+
+import os
+import runpy
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from tensordict import TensorDict, TensorDictBase
+
+from egoskin.cli import clear_errors
+from egoskin.film import Frame
+from egoskin.make import EnvConfig, SensorConfig, make_worker_env
+from egoskin.rendering import (
+    CameraConfig,
+    Painter,
+    RenderingError,
+    closest_point,
+    render_episode,
+)
+from egoskin.robots import RobotConfig
+from egoskin.sensors import Skin
+from egoskin.shapes import Sphere
+
+SIZE = (160, 90)
+SCRIPT = Path(__file__).parents[1] / "scripts" / "render.py"
+
+
+@pytest.fixture(scope="module")
+def painter(robot: RobotConfig, skin: Skin) -> Iterator[Painter]:
+    try:
+        made = Painter(
+            robot,
+            skin,
+            (Sphere(), Sphere()),
+            size=(320, 180),
+            camera=CameraConfig(distance=3.0),
+        )
+    except RenderingError as error:
+        pytest.skip(str(error))
+    with made:
+        yield made
+
+
+@pytest.fixture
+def standing(robot: RobotConfig) -> TensorDict:
+    """The robot in its default pose, facing +x; no ball, nothing detected."""
+    return TensorDict(
+        base_pose=torch.tensor([0, 0, robot.default_base_height, 1, 0, 0, 0]).float(),
+        joint_pos=torch.from_numpy(robot.default_joint_pos).float(),
+        object_pose=torch.tensor([0, 0, 1000.0, 1, 0, 0, 0]).repeat(2, 1),
+        object_active=torch.zeros(2, dtype=torch.bool),
+        distance=torch.full((64,), torch.inf),
+    )
+
+
+def place_ball(state: TensorDict, x: float, y: float, z: float) -> TensorDict:
+    """The same state with the first ball in play at a place [m]."""
+    state = state.clone()
+    state["object_active"][0] = True
+    state["object_pose"][0, :3] = torch.tensor([x, y, z])
+    return state
+
+
+def channels(frame: Frame) -> Iterator[np.ndarray]:
+    return iter(np.moveaxis(frame.image.astype(int), -1, 0))
+
+
+def count_blue(frame: Frame) -> int:
+    """Pixels of a field sensor's line."""
+    red, _, blue = channels(frame)
+    return int((blue - red > 70).sum())
+
+
+def count_orange(frame: Frame) -> int:
+    """Pixels of a ball."""
+    red, _, blue = channels(frame)
+    return int((red - blue > 60).sum())
+
+
+def test_the_robot_stands_in_the_picture(painter: Painter, standing: TensorDict):
+    gone = standing.clone()
+    gone["base_pose"][2] = -50.0
+    here, empty = painter.draw(standing, time=0.0), painter.draw(gone, time=0.0)
+    share = (here.image != empty.image).any(-1).mean()
+    assert 0.02 < share < 0.5
+    assert empty.image.std() > 5
+
+
+def test_a_ball_is_drawn_only_in_play(painter: Painter, standing: TensorDict):
+    inside = place_ball(standing, 0.3, 0.6, 1.2)
+    parked = inside.clone()
+    parked["object_active"][:] = False
+    assert count_orange(painter.draw(inside, time=0.0)) > 50
+    assert count_orange(painter.draw(parked, time=0.0)) == 0
+
+
+def test_a_line_leads_from_a_sensor_that_detects_to_the_ball(
+    painter: Painter, standing: TensorDict
+):
+    idle = place_ball(standing, 0.5, 0.9, 1.4)
+    lit = idle.clone()
+    lit["distance"][:10] = 0.8
+    before, after = painter.draw(idle, time=0.0), painter.draw(lit, time=0.0)
+    assert before.num_detecting == 0
+    assert after.num_detecting == 10
+    assert count_blue(before) == 0
+    assert count_blue(after) > 30
+
+
+def test_a_sensor_that_detects_is_lit(painter: Painter, standing: TensorDict):
+    # No ball in play: no line, the sensors alone change.
+    lit = standing.clone()
+    lit["distance"][:] = 0.5
+    dim, bright = painter.draw(standing, time=0.0), painter.draw(lit, time=0.0)
+    changed = (dim.image != bright.image).any(-1)
+    assert changed.any()
+    assert bright.image[changed].mean() > dim.image[changed].mean() + 20
+
+
+def test_the_gap_is_from_surface_to_surface(painter: Painter, standing: TensorDict):
+    assert painter.draw(standing, time=0.0).gap == np.inf
+    # To the side of the arm, which is less than half a metre from the middle.
+    near = painter.draw(place_ball(standing, 0.0, 0.9, 1.2), time=0.0).gap
+    far = painter.draw(place_ball(standing, 0.0, 1.9, 1.2), time=0.0).gap
+    assert 0.2 < near < 0.75
+    assert far - near == pytest.approx(1.0, abs=0.02)
+
+
+def test_the_camera_follows_the_base(painter: Painter, standing: TensorDict):
+    moved = standing.clone()
+    moved["base_pose"][:2] = torch.tensor([30.0, 40.0])
+    lost = painter.draw(standing, time=0.0)
+    for time in (10.0, 20.0):
+        found = painter.draw(moved, time=time)
+    # Floor tiles are 1 m: after whole tiles the picture is the same but for haze.
+    difference = np.abs(found.image.astype(int) - lost.image).mean()
+    assert difference < 3
+
+
+def test_the_closest_point_lies_on_the_surface():
+    ball, pose = Sphere(radius=0.15), np.array([1.0, 0, 0, 1, 0, 0, 0])
+    points = np.array([[0.0, 0, 0], [1, 2, 0], [1.05, 0, 0]])
+    # 1 - 0.15; 0 + 0.15; a point inside is its own.
+    expected = [[0.85, 0, 0], [1, 0.15, 0], [1.05, 0, 0]]
+    assert closest_point(ball, pose, points) == pytest.approx(np.array(expected))
+
+
+def render(config: EnvConfig, skin: Skin, **options: object) -> list[Frame]:
+    return render_episode(config, skin, None, **{"size": SIZE, **options})
+
+
+@pytest.mark.usefixtures("painter")
+@pytest.mark.parametrize(("sensor_range", "shows"), [(100.0, True), (1e-3, False)])
+def test_an_episode_shows_lines_only_in_range(
+    skin: Skin, sensor_range: float, shows: bool
+):
+    config = EnvConfig(sensor=SensorConfig(range=sensor_range))
+    frames = render(config, skin, max_seconds=0.2)
+    # 0.2 s at 30 pictures a second, and the start.
+    assert [f.time for f in frames] == pytest.approx([i / 30 for i in range(7)])
+    assert all(f.image.shape == (90, 160, 3) for f in frames)
+    assert all((f.num_detecting == 64) == shows for f in frames)
+    assert all((count_blue(f) > 0) == shows for f in frames)
+    assert [f.ending for f in frames] == [None] * 6 + ["cut"]
+
+
+@pytest.mark.usefixtures("painter")
+def test_a_rigid_robot_is_hit_and_the_last_frame_says_so(skin: Skin):
+    frames = render(EnvConfig(), skin, hold=True, fps=5)
+    assert frames[-1].ending == "hit"
+    assert frames[-1].gap < 0.05
+    assert all(f.ending is None for f in frames[:-1])
+
+
+@pytest.mark.usefixtures("painter")
+def test_a_blind_robot_has_no_sensors_to_draw(skin: Skin):
+    config = EnvConfig(sensor=SensorConfig(coverage="none"))
+    frame = render(config, skin, max_seconds=0.02)[0]
+    assert (frame.num_sensors, frame.num_detecting) == (0, 0)
+
+
+@pytest.mark.usefixtures("painter")
+def test_an_episode_is_the_row_of_the_bank(skin: Skin):
+    config, row, steps = EnvConfig(), 5, 6
+    seen = []
+
+    def still(td: TensorDictBase) -> TensorDictBase:
+        seen.append(td["object_pose"][0].clone())
+        return td.set("action", torch.zeros(1, 21))
+
+    render_episode(
+        config, skin, still, seed=3, row=row, max_seconds=steps / 60, size=SIZE
+    )
+    bank = make_worker_env(config, skin, num_envs=8, seed=3, keep_raw=True)
+    td = bank.reset()
+    for pose in seen:
+        assert torch.equal(pose, td["object_pose"][row])
+        td["action"] = torch.zeros(8, 21)
+        td = bank.step(td)["next"]
+    assert len(seen) == steps
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"fps": 61.0}, "fps must be in"),
+        ({"row": -1}, "row must not be negative"),
+        ({"max_seconds": 0.0}, "at least one control step"),
+        ({"size": (161, 90)}, "positive even numbers"),
+    ],
+)
+def test_numbers_out_of_range_are_refused(skin: Skin, options: dict, text: str):
+    with pytest.raises(ValueError, match=text):
+        render(EnvConfig(), skin, **options)
+
+
+@pytest.fixture
+def script(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Function of (arguments, environment): runs the script in an empty folder."""
+
+    def run(*args: str, **environment: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, str(SCRIPT), *args],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            timeout=200,
+            env={**os.environ, **environment},
+        )
+
+    return run
+
+
+@pytest.mark.usefixtures("painter")
+def test_the_script_writes_a_film_and_a_sheet(script: Callable, tmp_path: Path):
+    done = script("--out", "a.gif", "--seconds", "0.1", "--size", "160", "90")
+    assert done.returncode == 0, done.stderr
+    assert "cut" in done.stdout
+    with (
+        Image.open(tmp_path / "a.gif") as film,
+        Image.open(tmp_path / "a.png") as sheet,
+    ):
+        assert film.size == (160, 90)
+        assert sheet.width > sheet.height
+    assert {p.name for p in tmp_path.iterdir()} == {"a.gif", "a.png"}
+
+
+@pytest.mark.parametrize(
+    ("args", "text"),
+    [
+        (["--out", "a.avi"], "must end in .mp4 or .gif"),
+        (["--out", "nowhere/a.mp4"], "no folder nowhere"),
+        (["--sheet", "a.jpg"], "must end in .png"),
+        (["--slowdown", "0"], "slowdown must be positive"),
+        (["--bank-seed", "-1"], "bank_seed must be in"),
+        (["nothing.safetensors"], "nothing.safetensors"),
+        (["nothing", "--sensor.range", "1"], "a policy brings its own"),
+    ],
+)
+def test_bad_input_is_an_error_and_writes_nothing(
+    args: list, text: str, tmp_path: Path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    main = runpy.run_path(str(SCRIPT))["main"]
+    with pytest.raises(SystemExit) as status, clear_errors():
+        main(args)
+    assert status.value.code == 2
+    assert text in " ".join(capsys.readouterr().err.split())
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "environment",
+    [
+        # PyOpenGL bound to another platform, as if EGL were not installed.
+        {"MUJOCO_GL": "", "PYOPENGL_PLATFORM": "osmesa"},
+        {"MUJOCO_GL": "no_such_backend"},
+    ],
+)
+def test_without_opengl_the_script_says_what_to_install(
+    script: Callable, tmp_path: Path, environment: dict[str, str]
+):
+    (tmp_path / "a.mp4").write_text("old")
+    done = script("--out", "a.mp4", "--seconds", "0.1", **environment)
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert "apt-get install libegl1" in done.stderr
+    assert (tmp_path / "a.mp4").read_text() == "old"

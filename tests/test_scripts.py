@@ -1,0 +1,235 @@
+"""The scripts as a user runs them: train, stop, resume, evaluate, and bad input."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+import egoskin
+from egoskin.checkpoint import load_tensors
+
+ROOT = Path(__file__).parents[1]
+SMALL = ["--num-envs", "32", "--num-workers", "2", "--ppo.num-mini-batches", "2"]
+# Environment steps of one rollout of SMALL: 32 agents x 16 steps.
+BATCH = 512
+
+
+def command(script: str, *args: str | Path) -> list[str]:
+    return [sys.executable, str(ROOT / "scripts" / script), *map(str, args)]
+
+
+def run(script: str, *args: str | Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        command(script, *args), capture_output=True, text=True, timeout=200
+    )
+
+
+def train(folder: Path, rollouts: int, *args: str) -> None:
+    done = run(
+        "ppo.py", *SMALL, "--run-dir", folder, "--total-frames", rollouts * BATCH, *args
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def metrics(folder: Path) -> list[dict[str, str]]:
+    with open(folder / "metrics.csv", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory) -> Path:
+    """A run of four rollouts."""
+    folder = tmp_path_factory.mktemp("runs") / "trained"
+    train(folder, 4)
+    return folder
+
+
+def test_a_run_folder_holds_what_is_needed_to_understand_it(trained: Path):
+    config = json.loads((trained / "config.json").read_text())
+    assert config["env"]["sensor"] == {
+        "coverage": "field",
+        "signal": "proximity",
+        "range": 2.0,
+    }
+    assert config["env"]["task"]["throws"]["radius"] == 0.15
+    (start,) = json.loads((trained / "versions.json").read_text())
+    assert start["packages"]["torch"] == torch.__version__
+    assert len(json.loads((trained / "skin.json").read_text())["sensors"]) == 64
+    assert [int(row["frames"]) for row in metrics(trained)] == [
+        BATCH * n for n in (1, 2, 3, 4)
+    ]
+    assert list(trained.glob("events.out.tfevents.*"))
+    names = [path.stem for path in sorted((trained / "policies").iterdir())]
+    assert names == ["000000000000", f"{4 * BATCH:012d}"]
+
+
+def test_a_resumed_run_equals_one_that_never_stopped(trained: Path, tmp_path: Path):
+    train(tmp_path / "halves", 2)
+    done = run("ppo.py", "--resume", tmp_path / "halves", "--total-frames", 4 * BATCH)
+    assert done.returncode == 0, done.stderr
+    whole, _ = load_tensors(trained / "checkpoint.safetensors")
+    halves, _ = load_tensors(tmp_path / "halves" / "checkpoint.safetensors")
+    assert whole.keys() == halves.keys()
+    for key, value in whole.items():
+        assert torch.equal(value, halves[key]), key
+    for one, two in zip(metrics(trained), metrics(tmp_path / "halves"), strict=True):
+        for name, value in one.items():
+            if not name.startswith("time/"):
+                assert value == two[name], name
+
+
+def test_ctrl_c_leaves_a_checkpoint_and_says_how_to_go_on(tmp_path: Path):
+    folder = tmp_path / "stopped"
+    process = subprocess.Popen(
+        command("ppo.py", *SMALL, "--run-dir", folder),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    deadline = time.monotonic() + 120
+    while not (folder / "metrics.csv").exists() and time.monotonic() < deadline:
+        time.sleep(0.2)
+    process.send_signal(signal.SIGINT)
+    out, errors = process.communicate(timeout=60)
+    assert process.returncode == 0, errors
+    assert f"--resume {folder}" in out
+    _, header = load_tensors(folder / "checkpoint.safetensors")
+    assert header["frames"] == int(metrics(folder)[-1]["frames"]) > 0
+
+
+def test_an_evaluation_has_the_figures_promised(trained: Path, tmp_path: Path):
+    done = run(
+        "evaluate.py", trained, "--episodes", "32", "--json", tmp_path / "out.json"
+    )
+    assert done.returncode == 0, done.stderr
+    assert "success (no contact for 3 s)" in done.stdout
+    result = json.loads((tmp_path / "out.json").read_text())
+    assert result.keys() == {
+        "success",
+        "survival_time",
+        "ended_by_ball",
+        "ended_by_fall",
+        "diverged",
+        "rigid_success",
+        "avoided",
+        "episodes",
+    }
+    assert result["success"].keys() == result["survival_time"].keys()
+    assert result["success"].keys() == {"mean", "low", "high"}
+    ends = result["ended_by_ball"] + result["ended_by_fall"] + result["diverged"]
+    assert result["success"]["mean"] + ends == pytest.approx(1.0)
+
+
+def test_a_policy_file_runs_on_a_tensordict_without_any_environment(trained: Path):
+    policy = egoskin.load_policy(trained / "policies" / f"{4 * BATCH:012d}.safetensors")
+    assert policy.in_keys == ["observation", "signal"]
+    td = policy.env_config.sensor
+    assert (td.coverage, td.signal, td.range) == ("field", "proximity", 2.0)
+    assert len(policy.skin) == 64
+    from tensordict import TensorDict
+
+    batch = TensorDict(
+        {"observation": torch.zeros(7, 48), "signal": torch.ones(7, 64)}, [7]
+    )
+    assert policy(batch)["action"].shape == (7, 21)
+    same = egoskin.load_policy(trained)(batch.clone())
+    assert torch.equal(same["action"], batch["action"])
+    with pytest.raises(KeyError, match="'signal' is missing"):
+        policy(batch.select("observation"))
+
+
+@pytest.mark.parametrize(
+    "sensor",
+    [
+        ["--sensor.coverage", "none"],
+        ["--sensor.signal", "localization", "--sensor.range", "inf"],
+        ["--sensor.signal", "binary", "--sensor.range", "0.5"],
+    ],
+    ids=lambda args: "-".join(args[1::2]),
+)
+def test_every_sensor_trains(sensor: list[str], tmp_path: Path):
+    train(tmp_path / "run", 2, *sensor)
+    assert egoskin.load_policy(tmp_path / "run").spec.frames == 2 * BATCH
+
+
+BAD_SKIN = """{"format": "egoskin-skin-1", "robot": "h1_2", "sensors": [
+  {"link": "torso_lnk", "position": [0, 0, 0.1], "normal": [0, 0, 1]}]}"""
+
+
+@pytest.mark.parametrize(
+    ("args", "expected"),
+    [
+        (["--sensor.rnge", "1"], "--sensor.range"),
+        (["--sensor.range", "-1"], "must be positive"),
+        (["--sensor.signal", "smell"], "proximity"),
+        (["--num-envs", "32", "--num-workers", "3"], "valid: 1, 2, 4, 8, 16, 32"),
+        (["--task.physics.gains", "strong"], "real, rotor_inertia"),
+        (["--device", "gpu"], "available: cpu"),
+        (["--skin.path", "skin.json"], "did you mean 'torso_link'"),
+        (["--skin.path", "nothing.json"], "nothing.json"),
+        (["--run-dir", "full"], "exists already"),
+        (["--resume", "full"], "no run folder"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_bad_input_to_training_is_one_clear_message(
+    args: list[str], expected: str, tmp_path: Path
+):
+    (tmp_path / "skin.json").write_text(BAD_SKIN)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "notes.txt").write_text("mine")
+    done = subprocess.run(
+        command("ppo.py", *args),
+        capture_output=True,
+        text=True,
+        timeout=100,
+        cwd=tmp_path,
+    )
+    assert done.returncode == 2
+    # tyro draws boxes: take the lines together.
+    text = " ".join(done.stderr.replace("│", " ").split())
+    assert expected in text
+    assert "Traceback" not in done.stderr
+    assert sorted(os.listdir(tmp_path)) == ["full", "skin.json"]
+    assert (tmp_path / "full" / "notes.txt").read_text() == "mine"
+
+
+def test_a_changed_field_is_refused_by_name_on_resume(trained: Path):
+    before = (trained / "checkpoint.safetensors").read_bytes()
+    done = run("ppo.py", "--resume", trained, "--seed", "1", "--sensor.range", "1")
+    assert done.returncode == 2
+    assert "changed: sensor.range, seed" in done.stderr
+    assert (trained / "checkpoint.safetensors").read_bytes() == before
+
+
+def test_a_truncated_checkpoint_is_refused(trained: Path, tmp_path: Path):
+    content = (trained / "checkpoint.safetensors").read_bytes()
+    (tmp_path / "cut.safetensors").write_bytes(content[: len(content) // 2])
+    done = run("evaluate.py", tmp_path / "cut.safetensors")
+    assert done.returncode == 2
+    assert "cut.safetensors is truncated" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_bench_loop_gives_its_rows(tmp_path: Path):
+    done = run(
+        "bench.py",
+        "loop",
+        *("--num-envs", "32", "--num-workers", "1", "--warmup", "1", "--rounds", "1"),
+        *("--json", tmp_path / "loop.json"),
+    )
+    assert done.returncode == 0, done.stderr
+    rows = json.loads((tmp_path / "loop.json").read_text())["rows"]
+    names = ["raw", "env", "sensors", "policy", "train_field"]
+    assert [row["name"] for row in rows] == names
+    assert rows[0]["ratio"] == 1.0
+    assert all(row["value"] > 0 for row in rows)

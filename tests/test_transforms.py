@@ -1,0 +1,434 @@
+"""What every transform promises: offline, in an environment, around workers."""
+
+from __future__ import annotations
+
+import multiprocessing
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from torchrl.data import Composite, Unbounded
+from torchrl.envs import Compose, ParallelEnv, SerialEnv, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
+from egoskin.make import EnvConfig, SensorConfig, make_worker_env
+from egoskin.observations import Privileged, Proprioception
+from egoskin.robots import H1_2
+from egoskin.sensors import (
+    Binary,
+    FieldSensor,
+    Localization,
+    Proximity,
+    place_area_uniform,
+)
+
+SKIN = place_area_uniform(H1_2, 12, seed=0)
+BALLS = DodgeballConfig().throws.balls
+DEFAULT = torch.from_numpy(H1_2.default_joint_pos)
+JOINTS = len(H1_2.joints)
+
+BUILDERS = {
+    "field": partial(FieldSensor, SKIN, H1_2.chain, BALLS, 1.0),
+    "proximity": partial(Proximity, 1.0),
+    "binary": Binary,
+    "localization": Localization,
+    "proprioception": partial(Proprioception, DEFAULT),
+    "privileged objects": partial(Privileged, "objects", JOINTS, len(BALLS)),
+    "privileged velocity": partial(Privileged, "velocity", JOINTS, len(BALLS)),
+}
+every_transform = pytest.mark.parametrize("build", BUILDERS.values(), ids=BUILDERS)
+
+
+@pytest.fixture(scope="module")
+def full_state(random_state):
+    """Function like random_state, with the field sensor's results added."""
+
+    def draw(n: int, seed: int = 0, dtype: torch.dtype = torch.float32) -> TensorDict:
+        return BUILDERS["field"]()(random_state(n, seed, dtype))
+
+    return draw
+
+
+def select(state: TensorDict, keys) -> TensorDict:
+    return TensorDict({key: state[key] for key in keys}, batch_size=state.batch_size)
+
+
+def assert_same_bits(a, b, keys):
+    for key in keys:
+        assert torch.equal(a[key], b[key]), key
+
+
+# --- offline --------------------------------------------------------------------
+
+
+@every_transform
+def test_works_offline_with_a_time_dimension(build, full_state):
+    transform, state = build(), full_state(5 * 32)
+    ins = transform.in_keys
+    flat = transform(select(state, ins))
+    stored = transform(select(state, ins).reshape(5, 32))
+    assert stored.batch_size == (5, 32)
+    assert_same_bits(stored.reshape(-1), flat, transform.out_keys)
+
+
+@every_transform
+def test_works_without_a_batch(build, full_state):
+    transform, state = build(), full_state(1)
+    expected = transform(select(state, transform.in_keys))
+    single = transform(select(state, transform.in_keys)[0])
+    for key in transform.out_keys:
+        torch.testing.assert_close(single[key], expected[key][0])
+
+
+@every_transform
+def test_nested_and_custom_keys_change_no_value(build, full_state):
+    plain, state = build(), full_state(32)
+    expected = plain(select(state, plain.in_keys))
+    for rename in (lambda k: f"my_{k}", lambda k: ("robot_1", "raw", k)):
+        ins = [rename(key) for key in plain.in_keys]
+        outs = [rename(key) for key in plain.out_keys]
+        transform = build(in_keys=ins, out_keys=outs)
+        given_ = TensorDict({}, batch_size=[32])
+        for new, old in zip(ins, plain.in_keys, strict=True):
+            given_[new] = state[old]
+        result = transform(given_)
+        for new, old in zip(outs, plain.out_keys, strict=True):
+            assert torch.equal(result[new], expected[old])
+        assert all(key not in result.keys() for key in plain.out_keys)
+
+
+@every_transform
+def test_float64_gives_float64_of_the_same_value(build, full_state):
+    transform = build()
+    single = transform(select(full_state(32), transform.in_keys))
+    double = transform(select(full_state(32, dtype=torch.float64), transform.in_keys))
+    for key in transform.out_keys:
+        floating = single[key].is_floating_point()
+        assert double[key].dtype == (torch.float64 if floating else torch.bool)
+        torch.testing.assert_close(
+            double[key].float(), single[key].float(), atol=1e-5, rtol=1e-5
+        )
+
+
+@every_transform
+def test_a_missing_key_is_named(build, full_state):
+    transform, state = build(), full_state(4)
+    missing = transform.in_keys[-1]
+    name = type(transform).__name__
+    state = select(state, transform.in_keys[:-1])
+    with pytest.raises(KeyError, match=f"{name} reads '{missing}', which .* lacks"):
+        transform(state)
+
+
+@every_transform
+def test_inputs_are_never_written(build, full_state):
+    transform, state = build(), full_state(32)
+    state = select(state, transform.in_keys)
+    before = state.clone()
+    result = transform(state)
+    assert set(result.keys()) == {*transform.in_keys, *transform.out_keys}
+    # Writing to a result must not reach an input either.
+    for key in transform.out_keys:
+        result[key].fill_(1)
+    assert_same_bits(state, before, transform.in_keys)
+
+
+@every_transform
+def test_results_are_those_of_the_spec(build, full_state):
+    transform, state = build(), full_state(8)
+    spec = Composite(
+        {
+            key: Unbounded(shape=value.shape, dtype=value.dtype)
+            for key, value in state.items()
+        },
+        shape=[8],
+    )
+    for key in transform.out_keys:
+        spec.pop(key, None)
+    spec = transform.transform_observation_spec(spec)
+    result = transform(select(state, transform.in_keys))
+    for key in transform.out_keys:
+        assert spec[key].is_in(result[key]), key
+
+
+@every_transform
+@given(st.lists(st.booleans(), min_size=64, max_size=64))
+def test_a_reset_computes_the_rows_that_reset_to_the_same_bits(build, full_state, mask):
+    transform, state = build(), full_state(64)
+    state = select(state, transform.in_keys)
+    full = transform(state.clone())
+    mask = torch.tensor(mask)
+    asked = TensorDict({"_reset": mask[:, None]}, batch_size=[64])
+    partial_ = transform._reset(asked, state)
+    for key in transform.out_keys:
+        assert torch.equal(partial_[key][mask], full[key][mask])
+        # The other rows are the environment's to fill in: nothing was computed there
+        # (but one row, if none resets, so that shapes are known).
+        others = ~mask
+        others[0] = False
+        assert not partial_[key][others].any()
+
+
+@every_transform
+def test_a_reset_works_on_batches_of_workers(build, full_state):
+    transform, state = build(), full_state(64)
+    state = select(state, transform.in_keys).reshape(4, 16)
+    full = transform(state.clone())
+    mask = torch.zeros(4, 16, 1, dtype=torch.bool)
+    mask[1, 3] = mask[2, :5] = True
+    asked = TensorDict({"_reset": mask}, batch_size=[4, 16])
+    partial_ = transform._reset(asked, state)
+    rows = mask[..., 0]
+    for key in transform.out_keys:
+        assert partial_[key].shape == full[key].shape
+        assert torch.equal(partial_[key][rows], full[key][rows])
+
+
+def test_privileged_refuses_the_wrong_number_of_keys():
+    with pytest.raises(ValueError, match="in_keys must name base_pose, base_lin_vel_w"):
+        Privileged("velocity", JOINTS, 2, in_keys=["base_pose"])
+
+
+# --- layouts by hand ------------------------------------------------------------
+
+HALF = 0.5**0.5
+
+
+def tensors(**values) -> TensorDict:
+    return TensorDict(
+        {
+            k: torch.as_tensor(v)[None]
+            if isinstance(v, torch.Tensor)
+            else torch.tensor([v])
+            for k, v in values.items()
+        },
+        batch_size=[1],
+    )
+
+
+def test_proprioception_by_hand():
+    # Rolled +90 deg about x: the world's z is the base's y, so gravity is its -y.
+    deviation = torch.linspace(-1, 1, JOINTS)
+    velocity = torch.linspace(5, 6, JOINTS)
+    state = tensors(
+        base_pose=[7.0, 8, 9, HALF, HALF, 0, 0],
+        base_ang_vel_b=[0.1, 0.2, 0.3],
+        joint_pos=DEFAULT.float() + deviation,
+        joint_vel=velocity,
+    )
+    observation = BUILDERS["proprioception"]()(state)["observation"][0]
+    assert observation.shape == (48,)  # 3 + 21 + 21 + 3
+    torch.testing.assert_close(observation[:3], torch.tensor([0.1, 0.2, 0.3]))
+    torch.testing.assert_close(observation[3:24], deviation)
+    torch.testing.assert_close(observation[24:45], velocity)
+    torch.testing.assert_close(
+        observation[45:], torch.tensor([0.0, -1, 0]), atol=1e-6, rtol=0
+    )
+
+
+def privileged_state() -> TensorDict:
+    # Base at (1, 0, 1), turned +90 deg about z: its x is the world's y, its y the -x.
+    return tensors(
+        base_pose=[1.0, 0, 1, HALF, 0, 0, HALF],
+        base_lin_vel_w=[0.0, 2, 0.5],
+        displacement_w=[1.0, 0],
+        previous_action=torch.arange(JOINTS, dtype=torch.float32),
+        object_pose=[[1.0, 3, 2, 1, 0, 0, 0], [5.0, 5, 5, 1, 0, 0, 0]],
+        object_lin_vel_w=[[-4.0, 2, 0], [1.0, 1, 1]],
+        object_active=[True, False],
+    )
+
+
+def test_privileged_objects_by_hand():
+    result = BUILDERS["privileged objects"]()(privileged_state())
+    observation = result["privileged_observation"][0]
+    expected = [
+        *(2, 0, 0.5),  # base velocity
+        *(0, -1, 0),  # displacement (1, 0) in the base frame
+        *range(JOINTS),  # previous action
+        # First ball: (0, 3, 1) from the base is (3, 0, 1); its velocity relative to
+        # the base (-4, 0, -.5) is (0, 4, -.5); active.
+        *(3, 0, 1, 0, 4, -0.5, 1),
+        *(0,) * 7,  # the second ball is not in play
+    ]
+    torch.testing.assert_close(observation, torch.tensor(expected).float())
+
+
+def test_privileged_velocity_by_hand():
+    result = BUILDERS["privileged velocity"]()(privileged_state())
+    torch.testing.assert_close(
+        result["privileged_observation"][0], torch.tensor([2, 0, 0.5])
+    )
+
+
+def test_privileged_does_not_see_an_inactive_object():
+    build, state = BUILDERS["privileged objects"], privileged_state()
+    expected = build()(state.clone())["privileged_observation"]
+    state["object_pose"][:, 1] += 100
+    state["object_lin_vel_w"][:, 1] -= 3
+    assert torch.equal(build()(state)["privileged_observation"], expected)
+
+
+# --- in an environment ----------------------------------------------------------
+
+SENSORS = {
+    "proximity": SensorConfig(),
+    "localization": SensorConfig(signal="localization"),
+    "binary": SensorConfig(signal="binary", range=0.5),
+    "infinite": SensorConfig(range=float("inf")),
+    "blind": SensorConfig(coverage="none"),
+}
+
+
+def actions(steps: int, rows: int) -> torch.Tensor:
+    """Fixed wild actions: robots fall soon, and not all at once."""
+    generator = torch.Generator().manual_seed(0)
+    size = 0.7 * torch.rand(rows, 1, generator=generator)
+    return (size * torch.randn(100, rows, JOINTS, generator=generator))[:steps]
+
+
+def run(env, steps: int) -> list[TensorDict]:
+    """What an environment gives under fixed actions, flat over its rows."""
+    out, root = [], env.reset()
+    for action in actions(steps, root.numel()):
+        root["action"] = action.reshape(*root.batch_size, JOINTS)
+        step, root = env.step_and_maybe_reset(root)
+        out += [step["next"].reshape(-1).clone(), root.reshape(-1).clone()]
+    return out
+
+
+@pytest.mark.parametrize("sensor", SENSORS.values(), ids=SENSORS)
+def test_environment_keeps_its_specs(sensor):
+    config = EnvConfig(sensor=sensor)
+    env = make_worker_env(config, SKIN, num_envs=6, seed=0)
+    check_env_specs(env)
+    env = make_worker_env(config, SKIN, num_envs=6, seed=0, keep_raw=True)
+    check_env_specs(env)
+
+
+@pytest.mark.parametrize("content", ["objects", "velocity"])
+@pytest.mark.parametrize("signal", ["proximity", "localization", "binary"])
+def test_signals_are_those_of_the_state_under_staggered_resets(signal, content):
+    # Fixed actions, rows that end at different steps: what stands in the tensordict
+    # must always be what the raw state beside it gives offline.
+    config = EnvConfig(sensor=SensorConfig(signal=signal), privileged=content)
+    env = make_worker_env(config, SKIN, num_envs=6, seed=0, keep_raw=True)
+    ended = []
+    for state in run(env, 70):
+        ended.append(state["done"][:, 0].clone())
+        for transform in env.transform:
+            again = transform(select(state, transform.in_keys))
+            for key in transform.out_keys:
+                torch.testing.assert_close(state[key], again[key])
+    per_step = torch.stack(ended[::2]).sum(1)
+    assert ((per_step > 0) & (per_step < 6)).sum() >= 3  # partial resets happened
+
+
+def outside(config: EnvConfig, parallel, **kwargs) -> TransformedEnv:
+    """Transforms around two base environments of three rows."""
+    bases = [
+        partial(DodgeballEnv, H1_2, config.task, num_envs=3, seed=5, row_offset=i)
+        for i in (0, 3)
+    ]
+    transforms = [
+        Proprioception(DEFAULT),
+        Privileged("objects", JOINTS, len(BALLS)),
+        *config.sensor.transforms(H1_2, SKIN, config.task),
+    ]
+    return TransformedEnv(parallel(2, bases, **kwargs), Compose(*transforms))
+
+
+@pytest.fixture(scope="module")
+def inside_run() -> list[TensorDict]:
+    """Transforms in the environment itself: the reference of the next tests."""
+    return run(make_worker_env(EnvConfig(), SKIN, num_envs=6, seed=5), 60)
+
+
+OBSERVED = ("observation", "privileged_observation", "signal")
+
+
+@pytest.mark.parametrize(
+    ("parallel", "options"),
+    [(SerialEnv, {}), (ParallelEnv, {"mp_start_method": "forkserver"})],
+    ids=["serial", "parallel"],
+)
+def test_transforms_around_workers_give_what_they_give_inside(
+    inside_run, parallel, options
+):
+    # The workers' imports are paid for once.
+    multiprocessing.set_forkserver_preload(["egoskin.make"])
+    env = outside(EnvConfig(), parallel, **options)
+    try:
+        states = run(env, 60)
+    finally:
+        env.close()
+    assert any(state["done"].any() for state in states)
+    for state, expected in zip(states, inside_run, strict=True):
+        for key in (*OBSERVED, "done", "episode_step"):
+            torch.testing.assert_close(state[key], expected[key])
+
+
+def test_a_static_seed_reaches_the_environments_of_all_workers(inside_run):
+    env = outside(EnvConfig(), SerialEnv)
+    env.set_seed(99, static_seed=True)
+    other = run(env, 1)
+    assert not torch.equal(other[0]["observation"], inside_run[0]["observation"])
+    env.set_seed(5, static_seed=True)
+    for state, expected in zip(run(env, 10), inside_run, strict=False):
+        for key in OBSERVED:
+            torch.testing.assert_close(state[key], expected[key])
+    env.close()
+
+
+# --- what the actor may know ----------------------------------------------------
+
+
+def test_the_actor_reads_its_observation_and_the_signal_alone():
+    assert EnvConfig().actor_keys == ["observation", "signal"]
+    blind = EnvConfig(sensor=SensorConfig(coverage="none"))
+    assert blind.actor_keys == ["observation"]
+    for config in (EnvConfig(), blind):
+        assert config.critic_keys == [*config.actor_keys, "privileged_observation"]
+    env = make_worker_env(EnvConfig(), SKIN, num_envs=2, seed=0)
+    assert env.observation_spec["observation"].shape == (2, 48)
+    assert env.observation_spec["signal"].shape == (2, len(SKIN))
+
+
+@pytest.mark.parametrize("signal", ["proximity", "localization", "binary"])
+def test_the_actor_sees_nothing_that_it_may_not(random_state, signal):
+    """Allowed: angular velocity, joints, gravity, and where the ball is in range."""
+    config = EnvConfig(sensor=SensorConfig(signal=signal))
+    env = make_worker_env(config, SKIN, num_envs=32, seed=0, keep_raw=True)
+    env.reset()
+    state = env.rollout(3)[:, -1].select(*random_state(1).keys())
+    other = random_state(32, seed=1)
+    changed = state.clone()
+    forbidden = (
+        "base_lin_vel_w",
+        "object_lin_vel_w",
+        "displacement_w",
+        "previous_action",
+    )
+    for key in forbidden:
+        changed[key] = other[key]
+    # The whole scene moved over the floor and turned about the vertical.
+    yaw, shift = 1.1, torch.tensor([3.0, -2.0, 0.0])
+    c, s = np.cos(yaw), np.sin(yaw)
+    turn = torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1]]).float()
+    for key in ("base_pose", "object_pose"):
+        changed[key][..., :3] = state[key][..., :3] @ turn.T + shift
+    w, x, y, z = state["base_pose"][:, 3:].unbind(-1)
+    c, s = np.cos(yaw / 2), np.sin(yaw / 2)
+    turned = (c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w)
+    changed["base_pose"][:, 3:] = torch.stack(turned, -1)
+
+    seen, seen_changed = (env.transform(td.clone()) for td in (state, changed))
+    for key in config.actor_keys:
+        torch.testing.assert_close(seen_changed[key], seen[key], atol=1e-5, rtol=0)
+    key = "privileged_observation"
+    assert not torch.isclose(seen_changed[key], seen[key]).all()

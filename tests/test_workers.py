@@ -1,0 +1,162 @@
+"""The worker pool: same results, sleeping parent, faults told with their cause."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from functools import partial
+
+import pytest
+import torch
+from torchrl.envs import Transform, TransformedEnv
+
+from egoskin.make import (
+    EnvConfig,
+    load_env_state,
+    make_env,
+    make_worker_env,
+    save_env_state,
+)
+from egoskin.robots import H1_2
+from egoskin.sensors import place_area_uniform
+from egoskin.workers import WorkerError, WorkerPool, default_num_workers
+
+NUM_ENVS = 32
+
+
+@pytest.fixture(scope="module")
+def skin():
+    return place_area_uniform(H1_2, 8, seed=0)
+
+
+def make_pool(skin, workers: int, num_envs: int = NUM_ENVS) -> WorkerPool:
+    return make_env(EnvConfig(), skin, num_envs=num_envs, seed=5, num_workers=workers)
+
+
+def steps(pool: WorkerPool, root, count: int, seed: int):
+    """Step with fixed actions for each global row; return all that came out."""
+    generator = torch.Generator().manual_seed(seed)
+    seen = []
+    for _ in range(count):
+        action = torch.randn(NUM_ENVS, 21, generator=generator)
+        root["action"] = action.reshape(*root.batch_size, 21)
+        data, root = pool.step_and_maybe_reset(root)
+        seen.append(data["next"].reshape(-1))
+    return torch.stack(seen), root
+
+
+def assert_same(one, other) -> None:
+    assert one.keys() == other.keys()
+    for key in one.keys():
+        assert torch.equal(one[key], other[key]), key
+
+
+def test_results_do_not_depend_on_the_number_of_workers(skin):
+    # 90 steps: the first throws land, robots fall, rows reset at different times.
+    results = []
+    for workers in (1, 2, 4):
+        pool = make_pool(skin, workers)
+        try:
+            results.append(steps(pool, pool.reset(), 90, seed=0)[0])
+        finally:
+            pool.close()
+    assert results[0]["done"].any()
+    assert_same(results[0], results[1])
+    assert_same(results[0], results[2])
+
+
+def test_a_saved_state_continues_bit_for_bit_on_other_workers(skin):
+    pool = make_pool(skin, 2)
+    try:
+        _, root = steps(pool, pool.reset(), 40, seed=1)
+        state = save_env_state(pool, root)
+        expected, _ = steps(pool, root, 40, seed=2)
+    finally:
+        pool.close()
+    pool = make_pool(skin, 4)
+    try:
+        found, _ = steps(pool, load_env_state(pool, state), 40, seed=2)
+    finally:
+        pool.close()
+    assert_same(expected, found)
+
+
+def test_the_parent_sleeps_while_the_workers_step(skin):
+    pool = make_pool(skin, 1, num_envs=512)
+    try:
+        root = pool.reset()
+        root["action"] = torch.zeros(*root.batch_size, 21)
+        pool.step_and_maybe_reset(root.clone())
+        wall, cpu = time.perf_counter(), time.process_time()
+        for _ in range(10):
+            pool.step_and_maybe_reset(root.clone())
+        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    finally:
+        pool.close()
+    # TorchRL's busy wait would give 1.
+    assert cpu < 0.5 * wall
+
+
+def test_a_killed_worker_is_named_with_its_signal(skin):
+    pool = make_pool(skin, 2)
+    root = pool.reset()
+    processes = list(pool._workers)
+    os.kill(processes[1].pid, signal.SIGKILL)
+    root["action"] = torch.zeros(*root.batch_size, 21)
+    start = time.monotonic()
+    with pytest.raises(WorkerError, match="worker 1 of 2 was killed by SIGKILL"):
+        pool.step_and_maybe_reset(root)
+    assert time.monotonic() - start < 10
+    assert not any(process.is_alive() for process in processes)
+    pool.close()
+
+
+class Faulty(Transform):
+    """Raises at the third step."""
+
+    count = 0
+
+    def _step(self, tensordict, next_tensordict):
+        self.count += 1
+        if self.count == 3:
+            raise ZeroDivisionError("the third step")
+        return next_tensordict
+
+
+def build_faulty(skin) -> TransformedEnv:
+    env = make_worker_env(EnvConfig(), skin, num_envs=4, seed=0)
+    env.append_transform(Faulty())
+    return env
+
+
+def test_a_worker_that_raises_is_reported_with_its_traceback(skin):
+    pool = WorkerPool([partial(build_faulty, skin)] * 2)
+    root = pool.reset()
+    processes = list(pool._workers)
+    root["action"] = torch.zeros(*root.batch_size, 21)
+    for _ in range(2):
+        pool.step_and_maybe_reset(root.clone())
+    with pytest.raises(WorkerError, match="ZeroDivisionError: the third step"):
+        pool.step_and_maybe_reset(root)
+    assert not any(process.is_alive() for process in processes)
+    pool.close()
+
+
+def test_closing_twice_is_allowed(skin):
+    pool = make_pool(skin, 1)
+    pool.reset()
+    pool.close()
+    pool.close()
+
+
+def test_the_default_number_of_workers_is_the_largest_divisor_not_above_the_cores():
+    assert default_num_workers(4096, cores=2) == 2
+    assert default_num_workers(4096, cores=12) == 8
+    assert default_num_workers(9, cores=2) == 1
+    assert default_num_workers(1, cores=64) == 1
+
+
+def test_workers_that_do_not_divide_the_agents_are_refused(skin):
+    with pytest.raises(ValueError, match="valid: 1, 2, 4, 8, 16, 32"):
+        make_pool(skin, 3)
