@@ -174,7 +174,7 @@ def save_film(path: Path, frames: Sequence[Frame], fps: float) -> None:
     writer = imageio_ffmpeg.write_frames(
         part,
         (width, height),
-        fps=fps,
+        fps=fps,  # pyright: ignore[reportArgumentType] - ffmpeg takes fractions
         macro_block_size=2,
         ffmpeg_log_level="error",
         **options,

@@ -14,6 +14,7 @@ import math
 import os
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
 
@@ -118,9 +119,6 @@ def render_episode(
         steps = config.task.episode_steps
     else:
         steps = round(max_seconds * hz)
-    env = make_worker_env(
-        config, skin, num_envs=1, seed=seed, row_offset=row, hold=hold, keep_raw=True
-    )
     painter = Painter(
         config.robot_config,
         None if config.sensor.coverage == "none" else skin,
@@ -128,26 +126,26 @@ def render_episode(
         size=size,
         camera=camera,
     )
-    with painter, torch.no_grad():
+    env = make_worker_env(
+        config, skin, num_envs=1, seed=seed, row_offset=row, hold=hold, keep_raw=True
+    )
+    with painter, closing(env), torch.no_grad():
         td = env.reset()
         frames = [painter.draw(td[0], time=0.0)]
         for step in range(1, steps + 1):
             if policy is None:
-                td["action"] = torch.zeros_like(env.action_spec.zero())
+                td["action"] = env.action_spec.zero()
             else:
                 td = policy(td)
             td = env.step(td)
             state = td["next"][0]
-            ending = _ending(state)
-            if ending is None and step == steps:
-                ending = "cut"
-            due = int(step * fps / hz) > int((step - 1) * fps / hz)
-            if due or ending:
+            ending = _ending(state) or ("cut" if step == steps else None)
+            is_due = int(step * fps / hz) > int((step - 1) * fps / hz)
+            if is_due or ending:
                 frames.append(painter.draw(state, time=step / hz, ending=ending))
             if ending:
                 break
             td = step_mdp(td)
-    env.close()
     return frames
 
 
@@ -227,14 +225,15 @@ class Painter:
                 starts anew when time goes back.
             ending: Why the episode ends here, for the frame.
         """
-        active = state["object_active"].numpy()
-        self._follow(state["base_pose"].double().numpy(), time)
+        active = np.asarray(state["object_active"])
+        self._follow(np.asarray(state["base_pose"], float), time)
         self._place(state, active)
         self._canvas.update(self._data, self._camera)
         detecting = np.zeros(0, dtype=bool)
         if self._skin is not None:
-            detecting = np.isfinite(state["distance"].numpy())
-            self._draw_sensors(detecting, state["object_pose"], active)
+            detecting = np.isfinite(np.asarray(state["distance"]))
+            pose = np.asarray(state["object_pose"], float)
+            self._draw_sensors(detecting, pose[active], active)
         return Frame(
             image=self._canvas.read(),
             time=time,
@@ -246,9 +245,8 @@ class Painter:
 
     def _place(self, state: TensorDictBase, active: np.ndarray) -> None:
         """Put the robot and the balls of the visual model where the state says."""
-        robot_q = torch.cat((state["base_pose"], state["joint_pos"]))
-        self._data.qpos[:] = robot_q.double().numpy()
-        pose = state["object_pose"].double().numpy()
+        self._data.qpos[:] = np.concatenate((state["base_pose"], state["joint_pos"]))
+        pose = np.asarray(state["object_pose"], float)
         lamp = np.array([*self._camera.lookat[:2], 0.0])
         half = math.radians(self._camera.azimuth) / 2
         turn = np.array([math.cos(half), 0.0, 0.0, math.sin(half)])
@@ -279,9 +277,9 @@ class Painter:
         self._last_time = time
 
     def _draw_sensors(
-        self, detecting: np.ndarray, object_pose: torch.Tensor, active: np.ndarray
+        self, detecting: np.ndarray, active_pose: np.ndarray, active: np.ndarray
     ) -> None:
-        """Add the sensors, and a line from each that detects to what it detects."""
+        """Add the sensors, and a line from each that detects to the nearest ball."""
         assert self._skin is not None
         rotation = self._data.xmat[self._link_of_sensor].reshape(-1, 3, 3)
         offset = (rotation @ self._skin.position[:, :, None])[..., 0]
@@ -293,11 +291,9 @@ class Painter:
         if not (detecting.any() and active.any()):
             return
         points = points[detecting]
-        poses = object_pose.double().numpy()[active]
         shapes = [s for s, on in zip(self._objects, active, strict=True) if on]
-        ends = np.stack(
-            [closest_point(s, p, points) for s, p in zip(shapes, poses, strict=True)]
-        )
+        found = zip(shapes, active_pose, strict=True)
+        ends = np.stack([closest_point(shape, pose, points) for shape, pose in found])
         length = np.linalg.norm(ends - points, axis=-1)
         nearest = length.argmin(0)
         for i, point in enumerate(points):
@@ -463,9 +459,9 @@ class _Canvas:
         scene = self._scene
         assert scene.ngeom < scene.maxgeom
         geom = scene.geoms[scene.ngeom]
-        mujoco.mjv_initGeom(
-            geom, kind, np.zeros(3), np.zeros(3), np.eye(3).ravel(), np.float32(rgba)
-        )
+        colour = np.array(rgba, np.float32)
+        zero, identity = np.zeros(3), np.eye(3).ravel()
+        mujoco.mjv_initGeom(geom, kind, zero, zero, identity, colour)
         geom.category = mujoco.mjtCatBit.mjCAT_DECOR
         geom.emission = float(glows)
         scene.ngeom += 1

@@ -13,6 +13,7 @@ on resume, so that a log has neither a gap nor a repetition.
 
 from __future__ import annotations
 
+import argparse
 import csv
 import datetime
 import importlib.metadata
@@ -133,12 +134,13 @@ def parse_config(args: list[str]) -> TrainConfig:
         ValueError: If a field is changed that may not be, or the end lies before the
             one planned.
     """
-    config = tyro.cli(TrainConfig, args=args)
-    if config.resume is None:
-        return config
-    stored = Run.open(config.resume).config
+    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    first.add_argument("--resume", type=Path)
+    run, _ = first.parse_known_args(args)
+    if run.resume is None or str(run.resume) == "None":
+        return tyro.cli(TrainConfig, args=args)
+    stored = Run.open(run.resume).config
     config = tyro.cli(TrainConfig, args=args, default=stored)
-    assert config.resume is not None
     before, after = to_plain(stored), to_plain(config)
     for name in _CALL_FIELDS:
         del before[name], after[name]

@@ -13,10 +13,10 @@ import egoskin  # noqa: F401  (before torch: it says how torch's threads wait)
 import sys
 
 import tyro
+
 from benchmarks.loop import LoopConfig, loop
 from benchmarks.physics import PhysicsBench, physics_rows
 from benchmarks.report import report
-
 from egoskin.cli import clear_errors
 
 

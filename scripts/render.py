@@ -21,9 +21,9 @@ except (AttributeError, ImportError, RuntimeError) as fault:
     # PyOpenGL's and does not say so.
     backend = os.environ.get("MUJOCO_GL", "")
     print(
-        f"error: MuJoCo cannot be imported with MUJOCO_GL={backend!r} ({fault}); unset "
-        "it, or install the library (Debian: `apt-get install libegl1` for egl, "
-        "`apt-get install libosmesa6` for osmesa)",
+        f"error: MuJoCo cannot be imported with MUJOCO_GL={backend!r} ({fault}); "
+        "install the library (Debian: `apt-get install libegl1` for egl, `apt-get "
+        "install libosmesa6` for osmesa)",
         file=sys.stderr,
     )
     raise SystemExit(2) from None

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
-import runpy
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -269,9 +269,15 @@ def test_bad_input_is_an_error_and_writes_nothing(
     args: list, text: str, tmp_path: Path, monkeypatch, capsys
 ):
     monkeypatch.chdir(tmp_path)
-    main = runpy.run_path(str(SCRIPT))["main"]
+    spec = importlib.util.spec_from_file_location("render", SCRIPT)
+    assert spec is not None
+    assert spec.loader is not None
+    script = importlib.util.module_from_spec(spec)
+    # Dataclasses look their annotations up in the module of that name.
+    monkeypatch.setitem(sys.modules, "render", script)
+    spec.loader.exec_module(script)
     with pytest.raises(SystemExit) as status, clear_errors():
-        main(args)
+        script.main(args)
     assert status.value.code == 2
     assert text in " ".join(capsys.readouterr().err.split())
     assert not list(tmp_path.iterdir())

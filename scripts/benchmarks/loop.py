@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from benchmarks.report import Row, show
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from benchmarks.report import Row, show
 from egoskin.agents.ppo import PPO, PPOConfig, collect
 from egoskin.checkpoint import part
 from egoskin.envs.dodgeball import DodgeballEnv

@@ -10,8 +10,8 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import torch
-from benchmarks.report import Row, show
 
+from benchmarks.report import Row, show
 from egoskin.envs.physics import Physics, PhysicsConfig, build_scene
 from egoskin.envs.throws import ThrowConfig
 from egoskin.make import EnvConfig
