@@ -337,7 +337,9 @@ class DodgeballEnv(EnvBase):
             displacement_w=out["displacement_w"],
             action_change=action - counters["previous_action"],
             terminated=terminated,
-        ).nan_to_num(0.0)
+        )
+        # What a failed simulation leaves behind earns and costs nothing.
+        terms = torch.where(result.diverged[:, None], 0.0, terms)
         counters["previous_action"].copy_(action)
         out["previous_action"] = action.clone()
         out["reward_terms"] = terms

@@ -73,10 +73,13 @@ class ThrowConfig:
                 raise ValueError(f"{name} must be positive, got ({low}, {high})")
         if self.num_balls < 1:
             raise ValueError(f"num_balls must be at least 1, got {self.num_balls}")
-        if self.mass <= 0:
+        if not self.mass > 0:
             raise ValueError(f"mass must be positive, got {self.mass}")
-        if self.lead < 0:
-            raise ValueError(f"lead must not be negative, got {self.lead}")
+        for name in ("lead", "box_half_width"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(
+                    f"{name} must not be negative, got {getattr(self, name)}"
+                )
 
     @property
     def balls(self) -> tuple[Sphere, ...]:
@@ -185,7 +188,7 @@ class Thrower:
         """Return position and velocity of balls thrown at robots as they are now.
 
         A row's result is the same whichever rows are computed with it if their
-        number is a multiple of 16 (`egoskin.kinematics.pad_rows`).
+        number is a multiple of 32 (`egoskin.kinematics.pad_rows`).
 
         Args:
             draw: Draws of ``n`` throws.
