@@ -25,11 +25,11 @@ class PhysicsBench:
     (standard deviation 0.4 rad) in every control step and falls.
     """
 
-    num_envs: int = 1024
+    num_envs: int = 256
     """Simulations."""
     steps: int = 30
     """Control steps in each measurement."""
-    rounds: int = 5
+    rounds: int = 15
     """How often each variant is measured, in turn."""
     json: Path | None = None
     """File to write the rows to."""
