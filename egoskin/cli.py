@@ -20,13 +20,15 @@ def clear_errors() -> Iterator[None]:
     """Turn errors the user can mend into one line on stderr and exit status 2.
 
     Those are ValueError (bad input) and OSError (files). Anything else is a fault of
-    ours and keeps its traceback.
+    ours and keeps its traceback. Ctrl-C ends without one.
     """
     try:
         yield
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None
+    except KeyboardInterrupt:
+        raise SystemExit(130) from None
 
 
 def to_plain(value: Any) -> Any:

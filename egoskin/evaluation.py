@@ -18,12 +18,13 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
+from egoskin.envs.dodgeball import DodgeballConfig
 from egoskin.envs.throws import ThrowConfig
 from egoskin.make import EnvConfig, make_env
 from egoskin.sensors import Skin
 
-# Success is survival to this age; survival time is restricted to the other [s].
-SUCCESS_AGE, LONGEST = 3.0, 10.0
+# Survival time is restricted to this [s].
+_LONGEST = 10.0
 # Two-sided 95 % quantile of the normal distribution.
 _Z = 1.959964
 
@@ -184,20 +185,21 @@ def play_bank(
 def standard_task(config: EnvConfig) -> EnvConfig:
     """Return the configuration with the standard throw and episodes of 10 s."""
     task = dataclasses.replace(
-        config.task, throws=ThrowConfig(), episode_length_s=LONGEST
+        config.task, throws=ThrowConfig(), episode_length_s=_LONGEST
     )
     return dataclasses.replace(config, task=task)
 
 
-def summarize(played: Episodes, rigid: Episodes, control_hz: float) -> Evaluation:
+def summarize(played: Episodes, rigid: Episodes, task: DodgeballConfig) -> Evaluation:
     """Return the figures of a bank from how its episodes ended.
 
     Args:
         played: Episodes of the policy.
         rigid: Episodes of the rigid robot on the same bank.
-        control_hz: Control rate [Hz].
+        task: The task, for its control rate and the age of success.
     """
-    n, limit = len(played.steps), round(SUCCESS_AGE * control_hz)
+    control_hz = task.physics.control_hz
+    n, limit = len(played.steps), round(task.success_s * control_hz)
     early = played.steps <= limit
 
     def failed(episodes: Episodes) -> Tensor:
@@ -254,5 +256,4 @@ def evaluate(
             on_step=None if hold else on_step,
         )
 
-    control_hz = config.task.physics.control_hz
-    return summarize(play(policy, False), play(None, True), control_hz)
+    return summarize(play(policy, False), play(None, True), config.task)

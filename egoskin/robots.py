@@ -138,6 +138,11 @@ class RobotConfig:
         """Largest torque of each joint [N m], ``[J]`` (``actuatorfrcrange``)."""
         return self.model.jnt_actfrcrange[1:, 1].copy()
 
+    @cached_property
+    def joint_range(self) -> np.ndarray:
+        """Lower and upper end of each joint's range [rad], ``[2, J]``."""
+        return self.model.jnt_range[1:].T.copy()
+
     def joint_gains(self, gain_set: str) -> tuple[np.ndarray, np.ndarray]:
         """Return (kp [N m/rad], kd [N m s/rad]) of a named gain set, ``[J]`` each.
 

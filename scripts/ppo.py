@@ -41,8 +41,6 @@ from egoskin.workers import WorkerError, WorkerPool
 
 # A checkpoint is at most this old [s]; the next rollout must fit in as well.
 CHECKPOINT_AGE = 60.0
-# Age at which survival counts as success [s].
-SUCCESS_AGE = 3.0
 
 
 class Stop:
@@ -115,7 +113,8 @@ class Trainer:
         self.survival.decay()
         for info in infos:
             self.survival.update(info["episode_step"][:, 0], info["terminated"][:, 0])
-        hz = self.config.env.task.physics.control_hz
+        task = self.config.env.task
+        hz = task.physics.control_hz
         ended = float(infos["terminated"].sum())
         terms = infos["reward_terms"].mean(0).mean(0).tolist()
 
@@ -124,7 +123,9 @@ class Trainer:
 
         return {
             "episode/survival_s": self.survival.mean() / hz,
-            "episode/success": self.survival.probability(round(SUCCESS_AGE * hz)),
+            "episode/success": self.survival.probability(
+                round(min(task.success_s, task.episode_length_s) * hz)
+            ),
             "episode/ended_by_ball": share_of_ends("hit"),
             "episode/ended_by_fall": share_of_ends("fallen"),
             "episode/diverged": float(infos["diverged"].sum()),

@@ -586,3 +586,23 @@ def test_the_reward_does_not_depend_on_balls_that_do_not_touch():
 def test_a_task_that_makes_no_episode_is_refused(changes, message):
     with pytest.raises(ValueError, match=message):
         DodgeballConfig(**changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        # Ankle roll, gain set "real": 40 N m at 40 N m/rad; range +-0.2618 rad.
+        ({}, 0.5 * 40 / 40),
+        ({"action_scale": 0.3}, 0.3 * 0.5 * 40 / 40),
+        ({"one_action_scale": 0.2}, 0.5 * 0.2),
+        ({"clip_targets": True}, 0.261799),
+    ],
+    ids=["torque over stiffness", "scaled", "one for all", "clipped"],
+)
+def test_position_targets_of_an_action_by_hand(changes: dict, expected: float):
+    env = DodgeballEnv(H1_2, DodgeballConfig(**changes), num_envs=2)
+    td = env.reset()
+    td["action"] = torch.full((2, 21), 0.5)
+    env.step(td)
+    joint = H1_2.joints.index("left_ankle_roll_joint")
+    assert env.physics._ctrl[0, joint] == pytest.approx(expected, abs=1e-6)

@@ -61,7 +61,7 @@ def test_figures_of_five_episodes_by_hand():
         arrived=torch.zeros(5, 2),
         avoided=torch.zeros(5, 2),
     )
-    result = summarize(played, rigid, control_hz=60.0)
+    result = summarize(played, rigid, DodgeballConfig())
     assert result.success.mean == 0.4
     shares = (result.ended_by_ball, result.ended_by_fall, result.diverged)
     assert shares == pytest.approx((0.2, 0.2, 0.2))
@@ -83,7 +83,7 @@ def test_nothing_arrived_is_not_a_share():
         arrived=torch.zeros(1, 2),
         avoided=torch.zeros(1, 2),
     )
-    assert summarize(empty, empty, 60.0).avoided.first_ball is None
+    assert summarize(empty, empty, DodgeballConfig()).avoided.first_ball is None
 
 
 def test_the_standard_throw_replaces_the_throw_of_the_run():

@@ -10,6 +10,7 @@ from functools import partial
 import pytest
 import torch
 from torchrl.envs import Transform, TransformedEnv
+from torchrl.envs.utils import check_env_specs
 
 from egoskin.make import (
     EnvConfig,
@@ -80,6 +81,14 @@ def test_a_saved_state_continues_bit_for_bit_on_other_workers(skin):
     finally:
         pool.close()
     assert_same(expected, found)
+
+
+def test_the_pool_passes_torchrls_own_check(skin):
+    pool = make_pool(skin, 2)
+    try:
+        check_env_specs(pool)
+    finally:
+        pool.close()
 
 
 def test_the_parent_sleeps_while_the_workers_step(skin):

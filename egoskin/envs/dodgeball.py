@@ -34,15 +34,23 @@ class DodgeballConfig:
     """Weights of the reward terms."""
     action_scale: float = 1.0
     """q* = q_default + action_scale x torque limit / kp x action, per joint."""
+    one_action_scale: float | None = None
+    """The same scale for all joints instead [rad]."""
+    clip_targets: bool = False
+    """Clip q* to the joint ranges (an ankle could then ask for little torque)."""
     episode_length_s: float = 10.0
     """Episodes are truncated at this age [s]."""
+    success_s: float = 3.0
+    """An episode that is not terminated up to this age is a success [s]."""
     start_joint_noise: float = 0.05
     """Joints start uniformly within this of the default pose [rad]."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for values that make no episode."""
-        if not self.action_scale > 0:
-            raise ValueError(f"action_scale must be positive, got {self.action_scale}")
+        for name in ("action_scale", "one_action_scale", "success_s"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise ValueError(f"{name} must be positive, got {value}")
         if not self.episode_length_s * self.physics.control_hz >= 1:
             raise ValueError(
                 f"episode_length_s must be at least one control step, got "
@@ -137,7 +145,10 @@ class DodgeballEnv(EnvBase):
         kp, _ = robot.joint_gains(config.physics.gains)
         self._default = torch.from_numpy(robot.default_joint_pos).float()
         scale = config.action_scale * robot.torque_limit / kp
+        if config.one_action_scale is not None:
+            scale[:] = config.one_action_scale
         self._action_scale = torch.from_numpy(scale).float()
+        self._joint_range = torch.from_numpy(robot.joint_range).float()
         self._may_touch_floor = torch.tensor([n in robot.feet for n in robot.links])
         self._rows = torch.arange(num_envs) + row_offset
         balls = config.throws.num_balls
@@ -306,6 +317,8 @@ class DodgeballEnv(EnvBase):
         action = tensordict["action"]
         # q* = q_default + scale x action
         target = self._default + self._action_scale * action
+        if config.clip_targets:
+            target = target.clamp(*self._joint_range)
         result = self.physics.step(target, counters["active"])
         counters["step"] += 1
         state = self.physics.read()
