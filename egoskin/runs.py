@@ -274,9 +274,9 @@ class Run:
         if file.exists():
             with open(file, newline="") as source:
                 rows = list(csv.DictReader(source))
-            kept = [
-                row for row in rows if row["frames"] and int(row["frames"]) <= frames
-            ]
+            # A line that a crash cut short lacks columns.
+            whole = [row for row in rows if None not in row.values()]
+            kept = [row for row in whole if int(row["frames"]) <= frames]
             if kept:
                 self._columns = list(kept[0])
                 partial = file.with_suffix(".partial")

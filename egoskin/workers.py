@@ -43,7 +43,9 @@ def default_num_workers(num_envs: int, cores: int | None = None) -> int:
         cores: Number of cores; those this process may use by default.
     """
     if cores is None:
-        cores = len(os.sched_getaffinity(0))
+        # macOS has no affinity.
+        affinity = getattr(os, "sched_getaffinity", None)
+        cores = len(affinity(0)) if affinity else os.cpu_count() or 1
     return max(n for n in range(1, cores + 1) if num_envs % n == 0)
 
 

@@ -286,4 +286,6 @@ def _minibatches(
     for _ in range(passes):
         order = torch.randperm(len(data)).to(data.device or "cpu")
         for index in order.chunk(parts):
-            yield data[index]
+            batch = data[index]
+            assert isinstance(batch, TensorDictBase)
+            yield batch
