@@ -35,8 +35,8 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING, Any
 
-# Threads of torch that wait in a busy loop take the cores from whatever else runs; on
-# a loaded machine an update then takes tens of times as long. OpenMP reads these when
+# Threads of torch that wait in a busy loop take the cores from whatever else runs, and
+# on a loaded machine an update then takes many times as long. OpenMP reads these when
 # torch is first imported, so import egoskin before it; what is set already stays.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("GOMP_SPINCOUNT", "0")

@@ -247,7 +247,7 @@ class DodgeballEnv(EnvBase):
         rows = mask.reshape(-1).nonzero()[:, 0]
         if len(rows):
             self._start_episodes(rows)
-            self._throw(rows, self.physics.read())
+            self._throw(rows)
         never = torch.zeros(self.batch_size[0], 1, dtype=torch.bool)
         out = self._state_td(self.physics.read())
         out["reward_terms"] = torch.zeros(self.batch_size[0], len(TERMS))
@@ -285,9 +285,10 @@ class DodgeballEnv(EnvBase):
         n = len(rows)
         self.physics.reset(rows.numpy(), pose[:n], joint_pos.expand_as(noise)[:n])
 
-    def _throw(self, rows: Tensor, state: PhysicsState) -> None:
+    def _throw(self, rows: Tensor) -> None:
         """Throw the next ball of some rows at the robot as it is now."""
         counters, padded, n = self._counters, pad_rows(rows), len(rows)
+        state = self.physics.read(padded.numpy())
         throw = counters["throw"]
         draw = self.thrower.draw(
             self._seed,
@@ -296,10 +297,7 @@ class DodgeballEnv(EnvBase):
             throw[padded],
         )
         release = self.thrower.release(
-            draw,
-            state.base_pose[padded],
-            state.base_lin_vel_w[padded],
-            state.joint_pos[padded],
+            draw, state.base_pose, state.base_lin_vel_w, state.joint_pos
         )
         ball = throw[rows] % self.config.throws.num_balls
         self.physics.throw(
@@ -333,7 +331,7 @@ class DodgeballEnv(EnvBase):
         due = (counters["step"] >= counters["next_throw_step"]) & ~terminated
         rows = (due & ~truncated).nonzero()[:, 0]
         if len(rows):
-            self._throw(rows, state)
+            self._throw(rows)
             state = self.physics.read()
 
         out = self._state_td(state)
