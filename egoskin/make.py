@@ -13,6 +13,7 @@ from torch import Tensor
 from torchrl.envs import (
     Compose,
     ExcludeTransform,
+    Transform,
     TransformedEnv,
 )
 
@@ -179,12 +180,14 @@ def make_worker_env(
         num_threads=num_threads,
         hold=hold,
     )
-    default = torch.from_numpy(robot.default_joint_pos)
-    transforms = [
-        Proprioception(default),
-        Privileged(config.privileged, len(robot.joints), config.task.throws.num_balls),
-        *config.sensor.transforms(robot, skin, config.task),
-    ]
+    transforms: list[Transform] = []
+    if not bare:
+        balls = config.task.throws.num_balls
+        transforms += [
+            Proprioception(torch.from_numpy(robot.default_joint_pos)),
+            Privileged(config.privileged, len(robot.joints), balls),
+            *config.sensor.transforms(robot, skin, config.task),
+        ]
     if not keep_raw:
         sensed = set(env.observation_spec.keys()).union(
             *(map(str, t.out_keys) for t in transforms)

@@ -91,6 +91,16 @@ def test_the_pool_passes_torchrls_own_check(skin):
         pool.close()
 
 
+def test_a_bare_env_has_neither_observations_nor_signals(skin):
+    # What the row "env" of the loop benchmark measures.
+    full, bare = (
+        make_worker_env(EnvConfig(), skin, num_envs=2, seed=0, bare=bare)
+        for bare in (False, True)
+    )
+    missing = set(full.observation_spec.keys()) - set(bare.observation_spec.keys())
+    assert missing == {"observation", "privileged_observation", "signal"}
+
+
 def test_the_parent_sleeps_while_the_workers_step(skin):
     pool = make_pool(skin, 1, num_envs=512)
     try:
