@@ -193,7 +193,7 @@ def make_worker_env(
             *(map(str, t.out_keys) for t in transforms)
         )
         transforms.append(ExcludeTransform(*(k for k in _RAW_KEYS if k in sensed)))
-    return TransformedEnv(env, Compose(*transforms))
+    return TransformedEnv(env, Compose(transforms))
 
 
 def make_env(
