@@ -4,6 +4,7 @@ Everything here works on TensorDicts with the keys named in `egoskin`, from this
 project's environment, another simulator, a recording or a real robot.
 """
 
+from egoskin.sensors.coverage import Field, Ray
 from egoskin.sensors.field import FieldSensor
 from egoskin.sensors.placement import place_area_uniform
 from egoskin.sensors.signals import Binary, Localization, Proximity
@@ -11,9 +12,11 @@ from egoskin.sensors.skin import Skin
 
 __all__ = [
     "Binary",
+    "Field",
     "FieldSensor",
     "Localization",
     "Proximity",
+    "Ray",
     "Skin",
     "place_area_uniform",
 ]

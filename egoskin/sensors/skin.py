@@ -9,19 +9,24 @@ from __future__ import annotations
 import difflib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from egoskin.sensors.coverage import KINDS, Coverage
 
 _FORMAT = "egoskin-skin-1"
 _CONVENTIONS = {
     "position": "metres, in the frame of the link",
     "normal": "unit vector out of the surface, in the frame of the link",
     "sensor_frame": "z = normal, x = normalise(z_link x normal), or x_link if those "
-    "two are parallel",
+    "two are parallel; then turned by roll_deg about z",
+    "range": "metres; sensors without range or type take those of the configuration",
+    "radius": "metres, of the sensor itself",
 }
+_OPTIONAL = ("range", "roll_deg", "radius", "type")
 # Unit normals must be unit to this.
 _UNIT_TOLERANCE = 1e-3
 
@@ -33,6 +38,61 @@ def _is_vector(value: object) -> bool:
         and len(value) == 3
         and all(type(v) in (int, float) for v in value)
     )
+
+
+def _coverage(name: str, entry: Mapping[str, Any]) -> Coverage:
+    """Return the coverage that one of a file's types describes."""
+    values = dict(entry)
+    kind = values.pop("coverage", None)
+    if kind not in KINDS:
+        raise ValueError(
+            f"type {name!r}: 'coverage' must be one of {', '.join(KINDS)}, got {kind!r}"
+        )
+    known = [f.name for f in fields(KINDS[kind])]
+    for field_name in values:
+        _check_known(f"type {name!r}", field_name, known)
+    if "grid" in values:
+        values["grid"] = tuple(values["grid"])
+    try:
+        return KINDS[kind](**values)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"type {name!r}: {error}") from error
+
+
+def _check_known(where: str, name: str, known: Sequence[str]) -> None:
+    """Raise ValueError for a field that a skin file does not have."""
+    if name not in known:
+        close = difflib.get_close_matches(name, known, n=1)
+        hint = f"; did you mean {close[0]!r}?" if close else ""
+        raise ValueError(f"{where}: unknown field {name!r}{hint}")
+
+
+def _check_sensor(
+    index: int, sensor: Mapping[str, Any], types: Mapping[str, Coverage]
+) -> None:
+    """Raise ValueError for an entry that describes no sensor."""
+    where = f"sensor {index}"
+    required = ("link", "position", "normal")
+    for name in required:
+        if name not in sensor:
+            raise ValueError(f"{where} lacks the field {name!r}")
+    for name in sensor:
+        _check_known(where, name, (*required, *_OPTIONAL))
+    for name in ("position", "normal"):
+        if not _is_vector(sensor[name]):
+            raise ValueError(
+                f"{where}: {name!r} must be three numbers, got {sensor[name]!r}"
+            )
+    for name in ("range", "roll_deg", "radius"):
+        if name in sensor and type(sensor[name]) not in (int, float):
+            raise ValueError(
+                f"{where}: {name!r} must be a number, got {sensor[name]!r}"
+            )
+    if "type" in sensor and sensor["type"] not in types:
+        raise ValueError(
+            f"{where}: there is no type {sensor['type']!r}; the file's types are "
+            f"{', '.join(types) or 'none'}"
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -52,12 +112,37 @@ class Skin:
     """Positions in the link frames [m], ``[S, 3]``."""
     normal: np.ndarray
     """Outward unit normals in the link frames, ``[S, 3]``."""
+    coverage: tuple[Coverage | None, ...] = ()
+    """What each sensor sees, ``S`` of them; None leaves it to the configuration."""
+    range: np.ndarray = field(default_factory=lambda: np.empty(0))
+    """Range of each sensor [m], ``[S]``; NaN leaves it to the configuration."""
+    roll_deg: np.ndarray = field(default_factory=lambda: np.empty(0))
+    """Turn of each sensor's frame about its normal [deg], ``[S]``; 0 by default."""
+    radius: np.ndarray = field(default_factory=lambda: np.empty(0))
+    """Radius of each sensor itself [m], ``[S]``; NaN if unknown."""
     provenance: Mapping[str, Any] = field(default_factory=dict)
     """How the skin was made, for the reader of the file."""
 
     def __post_init__(self) -> None:
-        """Check shapes and values."""
-        shape = (len(self.links), 3)
+        """Fill in defaults, check shapes and values."""
+        shape, number = (len(self.links), 3), len(self.links)
+        defaults = {"range": np.nan, "roll_deg": 0.0, "radius": np.nan}
+        for name, default in defaults.items():
+            array = getattr(self, name)
+            if array.size == 0:
+                object.__setattr__(self, name, np.full(number, default))
+            elif array.shape != (number,):
+                raise ValueError(f"{name} must be ({number},), got {array.shape}")
+            elif (array <= 0).any() and name != "roll_deg":
+                raise ValueError(f"{name} must be positive, got {array.min()}")
+        if not np.isfinite(self.roll_deg).all():
+            raise ValueError("roll_deg holds values that are not finite")
+        if not self.coverage:
+            object.__setattr__(self, "coverage", (None,) * number)
+        elif len(self.coverage) != number:
+            raise ValueError(
+                f"coverage must hold {number} entries, got {len(self.coverage)}"
+            )
         for name in ("position", "normal"):
             array = getattr(self, name)
             if array.shape != shape:
@@ -98,25 +183,67 @@ class Skin:
         # A normal a hair off z_link leaves x_link not quite perpendicular.
         x = x - (x * z).sum(-1, keepdims=True) * z
         x /= np.linalg.norm(x, axis=-1, keepdims=True)
-        return np.stack((x, np.cross(z, x), z), axis=-1)
+        y = np.cross(z, x)
+        roll = np.radians(self.roll_deg)[:, None]
+        c, s = np.cos(roll), np.sin(roll)
+        return np.stack((c * x + s * y, c * y - s * x, z), axis=-1)
+
+    def select(self, index: Sequence[int]) -> Skin:
+        """Return the skin of some of the sensors, in the order given."""
+        arrays = ("position", "normal", "range", "roll_deg", "radius")
+        return replace(
+            self,
+            links=tuple(self.links[i] for i in index),
+            coverage=tuple(self.coverage[i] for i in index),
+            **{name: getattr(self, name)[list(index)] for name in arrays},
+        )
+
+    def filled(self, coverage: Coverage, max_range: float) -> Skin:
+        """Return the skin with what it leaves to the configuration filled in.
+
+        Args:
+            coverage: For sensors that have none of their own.
+            max_range: For sensors without a range of their own [m].
+        """
+        return replace(
+            self,
+            coverage=tuple(c or coverage for c in self.coverage),
+            range=np.where(np.isnan(self.range), max_range, self.range),
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return the skin as plain JSON values."""
+        types: dict[Coverage, str] = {}
+        sensors = []
+        for i, (link, coverage) in enumerate(
+            zip(self.links, self.coverage, strict=True)
+        ):
+            entry: dict[str, Any] = {
+                "link": link,
+                "position": [round(float(v), 6) for v in self.position[i]],
+                "normal": [round(float(v), 6) for v in self.normal[i]],
+            }
+            if self.roll_deg[i] != 0:
+                entry["roll_deg"] = float(self.roll_deg[i])
+            for name in ("range", "radius"):
+                value = float(getattr(self, name)[i])
+                if not np.isnan(value):
+                    entry[name] = value
+            if coverage is not None:
+                number = len(types) + 1
+                entry["type"] = types.setdefault(coverage, f"type_{number}")
+            sensors.append(entry)
+        named = {
+            name: {"coverage": type(c).__name__.lower(), **asdict(c)}
+            for c, name in types.items()
+        }
         return {
             "format": _FORMAT,
             "robot": self.robot,
             "conventions": _CONVENTIONS,
             "provenance": dict(self.provenance),
-            "sensors": [
-                {
-                    "link": link,
-                    "position": [round(float(v), 6) for v in position],
-                    "normal": [round(float(v), 6) for v in normal],
-                }
-                for link, position, normal in zip(
-                    self.links, self.position, self.normal, strict=True
-                )
-            ],
+            **({"types": named} if named else {}),
+            "sensors": sensors,
         }
 
     @classmethod
@@ -133,22 +260,26 @@ class Skin:
         for name in ("robot", "sensors"):
             if name not in content:
                 raise ValueError(f"a skin needs the field {name!r}")
-        for index, sensor in enumerate(content["sensors"]):
-            for name in ("link", "position", "normal"):
-                if name not in sensor:
-                    raise ValueError(f"sensor {index} lacks the field {name!r}")
-            for name in ("position", "normal"):
-                if not _is_vector(sensor[name]):
-                    raise ValueError(
-                        f"sensor {index}: {name!r} must be three numbers, got "
-                        f"{sensor[name]!r}"
-                    )
+        types = {
+            name: _coverage(name, entry)
+            for name, entry in content.get("types", {}).items()
+        }
         sensors = content["sensors"]
+        for index, sensor in enumerate(sensors):
+            _check_sensor(index, sensor, types)
+
+        def column(name: str, default: float) -> np.ndarray:
+            return np.array([float(s.get(name, default)) for s in sensors])
+
         return cls(
             robot=content["robot"],
             links=tuple(s["link"] for s in sensors),
             position=np.array([s["position"] for s in sensors], float).reshape(-1, 3),
             normal=np.array([s["normal"] for s in sensors], float).reshape(-1, 3),
+            coverage=tuple(types.get(s.get("type")) for s in sensors),
+            range=column("range", np.nan),
+            roll_deg=column("roll_deg", 0.0),
+            radius=column("radius", np.nan),
             provenance=content.get("provenance", {}),
         )
 

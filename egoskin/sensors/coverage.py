@@ -1,0 +1,109 @@
+"""Coverage: which part of space one sensor sees, as data.
+
+Two kinds: a field around the sensor, and a grid of beams. Transforms that compute
+them are `egoskin.sensors.field` and `egoskin.sensors.ray`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+
+@dataclass(frozen=True, kw_only=True)
+class Field:
+    """The closest point of an object around the sensor, whatever its direction."""
+
+    half_angle_deg: float = 180.0
+    """Angle from the normal within which the closest point must lie [deg]: 180 all
+    around, 90 the outer hemisphere, less a cone."""
+    measure: Literal["surface", "centre"] = "surface"
+    """Distance to the object's closest point, or to its centre."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for an angle that is no cone."""
+        if not 0 < self.half_angle_deg <= 180:
+            raise ValueError(
+                f"half_angle_deg must be in (0, 180], got {self.half_angle_deg}"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ray:
+    """A grid of beams through a square pyramid about the normal; each its first hit.
+
+    The defaults are the VL53L5CX of the paper: 8 x 8 zones, 63 degrees corner to
+    corner.
+    """
+
+    grid: tuple[int, int] = (8, 8)
+    """Zones along the sensor's y and x: (rows, columns)."""
+    fov_deg: float = 63.0
+    """Full angle of the field of view [deg]."""
+    fov: Literal["diagonal", "axis"] = "diagonal"
+    """Whether the angle is measured corner to corner or along each axis."""
+    beams: Literal["centres", "edges"] = "centres"
+    """Beams through the zones' centres, or spread from edge to edge of the view."""
+    sub_beams: int = 1
+    """A zone reads the closest of this many squared beams, spread over it evenly."""
+    measure: Literal["beam", "depth"] = "beam"
+    """Distance along the beam, or its component along the normal."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a grid without zones or a view that is no pyramid."""
+        if len(self.grid) != 2 or min(self.grid) < 1:
+            raise ValueError(f"grid must be two positive numbers, got {self.grid}")
+        if not 0 < self.fov_deg < 180:
+            raise ValueError(f"fov_deg must be in (0, 180), got {self.fov_deg}")
+        if self.sub_beams < 1:
+            raise ValueError(f"sub_beams must be at least 1, got {self.sub_beams}")
+        if self.beams == "edges" and (self.sub_beams > 1 or min(self.grid) < 2):
+            raise ValueError(
+                "beams='edges' needs a grid of at least 2 x 2 and sub_beams=1, got "
+                f"grid {self.grid} and sub_beams {self.sub_beams}"
+            )
+
+    @property
+    def num_beams(self) -> int:
+        """Readings of one sensor ``K``, one for each zone."""
+        return self.grid[0] * self.grid[1]
+
+    @property
+    def half_extent(self) -> float:
+        """Tangent of the half angle along each axis."""
+        # A square pyramid: corner at tan(h), so sqrt(2) half_extent = tan(h).
+        tangent = math.tan(math.radians(self.fov_deg) / 2)
+        return tangent / math.sqrt(2) if self.fov == "diagonal" else tangent
+
+    def directions(self) -> np.ndarray:
+        """Return unit beam directions in the sensor frame.
+
+        Returns:
+            ``[K, M, 3]`` with M = ``sub_beams`` squared beams in each zone. Zones go
+            row by row, y and within a row x from negative to positive.
+        """
+
+        def spread(zones: int) -> np.ndarray:
+            if self.beams == "edges":
+                return np.linspace(-1.0, 1.0, zones)[:, None]
+            fine = zones * self.sub_beams
+            return ((2 * np.arange(fine) + 1) / fine - 1).reshape(zones, -1)
+
+        rows, columns = (self.half_extent * spread(n) for n in self.grid)
+        shape = (*rows.shape, *columns.shape)
+        y = np.broadcast_to(rows[:, :, None, None], shape)
+        x = np.broadcast_to(columns[None, None], shape)
+        # [rows, m, columns, m] -> [K, M]
+        tangents = np.stack((x, y, np.ones(shape)), -1).transpose(0, 2, 1, 3, 4)
+        beams = tangents.reshape(self.num_beams, self.sub_beams**2, 3)
+        return beams / np.linalg.norm(beams, axis=-1, keepdims=True)
+
+
+Coverage = Field | Ray
+"""What one sensor sees."""
+
+KINDS: dict[str, type[Field] | type[Ray]] = {"field": Field, "ray": Ray}
+"""Kinds of coverage by the name used in configurations and skin files."""
