@@ -14,8 +14,8 @@ from `egoskin.envs.dodgeball.DodgeballEnv` (all its keys: its docstring)
 ``object_active``           ``[*B, O]``   bool: in play                 sensors
 ``tactile``                 ``[*B, L]``   bool: link touched something  -
 ``reward``, ``done``, ...   ``[*B, 1]``   TorchRL's                     PPO
-from `egoskin.sensors.FieldSensor`
-``distance``                ``[*B, S]``   [m], inf: nothing in range    signals
+from `egoskin.sensors.FieldSensor` or ``RaySensor``
+``distance``                ``[*B, S]``   or ``[*B, S, K]`` [m], inf: none signals
 ``object_detected``         ``[*B, O]``   bool: by any sensor           signals
 from `egoskin.sensors.Proximity`, ``Binary`` or ``Localization``
 ``signal``                  ``[*B, S]``   or ``[*B, 3]`` (localization) actor, critic

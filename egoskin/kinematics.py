@@ -11,7 +11,9 @@ offset the root itself has, so that they depend on the joint positions alone.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from typing import Any, NamedTuple, cast
 
 import pytorch_kinematics as pk
 import torch
@@ -64,6 +66,8 @@ def _dot(a: Sequence[Entry], b: Sequence[Entry]) -> Entry:
 
 
 Matrix = list[list[Entry]]
+Frame = tuple[Matrix, list[Entry]]
+"""Rotation (rows of entries) and position."""
 
 
 def _matmul(a: Matrix, b: Matrix) -> Matrix:
@@ -71,9 +75,8 @@ def _matmul(a: Matrix, b: Matrix) -> Matrix:
     return [[_dot(row, column) for column in columns] for row in a]
 
 
-def _axis_rotation(axis: Sequence[float], angle: Tensor) -> Matrix:
+def _axis_rotation(axis: Sequence[float], s: Tensor, c: Tensor) -> Matrix:
     """Rodrigues' formula: R = c I + s [a]x + (1 - c) a a^T."""
-    c, s = angle.cos(), angle.sin()
     x, y, z = axis
     skew = [[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]
     result: Matrix = []
@@ -88,7 +91,20 @@ def _axis_rotation(axis: Sequence[float], angle: Tensor) -> Matrix:
     return result
 
 
-def _constant(transform: pk.Transform3d | None) -> tuple[Matrix, list[Entry]]:
+def _shift(frame: Frame, offset: Sequence[Entry]) -> list[Entry]:
+    """Return where a point given in a frame is."""
+    rotation, position = frame
+    return [
+        _add(p, _dot(row, offset)) for p, row in zip(position, rotation, strict=True)
+    ]
+
+
+def _compose(frame: Frame, offset: Frame) -> Frame:
+    """Return a frame given in another frame."""
+    return _matmul(frame[0], offset[0]), _shift(frame, offset[1])
+
+
+def _constant(transform: pk.Transform3d | None) -> Frame:
     """Rotation and translation of a fixed offset; rounding noise becomes 0 or 1."""
     if transform is None:
         return [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], [0.0, 0.0, 0.0]
@@ -96,14 +112,27 @@ def _constant(transform: pk.Transform3d | None) -> tuple[Matrix, list[Entry]]:
 
     def clean(value: float) -> float:
         nearest = float(round(value))
-        return nearest if abs(value - nearest) < 1e-9 else value
+        return nearest if abs(value - nearest) < 1e-15 else value
 
     rotation: Matrix = [[clean(v) for v in row[:3]] for row in matrix[:3].tolist()]
     return rotation, [clean(v) for v in matrix[:3, 3].tolist()]
 
 
+class _Step(NamedTuple):
+    """How a frame follows from its parent: a fixed offset, then a joint."""
+
+    parent: int
+    offset: Frame
+    joint_type: str
+    axis: list[float]
+    joint: int
+
+
 class LinkKinematics:
     """Positions and rotations of links relative to the base, from joint positions.
+
+    Joint positions are in the order of ``chain.get_joint_parameter_names()``, [rad] or,
+    for a prismatic joint, [m].
 
     Args:
         chain: Chain of the robot; its root is the base.
@@ -116,7 +145,8 @@ class LinkKinematics:
     def __init__(self, chain: pk.Chain, links: Sequence[str]) -> None:
         self.links = tuple(links)
         joint_names = chain.get_joint_parameter_names()
-        self._steps: list[tuple] = []
+        self.num_joints = len(joint_names)
+        self._steps: list[_Step] = []
         slots: dict[str, int] = {}
         root = chain._root  # the public methods return frames by name only
 
@@ -125,23 +155,18 @@ class LinkKinematics:
             mark = len(self._steps)
             slot = parent
             if frame is not root:
-                slot = mark
+                slot = mark + 1
                 joint = frame.joint
-                revolute = joint.joint_type == "revolute"
+                fixed = joint.joint_type == "fixed"
                 self._steps.append(
-                    (
+                    _Step(
                         parent,
-                        _constant(frame.link.offset),
-                        _constant(joint.offset),
-                        joint.axis.double().tolist() if revolute else None,
-                        joint_names.index(joint.name) if revolute else -1,
+                        _compose(_constant(frame.link.offset), _constant(joint.offset)),
+                        joint.joint_type,
+                        joint.axis.double().tolist(),
+                        -1 if fixed else joint_names.index(joint.name),
                     )
                 )
-                if joint.joint_type not in ("revolute", "fixed"):
-                    raise ValueError(
-                        f"joint {joint.name!r} is {joint.joint_type}; only revolute "
-                        "and fixed joints are supported"
-                    )
             wanted = frame.name in self.links
             if wanted:
                 slots[frame.name] = slot
@@ -151,7 +176,7 @@ class LinkKinematics:
                 return False
             return True
 
-        visit(root, -1)
+        visit(root, 0)
         missing = [name for name in self.links if name not in slots]
         if missing:
             raise ValueError(
@@ -160,30 +185,90 @@ class LinkKinematics:
             )
         self._slots = [slots[name] for name in self.links]
 
-    def link_frames(self, joint_pos: Tensor) -> list[tuple[Matrix, list[Entry]]]:
+    def reach(self) -> list[float]:
+        """Return how far each link's origin can be from the base [m], at most.
+
+        Infinite behind a prismatic joint.
+        """
+        farthest = [0.0]
+        for step in self._steps:
+            sliding = step.joint_type == "prismatic"
+            length = math.inf if sliding else math.dist(step.offset[1], (0, 0, 0))
+            farthest.append(farthest[step.parent] + length)
+        return [farthest[slot] for slot in self._slots]
+
+    def link_frames(self, joint_pos: Tensor) -> list[Frame]:
         """Return (rotation, position) of each link, as matrices of entries.
 
         Args:
-            joint_pos: Joint positions [rad] in the order of the chain, ``[B, J]``.
+            joint_pos: Joint positions, ``[B, J]``.
 
         Returns:
-            For each link a 3 x 3 nested list and a list of three, whose entries are
-            ``[B]`` tensors or, where they cannot change, floats.
+            For each link a 3 x 3 nested list and a list of three [m], whose entries
+            are ``[B]`` tensors or, where they cannot change, floats.
         """
+        return self.frames_from(*self.trig(joint_pos))
+
+    def trig(self, joint_pos: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return (sine, cosine, value) of the joint positions, ``[J, B]`` each.
+
+        Args:
+            joint_pos: Joint positions, ``[B, J]``.
+
+        Raises:
+            ValueError: If J is not the chain's number of joints.
+        """
+        if joint_pos.shape[-1] != self.num_joints:
+            raise ValueError(
+                f"joint positions must be [B, {self.num_joints}], one column for each "
+                f"joint of the chain, got {list(joint_pos.shape)}"
+            )
         joints = joint_pos.t().contiguous()
-        frames: list[tuple[Matrix, list[Entry]]] = []
-        for parent, link_offset, joint_offset, axis, index in self._steps:
-            chained = [frames[parent]] if parent >= 0 else []
-            chained += [link_offset, joint_offset]
-            rotation, position = chained[0]
-            for r, p in chained[1:]:
-                position = [_add(position[i], _dot(rotation[i], p)) for i in range(3)]
-                rotation = _matmul(rotation, r)
-            if axis is not None:
-                rotation = _matmul(rotation, _axis_rotation(axis, joints[index]))
+        return joints.sin(), joints.cos(), joints
+
+    def frames_from(self, sin: Tensor, cos: Tensor, joints: Tensor) -> list[Frame]:
+        """Return `link_frames` from what `trig` returns, by sums and products alone.
+
+        Those round alike whoever evaluates them, so this part can be compiled.
+
+        Args:
+            sin: Sines of the joint positions, ``[J, B]``.
+            cos: Cosines of the joint positions, ``[J, B]``.
+            joints: Joint positions, ``[J, B]``.
+
+        Returns:
+            As `link_frames`.
+        """
+        return self._evaluate(_constant(None), sin, cos, joints)
+
+    def _stacked_frames(self, joint_pos: Tensor) -> list[tuple[list[Tensor], Tensor]]:
+        """Return each link's axes and position, ``[3, B]`` or, constant, ``[3, 1]``.
+
+        Those of `link_frames` to rounding (of constants), with the three coordinates
+        in one tensor: a third of the calls, and calls are what few rows cost.
+        """
+        unit = torch.eye(3, dtype=joint_pos.dtype, device=joint_pos.device)[:, :, None]
+        root: Frame = [list(unit.unbind(1))], [torch.zeros_like(unit[:, 0])]
+        frames = self._evaluate(root, *self.trig(joint_pos))
+        # All are tensors, because the root's are.
+        return cast(Any, [(axes, position) for (axes,), (position,) in frames])
+
+    def _evaluate(
+        self, root: Frame, sin: Tensor, cos: Tensor, joints: Tensor
+    ) -> list[Frame]:
+        """Return the links' frames, given the root's: with any number of rows."""
+        frames = [root]
+        for step in self._steps:
+            rotation, position = frame = _compose(frames[step.parent], step.offset)
+            if step.joint_type == "revolute":
+                turn = _axis_rotation(step.axis, sin[step.joint], cos[step.joint])
+                rotation = _matmul(rotation, turn)
+            elif step.joint_type == "prismatic":
+                position = _shift(
+                    frame, [_mul(joints[step.joint], a) for a in step.axis]
+                )
             frames.append((rotation, position))
-        identity = _constant(None)
-        return [frames[slot] if slot >= 0 else identity for slot in self._slots]
+        return [frames[slot] for slot in self._slots]
 
     def points_b(
         self, joint_pos: Tensor, offsets: Sequence[Sequence[Sequence[float]]]
@@ -191,58 +276,43 @@ class LinkKinematics:
         """Return points fixed on the links, in the base frame.
 
         Args:
-            joint_pos: Joint positions [rad], ``[B, J]``.
+            joint_pos: Joint positions, ``[B, J]``.
             offsets: For each link the points in its frame [m], n_l x 3.
 
         Returns:
             Positions [m], ``[3, S, B]`` with S = sum of n_l, link by link: the batch
             is last, as the kernels want it.
         """
-        parts: list[list[Tensor]] = [[], [], []]
+        parts = []
         batch = joint_pos.shape[0]
-        for (rotation, position), local in zip(
-            self.link_frames(joint_pos), offsets, strict=True
+        for (axes, position), local in zip(
+            self._stacked_frames(joint_pos), offsets, strict=True
         ):
             if len(local) == 0:
                 continue
             columns = torch.as_tensor(
                 local, dtype=joint_pos.dtype, device=joint_pos.device
             ).t()[:, :, None]
-            for i in range(3):
-                total: Entry = _dot(rotation[i], list(columns))
-                total = _add(total, position[i])
-                assert isinstance(total, Tensor)
-                parts[i].append(total.expand(len(local), batch))
-        return torch.stack([torch.cat(part) for part in parts])
+            total = _dot([axis[:, None] for axis in axes], list(columns))
+            total = total + position[:, None]
+            parts.append(total.expand(3, len(local), batch))
+        return torch.cat(parts, 1)
 
     def poses_b(self, joint_pos: Tensor) -> tuple[Tensor, Tensor]:
         """Return link positions ``[B, L, 3]`` [m] and rotations ``[B, L, 3, 3]``.
 
         Args:
-            joint_pos: Joint positions [rad], ``[B, J]``.
+            joint_pos: Joint positions, ``[B, J]``.
 
         Returns:
             Position and rotation matrix of each link in the base frame.
         """
-        batch = joint_pos.shape[0]
-
-        def fill(entry: Entry) -> Tensor:
-            if isinstance(entry, Tensor):
-                return entry
-            return joint_pos.new_full((batch,), entry)
-
-        frames = self.link_frames(joint_pos)
-        position = torch.stack(
-            [torch.stack([fill(e) for e in p], -1) for _, p in frames], 1
-        )
-        rotation = torch.stack(
-            [
-                torch.stack([torch.stack([fill(e) for e in row], -1) for row in r], 1)
-                for r, _ in frames
-            ],
-            1,
-        )
-        return position, rotation
+        size = (3, joint_pos.shape[0])
+        frames = self._stacked_frames(joint_pos)
+        position = torch.stack([p.expand(size).t() for _, p in frames], 1)
+        # Axes are columns: [3 columns, 3, B] -> [B, 3, 3 columns].
+        rotation = [torch.stack([a.expand(size) for a in axes]) for axes, _ in frames]
+        return position, torch.stack(rotation).permute(3, 0, 2, 1)
 
 
 def quat_to_matrix(quat: Tensor) -> Tensor:

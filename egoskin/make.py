@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import dataclasses
+from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Literal
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.envs import (
     Compose,
@@ -21,15 +21,9 @@ from egoskin.checkpoint import part, prefixed
 from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
 from egoskin.observations import Privileged, Proprioception
 from egoskin.robots import ROBOTS, RobotConfig
-from egoskin.sensors import (
-    Binary,
-    FieldSensor,
-    Localization,
-    Proximity,
-    Skin,
-    place_area_uniform,
-)
-from egoskin.transform import RowTransform
+from egoskin.sensors import History, Skin
+from egoskin.sensors.config import SensorConfig, SkinConfig
+from egoskin.transform import StatefulTransform
 from egoskin.workers import WorkerPool, default_num_workers
 
 # Raw state that neither the networks nor the metrics read: it stays in the workers.
@@ -45,67 +39,9 @@ _RAW_KEYS = (
     "tactile",
     "displacement_w",
     "previous_action",
-    "distance",
-    "object_detected",
 )
-
-
-@dataclass(frozen=True, kw_only=True)
-class SkinConfig:
-    """Where the sensors sit."""
-
-    path: Path | None = None
-    """Skin file; None places sensors at random on the upper body."""
-    num_sensors: int = 64
-    """Number of sensors to place (ignored with a file)."""
-    seed: int = 0
-    """Seed of the placement (ignored with a file)."""
-
-    def build(self, robot: RobotConfig) -> Skin:
-        """Return the skin, checked against the robot.
-
-        Raises:
-            ValueError: If the file is no skin of this robot.
-        """
-        if self.path is None:
-            return place_area_uniform(robot, self.num_sensors, self.seed)
-        skin = Skin.load(self.path)
-        try:
-            skin.check_links(robot.links)
-        except ValueError as error:
-            raise ValueError(f"skin file {self.path}: {error}") from error
-        return skin
-
-
-@dataclass(frozen=True, kw_only=True)
-class SensorConfig:
-    """What the sensors of the skin measure, and what the actor is given of it."""
-
-    coverage: Literal["field", "none"] = "field"
-    """Spherical field, or no sensor at all (a blind robot)."""
-    signal: Literal["localization", "proximity", "binary"] = "proximity"
-    """Ball position if any sensor detects it; distance / range; or in range or not."""
-    range: float = 2.0
-    """Detection range [m], to the ball's surface; "inf" is allowed."""
-
-    def __post_init__(self) -> None:
-        """Raise ValueError for a range that is not positive."""
-        if not self.range > 0:
-            raise ValueError(f"the sensor range must be positive, got {self.range}")
-
-    def transforms(
-        self, robot: RobotConfig, skin: Skin, task: DodgeballConfig
-    ) -> list[RowTransform]:
-        """Return the transforms that write ``signal`` (none for a blind robot)."""
-        if self.coverage == "none":
-            return []
-        sensor = FieldSensor(skin, robot.chain, task.throws.balls, self.range)
-        signals = {
-            "localization": Localization,
-            "proximity": partial(Proximity, self.range),
-            "binary": Binary,
-        }
-        return [sensor, signals[self.signal]()]
+# What the networks read of the transforms' results; the others stay as well.
+_NETWORK_KEYS = ("observation", "privileged_observation", "signal")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,17 +50,21 @@ class EnvConfig:
 
     robot: Literal["h1_2"] = "h1_2"
     """Robot by name."""
-    task: DodgeballConfig = field(default_factory=DodgeballConfig)
+    task: DodgeballConfig = dataclasses.field(default_factory=DodgeballConfig)
     """The dodgeball task."""
-    skin: SkinConfig = field(default_factory=SkinConfig)
+    skin: SkinConfig = dataclasses.field(default_factory=SkinConfig)
     """Where the sensors sit."""
-    sensor: SensorConfig = field(default_factory=SensorConfig)
+    sensor: SensorConfig = dataclasses.field(default_factory=SensorConfig)
     """What they measure."""
     privileged: Literal["objects", "velocity"] = "objects"
     """What the critic alone sees: also the balls, or (the paper's) the velocity."""
+    history: int = 1
+    """Observations of this many steps, the present one included."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError if the robot lacks the gain set asked for."""
+        """Raise ValueError for no history, or gains that the robot does not have."""
+        if self.history < 1:
+            raise ValueError(f"history must be at least 1, got {self.history}")
         self.robot_config.joint_gains(self.task.physics.gains)
 
     @property
@@ -183,17 +123,37 @@ def make_worker_env(
     transforms: list[Transform] = []
     if not bare:
         balls = config.task.throws.num_balls
+        # With a history, what is new goes by other names.
+        suffix = "" if config.history == 1 else "_now"
+        default = torch.from_numpy(robot.default_joint_pos)
         transforms += [
-            Proprioception(torch.from_numpy(robot.default_joint_pos)),
+            Proprioception(default, out_keys=[f"observation{suffix}"]),
             Privileged(config.privileged, len(robot.joints), balls),
-            *config.sensor.transforms(robot, skin, config.task),
+            *config.sensor.transforms(
+                robot,
+                skin,
+                config.task.throws.balls,
+                dt=1 / config.task.physics.control_hz,
+                seed=seed,
+                row_offset=row_offset,
+                out_key=f"signal{suffix}",
+            ),
         ]
+        if suffix:
+            new = [f"{key}{suffix}" for key in config.actor_keys]
+            transforms.append(History(config.history, new, config.actor_keys))
     if not keep_raw:
-        sensed = set(env.observation_spec.keys()).union(
-            *(map(str, t.out_keys) for t in transforms)
-        )
-        transforms.append(ExcludeTransform(*(k for k in _RAW_KEYS if k in sensed)))
+        kept = {*_NETWORK_KEYS, *(k for t in transforms for k in _state_keys(t))}
+        written = dict.fromkeys(key for t in transforms for key in t.out_keys)
+        between = [key for key in written if key not in kept]
+        transforms.append(ExcludeTransform(*_RAW_KEYS, *between))
     return TransformedEnv(env, Compose(transforms))
+
+
+def _state_keys(transform: Transform) -> list[NestedKey]:
+    """What a transform reads back at the next step."""
+    stateful = isinstance(transform, StatefulTransform)
+    return transform.state_keys if stateful else []
 
 
 def make_env(

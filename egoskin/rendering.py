@@ -16,6 +16,7 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import mujoco
@@ -27,8 +28,8 @@ from torchrl.envs import step_mdp
 from egoskin.film import Frame
 from egoskin.make import EnvConfig, make_worker_env
 from egoskin.robots import RobotConfig
-from egoskin.sensors import Skin
-from egoskin.shapes import Sphere
+from egoskin.sensors import Ray, Skin
+from egoskin.shapes import Shape
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 """Writes ``action`` into the tensordict it is given, and returns it."""
@@ -38,6 +39,7 @@ Policy = Callable[[TensorDictBase], TensorDictBase]
 _IDLE_RGBA = (0.16, 0.2, 0.3, 1.0)
 _LIT_RGBA = (0.1, 0.95, 1.0, 1.0)
 _FIELD_LINE_RGB = (0.1, 0.35, 1.0)
+_RAY_LINE_RGB = (1.0, 0.8, 0.0)
 _BALL_RGBA = (0.95, 0.35, 0.08, 1.0)
 # Drawn radii [m]: a sensor at rest, one that detects, a line.
 _IDLE_RADIUS, _LIT_RADIUS, _LINE_RADIUS = 0.017, 0.022, 0.006
@@ -119,19 +121,21 @@ def render_episode(
         steps = config.task.episode_steps
     else:
         steps = round(max_seconds * hz)
+    sensor = config.sensor
     painter = Painter(
         config.robot_config,
-        None if config.sensor.coverage == "none" else skin,
+        None if sensor.coverage == "none" else sensor.filled(skin),
         config.task.throws.balls,
         size=size,
         camera=camera,
     )
+    sensing = partial(sensor.detecting, skin)
     env = make_worker_env(
         config, skin, num_envs=1, seed=seed, row_offset=row, hold=hold, keep_raw=True
     )
     with painter, closing(env), torch.no_grad():
         td = env.reset()
-        frames = [painter.draw(td[0], time=0.0)]
+        frames = [painter.draw(td[0], sensing(td[0]), time=0.0)]
         for step in range(1, steps + 1):
             if policy is None:
                 td["action"] = env.action_spec.zero()
@@ -142,7 +146,10 @@ def render_episode(
             ending = _ending(state) or ("cut" if step == steps else None)
             is_due = int(step * fps / hz) > int((step - 1) * fps / hz)
             if is_due or ending:
-                frames.append(painter.draw(state, time=step / hz, ending=ending))
+                picture = painter.draw(
+                    state, sensing(state), time=step / hz, ending=ending
+                )
+                frames.append(picture)
             if ending:
                 break
             td = step_mdp(td)
@@ -179,7 +186,7 @@ class Painter:
         self,
         robot: RobotConfig,
         skin: Skin | None,
-        objects: Sequence[Sphere],
+        objects: Sequence[Shape],
         *,
         size: tuple[int, int] = (960, 540),
         camera: CameraConfig | None = None,
@@ -213,14 +220,19 @@ class Painter:
         self._canvas.close()
 
     def draw(
-        self, state: TensorDictBase, *, time: float, ending: str | None = None
+        self,
+        state: TensorDictBase,
+        detecting: np.ndarray | None = None,
+        *,
+        time: float,
+        ending: str | None = None,
     ) -> Frame:
         """Return the picture of a state.
 
         Args:
             state: One row with ``base_pose [7]``, ``joint_pos [J]``,
-                ``object_pose [O, 7]``, ``object_active [O]`` and, with a skin,
-                ``distance [S]`` [m], infinite for a sensor that detects nothing.
+                ``object_pose [O, 7]`` and ``object_active [O]``.
+            detecting: Whether each sensor detects something, ``[S]`` bool.
             time: Age of the episode [s]; the camera follows the base with time and
                 starts anew when time goes back.
             ending: Why the episode ends here, for the frame.
@@ -229,9 +241,11 @@ class Painter:
         self._follow(np.asarray(state["base_pose"], float), time)
         self._place(state, active)
         self._canvas.update(self._data, self._camera)
-        detecting = np.zeros(0, dtype=bool)
-        if self._skin is not None:
-            detecting = np.isfinite(np.asarray(state["distance"]))
+        if self._skin is None:
+            detecting = np.zeros(0, dtype=bool)
+        else:
+            if detecting is None:
+                detecting = np.zeros(len(self._skin), dtype=bool)
             pose = np.asarray(state["object_pose"], float)
             self._draw_sensors(detecting, pose[active], active)
         return Frame(
@@ -296,10 +310,12 @@ class Painter:
         ends = np.stack([closest_point(shape, pose, points) for shape, pose in found])
         length = np.linalg.norm(ends - points, axis=-1)
         nearest = length.argmin(0)
+        kinds = np.array([isinstance(own, Ray) for own in self._skin.coverage])
+        colours = [_RAY_LINE_RGB if k else _FIELD_LINE_RGB for k in kinds[detecting]]
         for i, point in enumerate(points):
             fade = max(1 - length[nearest[i], i] / _FADE_LENGTH, _FAINTEST)
             self._canvas.add_line(
-                point, ends[nearest[i], i], _LINE_RADIUS, (*_FIELD_LINE_RGB, fade)
+                point, ends[nearest[i], i], _LINE_RADIUS, (*colours[i], fade)
             )
 
     def _gap(self, active: np.ndarray) -> float:
@@ -314,7 +330,7 @@ class Painter:
         return min(gaps, default=math.inf)
 
 
-def closest_point(shape: Sphere, pose: np.ndarray, points: np.ndarray) -> np.ndarray:
+def closest_point(shape: Shape, pose: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Return the closest points of an object's surface.
 
     Args:
@@ -328,17 +344,13 @@ def closest_point(shape: Sphere, pose: np.ndarray, points: np.ndarray) -> np.nda
     rotation = np.zeros(9)
     mujoco.mju_quat2Mat(rotation, pose[3:])
     rotation = rotation.reshape(3, 3)
-    local = torch.tensor((points - pose[:3]) @ rotation, requires_grad=True)
-    with torch.enable_grad():
-        distance = shape.signed_distance(*local.unbind(-1)).clamp(min=0.0)
-        (gradient,) = torch.autograd.grad(distance.sum(), local)
-    # x* = x - d grad d, as the gradient of a distance has length 1
-    closest = (local - distance[:, None] * gradient).detach().numpy()
+    local = torch.from_numpy((points - pose[:3]) @ rotation)
+    closest = torch.stack(shape.closest_point(*local.unbind(-1)), -1).numpy()
     return closest @ rotation.T + pose[:3]
 
 
 def _build_model(
-    robot: RobotConfig, objects: Sequence[Sphere], size: tuple[int, int]
+    robot: RobotConfig, objects: Sequence[Shape], size: tuple[int, int]
 ) -> mujoco.MjModel:
     """The robot in a studio: tiled floor, sky, light, balls that go where put."""
     spec = robot.spec()

@@ -1,6 +1,7 @@
 """Measure how fast the parts of the project are.
 
 python scripts/bench.py loop --json loop.json
+python scripts/bench.py sensors
 python scripts/bench.py physics
 """
 
@@ -17,14 +18,20 @@ import tyro
 from benchmarks.loop import LoopConfig, loop
 from benchmarks.physics import PhysicsBench, physics_rows
 from benchmarks.report import report
+from benchmarks.sensors import SensorBench, sensor_rows
 from egoskin.cli import clear_errors
 
 
 def main(args: list[str]) -> None:
     """Run the command."""
-    benches = {"loop": LoopConfig, "physics": PhysicsBench}
+    benches = {"loop": LoopConfig, "physics": PhysicsBench, "sensors": SensorBench}
     config = tyro.extras.subcommand_cli_from_dict(benches, args=args)
-    rows = loop(config) if isinstance(config, LoopConfig) else physics_rows(config)
+    if isinstance(config, LoopConfig):
+        rows = loop(config)
+    elif isinstance(config, PhysicsBench):
+        rows = physics_rows(config)
+    else:
+        rows = sensor_rows(config)
     report(rows, config.json)
 
 

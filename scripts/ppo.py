@@ -39,6 +39,17 @@ from egoskin.sensors import Skin
 from egoskin.survival import SurvivalCurve
 from egoskin.workers import WorkerError, WorkerPool
 
+# What the metrics of an episode are made of.
+METRIC_KEYS = (
+    "diverged",
+    "episode_step",
+    "fallen",
+    "hit",
+    "reward",
+    "reward_terms",
+    "self_contact",
+    "terminated",
+)
 # A checkpoint is at most this old [s]; the next rollout must fit in as well.
 CHECKPOINT_AGE = 60.0
 
@@ -92,7 +103,11 @@ class Trainer:
         """Collect a rollout, improve the agent on it; return the metrics."""
         start = time.perf_counter()
         rollout, self.root, infos = collect(
-            self.env, self.agent, self.root, self.config.ppo.rollout_steps
+            self.env,
+            self.agent,
+            self.root,
+            self.config.ppo.rollout_steps,
+            METRIC_KEYS,
         )
         collected = time.perf_counter()
         learned = self.ppo.update(rollout)

@@ -12,7 +12,7 @@ from hypothesis import settings
 from tensordict import TensorDict
 
 from egoskin.robots import H1_2, RobotConfig
-from egoskin.sensors import Skin, place_area_uniform
+from egoskin.sensors import Skin, place_sensors
 
 # The same examples in every run: a test turns red with the change that broke it.
 settings.register_profile(
@@ -29,7 +29,7 @@ def robot() -> RobotConfig:
 @pytest.fixture(scope="session")
 def skin(robot: RobotConfig) -> Skin:
     """64 sensors on the upper body."""
-    return place_area_uniform(robot, 64, seed=0)
+    return place_sensors(robot, 64, seed=0)
 
 
 @pytest.fixture(scope="session")

@@ -7,7 +7,14 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from egoskin.draws import Stream, philox, uniform
+from egoskin.draws import (
+    Stream,
+    halfwords,
+    philox,
+    random_words,
+    standard_normal,
+    uniform,
+)
 
 WORD = st.integers(0, 2**32 - 1)
 
@@ -147,3 +154,51 @@ def test_numbers_of_neighbours_are_uncorrelated():
 def test_seed_outside_32_bits_is_refused(seed):
     with pytest.raises(ValueError, match=r"seed must be in \[0, 2\*\*32\), got"):
         draw([0], seed=seed)
+
+
+# --- words, halves of words and normal numbers --------------------------------------
+
+
+def test_halfwords_are_the_lower_and_the_upper_half_of_each_word():
+    words_ = torch.tensor([[0x00010002, 0xFFFF0000], [0x12345678, 0x9ABCDEF0]])
+    assert halfwords(words_).tolist() == [
+        [0x0002, 0x0001, 0x5678, 0x1234],
+        [0x0000, 0xFFFF, 0xDEF0, 0x9ABC],
+    ]
+
+
+@given(WORD, WORD, WORD, WORD, st.sampled_from(list(Stream)))
+def test_random_words_are_philox_of_their_names(seed, row, episode, counter, stream):
+    names = [torch.tensor([x]) for x in (row, episode, counter, 2**32 - 1)]
+    got = random_words(seed, stream, *names)[:, 0]
+    expected = philox(torch.tensor([row, episode, counter, 2**32 - 1]), (seed, stream))
+    assert torch.equal(got, expected)
+
+
+def test_normal_numbers_by_hand():
+    # Quantiles at (h + 1/2) / 65536; the one of 0.975 is 1.959964, its density 0.0584:
+    # half a step of 1/65536 further is 1.3e-4.
+    half = torch.tensor([0, 32767, 32768, 63897, 65535])
+    z = standard_normal(half, torch.float64)
+    assert z[0] == -z[4]
+    assert z[1] == -z[2]
+    assert z[3].item() == pytest.approx(1.959964, abs=2e-4)
+    # P(z < -4.2) = 1.33e-5, P(z < -4.4) = 5.4e-6; 1/131072 is 7.6e-6 in between.
+    assert -4.4 < z[0] < -4.2
+    assert standard_normal(half).dtype == torch.float32
+
+
+def test_normal_numbers_have_the_moments_of_a_gaussian():
+    z = standard_normal(torch.arange(2**16), torch.float64)
+    assert z.diff().min() > 0
+    # Of all 65536 quantiles alike: 0, 1, 3, but for the missing tails.
+    assert abs(z.mean()) < 1e-12
+    assert z.square().mean().item() == pytest.approx(1, abs=1e-4)
+    assert z.pow(4).mean().item() == pytest.approx(3, abs=2e-3)
+
+
+@given(st.lists(st.integers(0, 2**16 - 1), min_size=1, max_size=70))
+def test_a_normal_number_does_not_depend_on_its_batch(halves):
+    batch = standard_normal(torch.tensor(halves))
+    for half, z in zip(halves, batch, strict=True):
+        assert torch.equal(standard_normal(torch.tensor(half)), z)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -12,15 +13,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from egoskin.kinematics import quat_to_matrix, rotate
-from egoskin.robots import H1_2
-from egoskin.sensors import FieldSensor, Skin
-from egoskin.shapes import Sphere
+from egoskin.robots import H1_2, build_chain
+from egoskin.sensors import Field, FieldSensor, Ray, Skin
+from egoskin.shapes import Box, Capsule, Ellipsoid, Shape, Sphere, shape_of
 
 BALLS = (Sphere(radius=0.15), Sphere(radius=0.08))
 RANGE = 1.2
+KINDS = ("sphere", "box", "capsule", "ellipsoid")
+SHAPES = (
+    Sphere(radius=0.25),
+    Box(half_extents=(0.1, 0.2, 0.3)),
+    Capsule(radius=0.1, half_length=0.3),
+    Ellipsoid(semi_axes=(0.4, 0.1, 0.25)),
+)
+KEYS = ("base_pose", "joint_pos", "object_pose", "object_active")
+SEED = st.integers(0, 2**32 - 1)
 # Stands for a point: MuJoCo measures distances between geoms.
 TINY = 1e-9
-KEYS = ("base_pose", "joint_pos", "object_pose", "object_active")
 
 
 @pytest.fixture(scope="module")
@@ -33,102 +42,201 @@ def measure(sensor, state):
     return sensor.compute(*(state[key] for key in KEYS))
 
 
+def turned(state, seed: int):
+    """The state with its objects turned anyhow."""
+    rng = np.random.default_rng(seed)
+    quat = torch.from_numpy(rng.normal(size=(*state["object_active"].shape, 4)))
+    quat = torch.nn.functional.normalize(quat, dim=-1)
+    pose = state["object_pose"]
+    return state.set("object_pose", torch.cat((pose[..., :3], quat.to(pose.dtype)), -1))
+
+
 # --- MuJoCo as the oracle -------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
-def scene(skin) -> mujoco.MjModel:
-    """The robot with a speck at each sensor, and the balls."""
+def scene() -> mujoco.MjModel:
+    """The robot, one object of each kind, and a speck to be put where sensors are."""
     spec = H1_2.spec()
-    for i, (link, position) in enumerate(zip(skin.links, skin.position, strict=True)):
-        spec.body(link).add_geom(name=f"sensor_{i}", size=[TINY, 0, 0], pos=position)
-    for i, ball in enumerate(BALLS):
-        body = spec.worldbody.add_body(name=f"ball_{i}", mocap=True)
-        ball.add_geom(body, name=f"ball_{i}")
+    # MuJoCo iterates for the ellipsoid: here to 1e-9 m.
+    spec.option.ccd_tolerance, spec.option.ccd_iterations = 1e-9, 1000
+    for kind, shape in zip(KINDS, SHAPES, strict=True):
+        shape.add_geom(spec.worldbody.add_body(name=kind, mocap=True), name=kind)
+    spec.worldbody.add_geom(name="speck", size=[TINY, 0, 0])
     return spec.compile()
 
 
-def mujoco_distances(model, state) -> np.ndarray:
-    """Distance from every sensor to every ball, 0 inside, ``[n, O, S]``."""
-    data, unused = mujoco.MjData(model), np.zeros(6)
-    # Geoms are numbered body by body, sensors are not.
-    names = [model.geom(i).name for i in range(model.ngeom)]
-    count = sum(name.startswith("sensor_") for name in names)
-    sensors = [names.index(f"sensor_{i}") for i in range(count)]
-    balls = [model.geom(f"ball_{i}").id for i in range(len(BALLS))]
-    result = np.zeros((len(state), len(balls), len(sensors)))
-    for row, values in zip(result, state.unbind(0), strict=True):
+def draw_objects(model: mujoco.MjModel, rng) -> tuple[Shape, ...]:
+    """One object of each kind, its lengths drawn from .03 m to 1 m."""
+    objects = []
+    for kind in KINDS:
+        size = np.exp(rng.uniform(math.log(0.03), 0, 3))
+        model.geom(kind).size[:] = size
+        objects.append(shape_of(kind, size))
+    return tuple(objects)
+
+
+def mujoco_field(model, skin, state) -> tuple[np.ndarray, ...]:
+    """What MuJoCo says of each row, sensor and object, ``[n, S, O]``.
+
+    Distance (negative inside) and distance to the centre [m]; cosine of the closest
+    point's angle from the normal.
+    """
+    data, ends = mujoco.MjData(model), np.zeros(6)
+    speck = model.geom("speck").id
+    result = np.zeros((3, len(state), len(skin), len(KINDS)))
+    for row, values in enumerate(state.unbind(0)):
         data.qpos[:7] = values["base_pose"]
         data.qpos[7:] = values["joint_pos"]
         data.mocap_pos[:] = values["object_pose"][:, :3]
+        data.mocap_quat[:] = values["object_pose"][:, 3:]
         mujoco.mj_kinematics(model, data)
-        for o, ball in enumerate(balls):
-            for s, point in enumerate(sensors):
-                row[o, s] = mujoco.mj_geomDistance(model, data, point, ball, 99, unused)
-    return np.maximum(result + TINY, 0)
+        for s, link in enumerate(skin.links):
+            turn = data.body(link).xmat.reshape(3, 3)
+            place = data.body(link).xpos + turn @ skin.position[s]
+            data.geom_xpos[speck] = place
+            for o, kind in enumerate(KINDS):
+                geom = data.geom(kind)
+                distance = mujoco.mj_geomDistance(model, data, speck, geom.id, 99, ends)
+                way = ends[3:] - place
+                cosine = way @ turn @ skin.normal[s] / max(np.linalg.norm(way), TINY)
+                away = np.linalg.norm(geom.xpos - place)
+                result[:, row, s, o] = distance + TINY, away, cosine
+    return tuple(result)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_distance_equals_that_of_mujoco(sensor, scene, random_state, dtype):
-    state = random_state(1000, seed=1, dtype=dtype)
-    truth = mujoco_distances(scene, state)
-    truth[~state["object_active"].numpy()] = np.inf
-    truth_detected = (truth <= RANGE).any(-1)
+def draw_skin(skin: Skin, rng) -> Skin:
+    """The skin with ranges, half angles and measures drawn for each sensor."""
+    fields = [
+        Field(),
+        Field(half_angle_deg=90),
+        Field(half_angle_deg=rng.uniform(5, 175)),
+        Field(half_angle_deg=rng.uniform(5, 175), measure="centre"),
+        Field(measure="centre"),
+    ]
+    return replace(
+        skin,
+        coverage=tuple(fields[i] for i in rng.integers(len(fields), size=len(skin))),
+        range=np.exp(rng.uniform(math.log(0.05), math.log(4), len(skin))),
+    )
+
+
+@given(SEED, st.sampled_from([torch.float32, torch.float64]))
+def test_distances_are_those_of_mujoco(skin, scene, random_state, seed, dtype):
+    rng = np.random.default_rng(seed)
+    mixed = draw_skin(skin.select(rng.permutation(len(skin))[:20]), rng)
+    objects = draw_objects(scene, rng)
+    state = turned(random_state(8, seed, dtype, objects=4), seed)
+    signed, away, cosine = mujoco_field(scene, mixed, state)
+    to_centre = np.array([f.measure == "centre" for f in mixed.coverage])[:, None]
+    half = np.array([f.half_angle_deg for f in mixed.coverage])[:, None]
+    truth = np.where(to_centre, away, signed.clip(0))
+    # An object that a sensor is inside is all around it.
+    beside = (cosine < np.cos(np.radians(half))) & (half < 180) & (signed > 0)
+    limit = mixed.range[:, None]
+    active = state["object_active"][:, None].numpy()
+    expected = np.where(beside | (truth > limit) | ~active, np.inf, truth)
+    unsure = np.abs(truth - limit) < 1e-5
+    # MuJoCo tells where the closest point of an ellipsoid is to about 1e-4 m.
+    edge = np.abs(cosine - np.cos(np.radians(half))) * np.abs(signed)
+    unsure |= (half < 180) & (signed > -1e-5) & (edge < 2e-4)
+    assert unsure.mean() < 0.02
+
+    # Constants as exact as the inputs.
+    chain = build_chain(H1_2.model, H1_2.base, dtype)
+    apart = FieldSensor(mixed, chain, objects, 9, per_object=True)
+    distance, detected = measure(apart, state)
+    assert distance.dtype == dtype
+    tolerance = 1e-5 if dtype == torch.float32 else 1e-8
+    np.testing.assert_allclose(
+        distance.numpy()[~unsure], expected[~unsure], 0, tolerance
+    )
+    # Of all objects the nearest, and detected by any sensor: exactly.
+    nearest, seen = measure(FieldSensor(mixed, chain, objects, 9), state)
+    assert torch.equal(nearest, distance.amin(-1))
+    assert torch.equal(seen, distance.isfinite().any(1))
+    assert torch.equal(detected, seen)
+
+
+def test_a_thousand_states_of_the_default_task_are_those_of_mujoco(
+    skin, random_state, sensor
+):
+    # Balls are points with a radius: MuJoCo's kinematics alone is the oracle.
+    state = random_state(1000, seed=1)
+    model, expected = H1_2.model, []
+    data = mujoco.MjData(model)
+    body = [model.body(link).id for link in skin.links]
+    radius = np.array([ball.radius for ball in BALLS])
+    for values in state.unbind(0):
+        data.qpos[:7], data.qpos[7:] = values["base_pose"], values["joint_pos"]
+        mujoco.mj_kinematics(model, data)
+        turn = data.xmat[body].reshape(-1, 3, 3)
+        place = data.xpos[body] + np.einsum("sij,sj->si", turn, skin.position)
+        gap = place[:, None] - values["object_pose"][None, :, :3].numpy()
+        expected.append(np.maximum(np.linalg.norm(gap, axis=-1) - radius, 0))
+    truth = np.where(state["object_active"][:, None].numpy(), expected, np.inf)
+    unsure = (np.abs(truth - RANGE) < 1e-5).any(-1)
     truth[truth > RANGE] = np.inf
     distance, detected = measure(sensor, state)
-    assert distance.dtype == dtype
     assert distance.shape == (1000, 64)
-    # Within rounding of the range either side may say "nothing": leave those out.
-    clear = np.abs(truth.min(1) - RANGE) > 1e-5
-    clear &= ~((distance.numpy() > RANGE - 1e-5) & np.isfinite(distance.numpy()))
-    assert clear.mean() > 0.99
-    np.testing.assert_allclose(distance[clear], truth.min(1)[clear], 0, 1e-5)
-    np.testing.assert_array_equal(detected, truth_detected)
+    np.testing.assert_allclose(distance[~unsure], truth.min(-1)[~unsure], 0, 1e-5)
+    sure = ~unsure.any(-1)
+    np.testing.assert_array_equal(detected[sure], np.isfinite(truth[sure]).any(1))
     # The sample covers what matters: balls in and out of range, sensors inside balls.
-    assert 0.1 < np.isfinite(truth.min(1)).mean() < 0.9
+    assert 0.1 < np.isfinite(truth.min(-1)).mean() < 0.9
     assert (truth == 0).any()
+    assert unsure.mean() < 0.01
 
 
-def test_sensors_sit_where_the_skin_says(sensor, scene, random_state):
+def test_sensors_sit_and_look_as_the_skin_says(skin, random_state):
+    rolled = replace(skin, roll_deg=np.linspace(-180, 180, len(skin)))
+    sensor = FieldSensor(rolled, H1_2.chain, BALLS, RANGE)
     state = random_state(20, seed=2, dtype=torch.float64)
-    points = sensor.points_b(state["joint_pos"])
-    data = mujoco.MjData(scene)
-    for row, values in zip(points, state.unbind(0), strict=True):
-        data.qpos[3] = 1
-        data.qpos[:3] = 0
+    position, rotation = sensor.poses_b(state["joint_pos"])
+    assert position.shape == (20, 64, 3)
+    assert rotation.shape == (20, 64, 3, 3)
+    data = mujoco.MjData(H1_2.model)
+    for place, turn, values in zip(position, rotation, state.unbind(0), strict=True):
+        data.qpos[:7] = [0, 0, 0, 1, 0, 0, 0]
         data.qpos[7:] = values["joint_pos"]
-        mujoco.mj_kinematics(scene, data)
-        expected = [data.geom(f"sensor_{i}").xpos for i in range(len(row))]
-        np.testing.assert_allclose(row, expected, 0, 1e-6)
+        mujoco.mj_kinematics(H1_2.model, data)
+        links = [data.body(link) for link in rolled.links]
+        frames = np.array([link.xmat.reshape(3, 3) for link in links])
+        origins = np.array([link.xpos for link in links])
+        offset = np.einsum("sij,sj->si", frames, rolled.position)
+        np.testing.assert_allclose(place, origins + offset, 0, 1e-6)
+        np.testing.assert_allclose(turn, frames @ rolled.rotation(), 0, 1e-6)
 
 
 # --- one sensor, by hand --------------------------------------------------------
 
 
-def one_sensor(max_range: float, objects=BALLS[:1]) -> FieldSensor:
-    """A sensor at the origin of the base."""
+def one_sensor(max_range: float, objects=BALLS[:1], **options) -> FieldSensor:
+    """A sensor at the origin of the base, looking up."""
     skin = Skin(
         robot="h1_2",
         links=("pelvis",),
         position=np.zeros((1, 3)),
         normal=np.array([[0.0, 0, 1]]),
     )
-    return FieldSensor(skin, H1_2.chain, objects, max_range)
+    return FieldSensor(skin, H1_2.chain, objects, max_range, **options)
 
 
-def look(sensor, *centres, active=None, dtype=torch.float64):
-    """(distance, detected) for balls at the given places, base at the origin."""
-    pose = torch.zeros(1, len(centres), 7, dtype=dtype)
-    pose[0, :, :3] = torch.tensor(centres, dtype=dtype)
+def look(sensor, *centres, active=None, quat=(1, 0, 0, 0)):
+    """(distance, detected) for objects at the given places, base at the origin."""
+    pose = torch.zeros(1, len(centres), 7, dtype=torch.float64)
+    pose[0, :, :3] = torch.tensor(centres, dtype=torch.float64)
+    pose[0, :, 3:] = torch.tensor(quat, dtype=torch.float64)
     if active is None:
         active = [True] * len(centres)
     distance, detected = sensor.compute(
-        torch.tensor([[0, 0, 0, 1, 0, 0, 0]], dtype=dtype),
-        torch.zeros(1, len(H1_2.joints), dtype=dtype),
+        torch.tensor([[0, 0, 0, 1, 0, 0, 0]], dtype=torch.float64),
+        torch.zeros(1, len(H1_2.joints), dtype=torch.float64),
         pose,
         torch.tensor([active]),
     )
-    return distance.item(), detected[0].tolist()
+    distance = distance[0, 0].tolist()
+    return distance, detected[0].tolist()
 
 
 def test_distance_is_to_the_surface():
@@ -136,10 +244,28 @@ def test_distance_is_to_the_surface():
     assert look(one_sensor(9), (3, 0, 4)) == (pytest.approx(4.85), [True])
 
 
-def test_a_sensor_inside_the_ball_reads_zero():
-    sensor = one_sensor(2)
-    assert look(sensor, (0, 0, 0)) == (0, [True])
-    assert look(sensor, (0.1, 0, 0)) == (0, [True])
+@pytest.mark.parametrize(
+    ("shape", "expected"),
+    [
+        # Seen from 2 m below, turned +90 deg about y: the object's x looks down, its
+        # z along the base's x.
+        (SHAPES[1], 2 - 0.1),
+        (SHAPES[2], 2 - 0.1),
+        (SHAPES[3], 2 - 0.4),
+    ],
+)
+def test_distance_depends_on_how_an_object_is_turned(shape, expected):
+    half = math.sqrt(0.5)
+    found, _ = look(one_sensor(9, (shape,)), (0, 0, 2), quat=(half, 0, half, 0))
+    assert found == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_a_sensor_inside_an_object_reads_zero(shape):
+    for options in ({}, {"coverage": Field(half_angle_deg=10)}):
+        sensor = one_sensor(2, (shape,), **options)
+        assert look(sensor, (0, 0, 0)) == (0, [True])
+        assert look(sensor, (0.01, -0.02, -0.05)) == (0, [True])
 
 
 def test_the_range_itself_counts_as_detected():
@@ -164,6 +290,11 @@ def test_the_nearest_of_two_balls_is_measured():
     assert look(sensor, (0, 1, 0), (1, 0, 0)) == (pytest.approx(0.85), [True, True])
     assert look(sensor, (0, 1, 0), (0.9, 0, 0)) == (pytest.approx(0.82), [True, True])
     assert look(sensor, (0, 9, 0), (1, 0, 0)) == (pytest.approx(0.92), [False, True])
+    apart = one_sensor(2, BALLS, per_object=True)
+    assert look(apart, (0, 9, 0), (1, 0, 0)) == (
+        [math.inf, pytest.approx(0.92)],
+        [False, True],
+    )
 
 
 def test_an_inactive_ball_is_sensed_by_nothing():
@@ -176,9 +307,75 @@ def test_an_inactive_ball_is_sensed_by_nothing():
     assert look(sensor, *places, active=[False, False]) == (math.inf, [False, False])
 
 
+def test_a_hemisphere_sees_what_lies_above_its_plane():
+    sensor = one_sensor(2, coverage=Field(half_angle_deg=90))
+    # The closest point of a ball lies towards its centre.
+    assert look(sensor, (0.6, 0, 0.8)) == (pytest.approx(0.85), [True])
+    assert look(sensor, (1, 0, 1e-6)) == (pytest.approx(0.85), [True])
+    assert look(sensor, (1, 0, -1e-6)) == (math.inf, [False])
+    assert look(sensor, (0, 0, -1)) == (math.inf, [False])
+
+
+def test_a_cone_sees_what_lies_within_its_half_angle():
+    # 36.87 deg is the angle of a 3-4-5 triangle.
+    for angle, seen in ((36.8, False), (36.9, True)):
+        sensor = one_sensor(2, coverage=Field(half_angle_deg=angle))
+        assert look(sensor, (0.6, 0, 0.8))[1] == [seen]
+    # A wide box: its centre lies 45 deg off, its closest point straight above.
+    box = (Box(half_extents=(1.5, 1, 0.25)),)
+    sensor = one_sensor(2, box, coverage=Field(half_angle_deg=10))
+    assert look(sensor, (1, 0, 1)) == (0.75, [True])
+    assert look(sensor, (2, 0, 1))[1] == [False]
+
+
+def test_the_distance_to_the_centre_is_an_option():
+    # |(.6, 0, .8)| = 1; in range if the centre is.
+    centre = Field(measure="centre")
+    assert look(one_sensor(1.01, coverage=centre), (0.6, 0, 0.8)) == (
+        pytest.approx(1),
+        [True],
+    )
+    assert look(one_sensor(0.99, coverage=centre), (0.6, 0, 0.8))[1] == [False]
+    sensor = one_sensor(9, (SHAPES[1],), coverage=centre)
+    assert look(sensor, (0, 3, 4)) == (pytest.approx(5), [True])
+
+
+# --- bad inputs -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("key", KEYS[:3])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_nan_anywhere_reads_nan(skin, random_state, shape, key):
+    state = random_state(8, seed=3, objects=2)
+    state["object_active"][:] = True
+    state["object_active"][6:, 1] = False
+    sensor = FieldSensor(skin, H1_2.chain, (shape, shape), RANGE)
+    clean, clean_detected = measure(sensor, state)
+    number = state[key][0].numel()
+    for i in range(number):
+        bad = state.clone()
+        bad[key][1::2].view(4, -1)[:, i] = math.nan
+        distance, detected = measure(sensor, bad)
+        assert torch.equal(distance[::2], clean[::2])
+        assert torch.equal(detected[::2], clean_detected[::2])
+        # A bad pose is one object's; that of the second in row 7 is not in play.
+        own = key == "object_pose"
+        marked = [1, 3, 5] if own and i >= number // 2 else [1, 3, 5, 7]
+        assert distance[marked].isnan().all()
+        assert (detected[marked].sum(-1) >= 1).all()
+
+
+def test_poses_of_inactive_objects_are_not_looked_at(sensor, random_state):
+    state = random_state(32, seed=4)
+    parked = state.clone()
+    parked["object_pose"][~state["object_active"]] = math.nan
+    assert not state["object_active"].all()
+    for a, b in zip(measure(sensor, parked), measure(sensor, state), strict=True):
+        assert torch.equal(a, b)
+
+
 # --- invariances ----------------------------------------------------------------
 
-ANGLE = st.floats(-math.pi, math.pi)
 UNIT_QUAT = (
     st.tuples(*[st.floats(-1, 1)] * 4)
     .filter(lambda q: np.linalg.norm(q) > 0.1)
@@ -192,21 +389,23 @@ def quat_product(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     return torch.cat((w, v + torch.linalg.cross(a[..., 1:], b[..., 1:])), -1)
 
 
+@pytest.fixture(scope="module")
+def every_shape(skin) -> FieldSensor:
+    return FieldSensor(skin, H1_2.chain, SHAPES, RANGE, Field(half_angle_deg=80))
+
+
 @given(UNIT_QUAT, st.tuples(*[st.floats(-5, 5)] * 3))
-def test_moving_robot_and_balls_together_changes_nothing(
-    sensor, random_state, quat, shift
-):
-    state = random_state(16, seed=3, dtype=torch.float64)
-    distance, detected = measure(sensor, state)
+def test_moving_the_whole_world_changes_nothing(every_shape, random_state, quat, shift):
+    state = turned(random_state(8, 3, torch.float64, objects=4), 3)
     moved = state.clone()
     shift = torch.tensor(shift, dtype=torch.float64)
     for key in ("base_pose", "object_pose"):
-        place = state[key][..., :3]
-        moved[key][..., :3] = rotate(quat.expand(*place.shape[:-1], 4), place) + shift
-    turn = quat.expand(16, 4)
-    moved["base_pose"][:, 3:] = quat_product(turn, state["base_pose"][:, 3:])
-    moved_distance, moved_detected = measure(sensor, moved)
-    torch.testing.assert_close(moved_distance, distance, rtol=0, atol=1e-9)
+        place, turn = state[key].split((3, 4), -1)
+        by = quat.expand_as(turn)
+        moved[key] = torch.cat((rotate(by, place) + shift, quat_product(by, turn)), -1)
+    distance, detected = measure(every_shape, state)
+    moved_distance, moved_detected = measure(every_shape, moved)
+    torch.testing.assert_close(moved_distance, distance, rtol=0, atol=1e-8)
     assert torch.equal(moved_detected, detected)
 
 
@@ -220,23 +419,49 @@ def test_permuting_the_rows_permutes_the_result(sensor, random_state, order):
 
 
 @given(st.permutations(range(64)))
-def test_permuting_the_sensors_permutes_the_result(skin, sensor, random_state, order):
-    order = list(order)
-    shuffled = Skin(
-        robot=skin.robot,
-        links=tuple(skin.links[i] for i in order),
-        position=skin.position[order],
-        normal=skin.normal[order],
-    )
+def test_permuting_the_sensors_permutes_the_result(skin, random_state, order):
+    mixed = draw_skin(skin, np.random.default_rng(5))
     state = random_state(16, seed=5)
-    distance, detected = measure(sensor, state)
-    other = FieldSensor(shuffled, H1_2.chain, BALLS, RANGE)
+    distance, detected = measure(FieldSensor(mixed, H1_2.chain, BALLS, RANGE), state)
+    other = FieldSensor(mixed.select(order), H1_2.chain, BALLS, RANGE)
     other_distance, other_detected = measure(other, state)
-    assert torch.equal(other_distance, distance[:, order])
+    assert torch.equal(other_distance, distance[:, list(order)])
     assert torch.equal(other_detected, detected)
 
 
-@given(st.integers(0, 1000), st.floats(0.05, 5))
+@given(st.permutations(range(4)))
+def test_the_order_of_the_objects_does_not_matter(
+    every_shape, skin, random_state, order
+):
+    order = list(order)
+    state = turned(random_state(16, seed=6, objects=4), 6)
+    shuffled = state.clone()
+    for key in ("object_pose", "object_active"):
+        shuffled[key] = state[key][:, order]
+    other = FieldSensor(
+        skin, H1_2.chain, [SHAPES[i] for i in order], RANGE, Field(half_angle_deg=80)
+    )
+    distance, detected = measure(every_shape, state)
+    other_distance, other_detected = measure(other, shuffled)
+    assert torch.equal(other_distance, distance)
+    assert torch.equal(other_detected, detected[:, order])
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_a_row_has_the_same_bits_in_any_batch(skin, random_state, shape):
+    mixed = draw_skin(skin, np.random.default_rng(7))
+    sensor = FieldSensor(mixed, H1_2.chain, (shape,), RANGE)
+    state = turned(random_state(101, seed=7, objects=1), 7)
+    distance, detected = measure(sensor, state)
+    for size in (1, 5, 27, 32):
+        for start in (0, 3, 69):
+            rows = slice(start, start + size)
+            part, part_detected = measure(sensor, state[rows])
+            assert torch.equal(part, distance[rows])
+            assert torch.equal(part_detected, detected[rows])
+
+
+@given(SEED, st.floats(0.05, 5))
 def test_distances_of_two_sensors_differ_by_no_more_than_their_gap(
     skin, random_state, seed, max_range
 ):
@@ -244,7 +469,7 @@ def test_distances_of_two_sensors_differ_by_no_more_than_their_gap(
     sensor = FieldSensor(skin, H1_2.chain, BALLS[:1], max_range)
     state = random_state(4, seed=seed, dtype=torch.float64, objects=1)
     distance, detected = measure(sensor, state)
-    points = sensor.points_b(state["joint_pos"])
+    points, _ = sensor.poses_b(state["joint_pos"])
     gap = (points[:, :, None] - points[:, None]).norm(dim=-1)
     difference = (distance[:, :, None] - distance[:, None]).abs()
     both = distance.isfinite()[:, :, None] & distance.isfinite()[:, None]
@@ -254,30 +479,32 @@ def test_distances_of_two_sensors_differ_by_no_more_than_their_gap(
     assert torch.equal(detected[:, 0], distance.isfinite().any(-1))
 
 
-@given(st.floats(0.1, 2), st.floats(0.1, 2))
-def test_a_longer_range_only_adds_detections(skin, random_state, a, b):
-    state = random_state(8, seed=6)
-    short, long = (
-        measure(FieldSensor(skin, H1_2.chain, BALLS, r), state)[0]
-        for r in sorted((a, b))
+@given(SEED, st.floats(0.05, 3))
+def test_a_range_only_cuts_off(every_shape, skin, random_state, seed, max_range):
+    # Without a range no row is left out: everything is computed.
+    state = turned(random_state(16, seed, objects=4), seed)
+    state["object_pose"][..., :3] *= 3
+    narrow = Field(half_angle_deg=80)
+    full, short = (
+        measure(FieldSensor(skin, H1_2.chain, SHAPES, r, narrow), state)[0]
+        for r in (math.inf, max_range)
     )
-    seen = short.isfinite()
-    assert torch.equal(short[seen], long[seen])
-    assert (long[~seen] > min(a, b)).all()
+    limit = torch.tensor(max_range, dtype=torch.float32)
+    assert torch.equal(short, full.masked_fill(full > limit, math.inf))
 
 
 def test_the_way_a_ball_is_turned_does_not_matter(sensor, random_state):
     state = random_state(16, seed=7)
-    turned = state.clone()
-    turned["object_pose"][..., 3:] = torch.tensor([0.5, 0.5, -0.5, 0.5])
-    for a, b in zip(measure(sensor, state), measure(sensor, turned), strict=True):
+    for a, b in zip(
+        measure(sensor, state), measure(sensor, turned(state.clone(), 1)), strict=True
+    ):
         assert torch.equal(a, b)
 
 
 def test_points_in_the_world_and_quaternions_agree(sensor, random_state):
     # The same distances from world positions, by rotation matrices.
     state = random_state(32, seed=8, dtype=torch.float64, objects=2)
-    points = sensor.points_b(state["joint_pos"])
+    points, _ = sensor.poses_b(state["joint_pos"])
     turn = quat_to_matrix(state["base_pose"][:, 3:])
     points_w = points @ turn.mT + state["base_pose"][:, None, :3]
     gap = (points_w[:, None] - state["object_pose"][:, :, None, :3]).norm(dim=-1)
@@ -306,3 +533,26 @@ def test_a_skin_of_another_robot_is_refused(small_robot, skin):
 def test_another_number_of_objects_is_refused(sensor, random_state):
     with pytest.raises(ValueError, match="made for 2 objects, 'object_pose' holds 3"):
         measure(sensor, random_state(4, objects=3))
+
+
+def test_no_object_is_refused(skin):
+    with pytest.raises(ValueError, match="at least one object"):
+        FieldSensor(skin, H1_2.chain, (), RANGE)
+
+
+def test_a_ray_is_refused(skin):
+    mixed = replace(skin, coverage=(None,) * 63 + (Ray(),))
+    with pytest.raises(ValueError, match=r"sensor 63 is a Ray, not a Field; .*select"):
+        FieldSensor(mixed, H1_2.chain, BALLS, RANGE)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_a_gpu_measures_the_same(skin, random_state):
+    mixed = draw_skin(skin, np.random.default_rng(9))
+    sensor = FieldSensor(mixed, H1_2.chain, SHAPES, RANGE, body=H1_2.primitives)
+    state = turned(random_state(64, 9, torch.float64, objects=4), 9)
+    distance, detected = measure(sensor, state)
+    other, other_detected = measure(sensor.to("cuda"), state.to("cuda"))
+    torch.testing.assert_close(other.cpu(), distance, rtol=0, atol=1e-9)
+    assert torch.equal(other_detected.cpu(), detected)

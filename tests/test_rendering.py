@@ -17,7 +17,7 @@ from tensordict import TensorDict, TensorDictBase
 
 from egoskin.cli import clear_errors
 from egoskin.film import Frame
-from egoskin.make import EnvConfig, SensorConfig, make_worker_env
+from egoskin.make import EnvConfig, make_worker_env
 from egoskin.rendering import (
     CameraConfig,
     Painter,
@@ -27,6 +27,7 @@ from egoskin.rendering import (
 )
 from egoskin.robots import RobotConfig
 from egoskin.sensors import Skin
+from egoskin.sensors.config import SensorConfig
 from egoskin.shapes import Sphere
 
 SIZE = (160, 90)
@@ -57,7 +58,6 @@ def standing(robot: RobotConfig) -> TensorDict:
         joint_pos=torch.from_numpy(robot.default_joint_pos).float(),
         object_pose=torch.tensor([0, 0, 1000.0, 1, 0, 0, 0]).repeat(2, 1),
         object_active=torch.zeros(2, dtype=torch.bool),
-        distance=torch.full((64,), torch.inf),
     )
 
 
@@ -106,9 +106,8 @@ def test_a_line_leads_from_a_sensor_that_detects_to_the_ball(
     painter: Painter, standing: TensorDict
 ):
     idle = place_ball(standing, 0.5, 0.9, 1.4)
-    lit = idle.clone()
-    lit["distance"][:10] = 0.8
-    before, after = painter.draw(idle, time=0.0), painter.draw(lit, time=0.0)
+    lit = np.arange(64) < 10
+    before, after = painter.draw(idle, time=0.0), painter.draw(idle, lit, time=0.0)
     assert before.num_detecting == 0
     assert after.num_detecting == 10
     assert count_blue(before) == 0
@@ -117,9 +116,11 @@ def test_a_line_leads_from_a_sensor_that_detects_to_the_ball(
 
 def test_a_sensor_that_detects_is_lit(painter: Painter, standing: TensorDict):
     # No ball in play: no line, the sensors alone change.
-    lit = standing.clone()
-    lit["distance"][:] = 0.5
-    dim, bright = painter.draw(standing, time=0.0), painter.draw(lit, time=0.0)
+    lit = np.ones(64, dtype=bool)
+    dim, bright = (
+        painter.draw(standing, time=0.0),
+        painter.draw(standing, lit, time=0.0),
+    )
     changed = (dim.image != bright.image).any(-1)
     assert changed.any()
     assert bright.image[changed].mean() > dim.image[changed].mean() + 20

@@ -16,27 +16,49 @@ from torchrl.envs import Compose, ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
-from egoskin.make import EnvConfig, SensorConfig, make_worker_env
+from egoskin.make import EnvConfig, make_worker_env
 from egoskin.observations import Privileged, Proprioception
 from egoskin.robots import H1_2
 from egoskin.sensors import (
     Binary,
+    Field,
     FieldSensor,
     Localization,
     Proximity,
-    place_area_uniform,
+    RaySensor,
+    place_sensors,
 )
+from egoskin.sensors.config import LocalizationConfig, SensorConfig
 
-SKIN = place_area_uniform(H1_2, 12, seed=0)
+SKIN = place_sensors(H1_2, 12, seed=0)
 BALLS = DodgeballConfig().throws.balls
 DEFAULT = torch.from_numpy(H1_2.default_joint_pos)
 JOINTS = len(H1_2.joints)
 
 BUILDERS = {
     "field": partial(FieldSensor, SKIN, H1_2.chain, BALLS, 1.0),
+    "field, cone, occluded": partial(
+        FieldSensor,
+        SKIN,
+        H1_2.chain,
+        BALLS,
+        1.0,
+        Field(half_angle_deg=70),
+        body=H1_2.primitives,
+    ),
+    "ray": partial(RaySensor, SKIN, H1_2.chain, BALLS, 1.0),
+    "ray, reduced": partial(RaySensor, SKIN, H1_2.chain, BALLS, 1.0, reduce="min"),
+    "ray, each object": partial(
+        RaySensor, SKIN, H1_2.chain, BALLS, 1.0, per_object=True
+    ),
     "proximity": partial(Proximity, 1.0),
+    "closeness": partial(Proximity, 1.0, closeness=True, validity=True),
     "binary": Binary,
     "localization": Localization,
+    "localization, torso": partial(
+        Localization, centre=(H1_2.chain, "torso_link"), slots="all", validity=True
+    ),
+    "localization, yaw": partial(Localization, yaw_only=True, scale=2.0),
     "proprioception": partial(Proprioception, DEFAULT),
     "privileged objects": partial(Privileged, "objects", JOINTS, len(BALLS)),
     "privileged velocity": partial(Privileged, "velocity", JOINTS, len(BALLS)),
@@ -282,6 +304,18 @@ SENSORS = {
     "binary": SensorConfig(signal="binary", range=0.5),
     "infinite": SensorConfig(range=float("inf")),
     "blind": SensorConfig(coverage="none"),
+    "ray": SensorConfig(coverage="ray", signal="closeness", validity=True),
+    "ray, reduced, held": SensorConfig(
+        coverage="ray",
+        signal="localization",
+        localization=LocalizationConfig(hold=True),
+    ),
+    "cone, real, hidden": SensorConfig(
+        field=Field(half_angle_deg=60), corruption="acoustic", occlusion=True
+    ),
+    "ray, reduced, real": SensorConfig(
+        coverage="ray", reduce="min", corruption="time_of_flight"
+    ),
 }
 
 
@@ -338,7 +372,7 @@ def outside(config: EnvConfig, parallel, **kwargs) -> TransformedEnv:
     transforms = [
         Proprioception(DEFAULT),
         Privileged("objects", JOINTS, len(BALLS)),
-        *config.sensor.transforms(H1_2, SKIN, config.task),
+        *config.sensor.transforms(H1_2, SKIN, BALLS, dt=1 / 60),
     ]
     return TransformedEnv(parallel(2, bases, **kwargs), Compose(*transforms))
 

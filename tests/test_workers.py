@@ -20,7 +20,7 @@ from egoskin.make import (
     save_env_state,
 )
 from egoskin.robots import H1_2
-from egoskin.sensors import place_area_uniform
+from egoskin.sensors import place_sensors
 from egoskin.workers import WorkerError, WorkerPool, default_num_workers
 
 NUM_ENVS = 32
@@ -28,7 +28,7 @@ NUM_ENVS = 32
 
 @pytest.fixture(scope="module")
 def skin():
-    return place_area_uniform(H1_2, 8, seed=0)
+    return place_sensors(H1_2, 8, seed=0)
 
 
 def make_pool(skin, workers: int, num_envs: int = NUM_ENVS) -> WorkerPool:

@@ -6,7 +6,7 @@ the value of a time-out is taken from the terminal observation, before the reset
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -81,7 +81,11 @@ class PPOConfig:
 
 @torch.no_grad()
 def collect(
-    env: EnvBase, agent: Agent, root: TensorDictBase, num_steps: int
+    env: EnvBase,
+    agent: Agent,
+    root: TensorDictBase,
+    num_steps: int,
+    info_keys: Sequence[str] = (),
 ) -> tuple[TensorDict, TensorDictBase, list[TensorDict]]:
     """Step an environment with an agent; return what PPO needs.
 
@@ -90,12 +94,13 @@ def collect(
         agent: Chooses the actions, on its own device.
         root: Tensordict to start from.
         num_steps: Number of steps ``T``.
+        info_keys: What else to keep of what the environment says, for metrics.
 
     Returns:
         The rollout ``[T, N]`` with the agent's keys, ``action``, ``action_log_prob``,
         ``loc``, ``scale``, ``state_value``, ``next_state_value``, ``reward``,
         ``done`` and ``terminated``, on the agent's device; the tensordict to go on
-        from; and for each step what the environment said beside it, for metrics.
+        from; and for each step the entries asked for.
     """
     device = agent.head.log_std.device
     frames, bootstraps, infos = [], [], []
@@ -110,7 +115,7 @@ def collect(
             frame[key] = after[key].to(device)
         frames.append(frame)
         bootstraps.append(_timeout_values(agent, after, device))
-        infos.append(after.exclude(*inputs))
+        infos.append(after.select(*info_keys))
     rollout = TensorDict.maybe_dense_stack(frames)
     assert isinstance(rollout, TensorDict)
     last = root.select(*inputs).reshape(-1).to(device)

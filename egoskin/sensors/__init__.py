@@ -4,19 +4,44 @@ Everything here works on TensorDicts with the keys named in `egoskin`, from this
 project's environment, another simulator, a recording or a real robot.
 """
 
+from egoskin.sensors.corruption import Corruption
 from egoskin.sensors.coverage import Field, Ray
 from egoskin.sensors.field import FieldSensor
-from egoskin.sensors.placement import place_area_uniform
-from egoskin.sensors.signals import Binary, Localization, Proximity
+from egoskin.sensors.gentact import load_gentact, save_gentact
+from egoskin.sensors.history import History, HoldLast
+from egoskin.sensors.placement import place_sensors
+from egoskin.sensors.ray import RaySensor
+from egoskin.sensors.signals import BeamMinimum, Binary, Localization, Proximity
 from egoskin.sensors.skin import Skin
+from egoskin.sensors.tactile import (
+    ContactFree,
+    ContactPenalty,
+    ContactTermination,
+    Tactile,
+    contact_free,
+    split_by_contact,
+)
 
 __all__ = [
+    "BeamMinimum",
     "Binary",
+    "ContactFree",
+    "ContactPenalty",
+    "ContactTermination",
+    "Corruption",
     "Field",
     "FieldSensor",
+    "History",
+    "HoldLast",
     "Localization",
     "Proximity",
     "Ray",
+    "RaySensor",
     "Skin",
-    "place_area_uniform",
+    "Tactile",
+    "contact_free",
+    "load_gentact",
+    "place_sensors",
+    "save_gentact",
+    "split_by_contact",
 ]

@@ -24,7 +24,8 @@ class Field:
     """Distance to the object's closest point, or to its centre."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for an angle that is no cone."""
+        """Raise ValueError for an angle that is no cone, or an unknown measure."""
+        _check_choice("measure", self.measure, ("surface", "centre"))
         if not 0 < self.half_angle_deg <= 180:
             raise ValueError(
                 f"half_angle_deg must be in (0, 180], got {self.half_angle_deg}"
@@ -53,7 +54,10 @@ class Ray:
     """Distance along the beam, or its component along the normal."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for a grid without zones or a view that is no pyramid."""
+        """Raise ValueError for no zones, a view that is no pyramid, unknown words."""
+        _check_choice("fov", self.fov, ("diagonal", "axis"))
+        _check_choice("beams", self.beams, ("centres", "edges"))
+        _check_choice("measure", self.measure, ("beam", "depth"))
         if len(self.grid) != 2 or min(self.grid) < 1:
             raise ValueError(f"grid must be two positive numbers, got {self.grid}")
         if not 0 < self.fov_deg < 180:
@@ -104,6 +108,13 @@ class Ray:
 
 Coverage = Field | Ray
 """What one sensor sees."""
+
+
+def _check_choice(name: str, value: str, choices: tuple[str, str]) -> None:
+    """Raise ValueError for a word that is none of the choices."""
+    if value not in choices:
+        raise ValueError(f"{name} must be {' or '.join(choices)}, got {value!r}")
+
 
 KINDS: dict[str, type[Field] | type[Ray]] = {"field": Field, "ray": Ray}
 """Kinds of coverage by the name used in configurations and skin files."""

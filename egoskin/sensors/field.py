@@ -1,128 +1,163 @@
-"""Field sensors: non-directional, the distance to the closest point of an object."""
+"""Field sensors: the distance to the closest point of an object."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 
 import pytorch_kinematics as pk
 import torch
 from tensordict import NestedKey
 from torch import Tensor
-from torchrl.data import Binary as BinarySpec
-from torchrl.data import Composite, TensorSpec, Unbounded
 
-from egoskin.kinematics import LinkKinematics, rotate_inverse
+from egoskin.compilation import compiled, exact_sqrt
+from egoskin.robots import Primitive
+from egoskin.sensors.coverage import Field
+from egoskin.sensors.geometry import (
+    STATE_KEYS,
+    ProximitySensor,
+    Scene,
+    View,
+    checked,
+)
 from egoskin.sensors.skin import Skin
-from egoskin.shapes import Sphere
-from egoskin.transform import RowTransform
+from egoskin.shapes import Shape, Sphere
 
 
-def field_distance(points: Tensor, centres: Tensor, shape: Sphere) -> Tensor:
-    """Return the distance from sensors to the closest point of an object.
-
-    Args:
-        points: Sensor positions [m], ``[3, S, B]``.
-        centres: Centre of the object in the same frame [m], ``[3, B]``.
-        shape: The object's shape.
-
-    Returns:
-        max(signed distance, 0) [m], ``[S, B]``: 0 for a sensor inside the object.
-    """
-    # The object's frame differs by a shift alone: a sphere needs no rotation.
-    x, y, z = (p - c for p, c in zip(points, centres, strict=True))
-    return shape.signed_distance(x, y, z).clamp_(min=0.0)
-
-
-class FieldSensor(RowTransform):
+class FieldSensor(ProximitySensor):
     """Distance from each sensor of a skin to the closest active object in range.
 
     Reads ``base_pose [*B, 7]``, ``joint_pos [*B, J]``, ``object_pose [*B, O, 7]`` and
     ``object_active [*B, O]``. Writes ``distance [*B, S]`` [m], infinite where nothing
-    is in range, and ``object_detected [*B, O]``, whether any sensor detects the
-    object. The robot's own body is transparent. Distances are those of the state
-    given: forward kinematics from the joint positions.
+    is in range and NaN where the input is, and ``object_detected [*B, O]``, whether
+    any sensor detects the object. A sensor inside an object reads 0. Distances are
+    those of the state given: forward kinematics from the joint positions.
+
+    A sensor with a half angle below 180 degrees sees an object if the object's
+    closest point lies within that angle of the normal.
 
     Args:
-        skin: The sensors.
+        skin: The sensors. Their own coverage and range come first.
         chain: Kinematic chain of the robot, rooted at the base.
         objects: Shape of each object, ``O`` of them.
         max_range: A distance is detected if it is at most this [m]; may be infinite.
+        coverage: What a sensor sees.
+        body: The robot's shapes, to hide what lies behind them: an object is seen if
+            the straight path to its closest point is free. Empty: transparent.
+        per_object: Write ``distance [*B, S, O]``, objects told apart.
+        compile: Compile the kernel; results are the same.
         in_keys: Keys of the four inputs, in the order above.
         out_keys: Keys of the two outputs, in the order above.
 
     Raises:
-        ValueError: If the range is not positive or the skin does not fit the chain.
+        ValueError: If the range is not positive, the skin does not fit the chain or
+            holds a sensor that is no field sensor.
     """
 
-    _order: Tensor
+    _cos_half: Tensor | None
+    _to_centre: Tensor | None
 
     def __init__(
         self,
         skin: Skin,
         chain: pk.Chain,
-        objects: Sequence[Sphere],
+        objects: Sequence[Shape],
         max_range: float,
-        in_keys: Sequence[NestedKey] = (
-            "base_pose",
-            "joint_pos",
-            "object_pose",
-            "object_active",
-        ),
+        coverage: Field | None = None,
+        *,
+        body: Sequence[Primitive] = (),
+        per_object: bool = False,
+        compile: bool = False,
+        in_keys: Sequence[NestedKey] = STATE_KEYS,
         out_keys: Sequence[NestedKey] = ("distance", "object_detected"),
     ) -> None:
-        super().__init__(in_keys, out_keys)
-        if not max_range > 0:
-            raise ValueError(f"max_range must be positive, got {max_range}")
-        skin.check_links(chain.get_link_names())
-        self.max_range = float(max_range)
-        self.num_sensors = len(skin)
-        self.objects = tuple(objects)
-        links = tuple(dict.fromkeys(skin.links))
-        self._kinematics = LinkKinematics(chain, links)
-        sensors = [
-            [i for i, on in enumerate(skin.links) if on == link] for link in links
-        ]
-        self._offsets = [skin.position[group].tolist() for group in sensors]
-        # Points come link by link; the signal is in the order of the skin.
-        order = torch.tensor([i for group in sensors for i in group])
-        self.register_buffer("_order", order.argsort())
-
-    def points_b(self, joint_pos: Tensor) -> Tensor:
-        """Return the sensors' positions in the base frame [m], ``[B, S, 3]``.
-
-        Args:
-            joint_pos: Joint positions [rad], ``[B, J]``.
-        """
-        points = self._kinematics.points_b(joint_pos, self._offsets)
-        return points[:, self._order].permute(2, 1, 0)
-
-    def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
-        """Return (distance ``[B, S]`` [m], detected ``[B, O]``)."""
-        base_pose, joint_pos, object_pose, active = inputs
-        if object_pose.shape[1] != len(self.objects):
-            raise ValueError(
-                f"the sensor was made for {len(self.objects)} objects, "
-                f"{self.in_keys[2]!r} holds {object_pose.shape[1]}"
-            )
-        points = self._kinematics.points_b(joint_pos, self._offsets)
-        nearest = torch.full_like(points[0], torch.inf)
-        detected = []
-        for i, shape in enumerate(self.objects):
-            offset_w = object_pose[:, i, :3] - base_pose[:, :3]
-            centres = rotate_inverse(base_pose[:, 3:], offset_w).t()
-            distance = field_distance(points, centres, shape)
-            seen = (distance <= self.max_range) & active[:, i]
-            nearest = torch.where(seen, distance.minimum(nearest), nearest)
-            detected.append(seen.any(0))
-        return nearest[self._order].t().contiguous(), torch.stack(detected, -1)
-
-    def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
-        """Return the specs of distance and detection."""
-        batch, objects = spec.shape, len(self.objects)
-        return (
-            Unbounded(
-                shape=torch.Size((*batch, self.num_sensors)),
-                dtype=spec[self.in_keys[1]].dtype,
-            ),
-            BinarySpec(shape=torch.Size((*batch, objects)), dtype=torch.bool),
+        skin, fields = checked(skin, coverage or Field(), max_range, Field)
+        super().__init__(
+            skin, chain, objects, (), 1.0, body, per_object, in_keys, out_keys
         )
+        # None where every sensor sees all around, or measures to the surface.
+        cos_half = to_centre = None
+        if any(f.half_angle_deg < 180 for f in fields):
+            angles = [math.cos(math.radians(f.half_angle_deg)) for f in fields]
+            cos_half = torch.tensor(angles, dtype=torch.float64)[:, None]
+        if any(f.measure == "centre" for f in fields):
+            to_centre = torch.tensor([[f.measure == "centre"] for f in fields])
+        self.register_buffer("_cos_half", cos_half)
+        self.register_buffer("_to_centre", to_centre)
+        self._kernel: Callable[..., tuple[Tensor, Tensor]] = self.distances
+        if compile:
+            self._kernel = compiled(self.distances)
+
+    def distances(self, scene: Scene, shape: Shape) -> tuple[Tensor, Tensor]:
+        """Return readings of one object [m], ``[B, S]``, and the least, ``[B]``."""
+        view = self.view(scene, shape)
+        # From each sensor to the object's centre, in the sensor's link.
+        x, y, z = v = view.centre[:, self._link] - self._offset.to(view.centre.dtype)
+        to_centre = exact_sqrt(x * x + y * y + z * z)
+        if isinstance(shape, Sphere):
+            # |c| - r: the object's frame differs by a shift alone.
+            distance = (to_centre - shape.radius).clamp(min=0.0)
+        else:
+            distance = shape.signed_distance(*self._in_object(view, v)).clamp(min=0.0)
+        if self._cos_half is not None:
+            n = self._axes[2].to(x.dtype)
+            way = self._to_closest(view, shape, v)
+            along = n[0] * way[0] + n[1] * way[1] + n[2] * way[2]
+            reach = exact_sqrt(way[0] * way[0] + way[1] * way[1] + way[2] * way[2])
+            # cos(angle) < cos(half angle); an object about the sensor is all around.
+            beside = (along < self._cos_half.to(x) * reach) & ~(distance <= 0)
+            distance = torch.where(beside, torch.inf, distance)
+        if self._to_centre is not None:
+            measured = torch.where(distance == torch.inf, distance, to_centre)
+            distance = torch.where(self._to_centre, measured, distance)
+        # Written so that NaN stays NaN.
+        gone = distance > self._range.to(x.dtype)
+        reading = torch.where(gone, torch.inf, distance)
+        return reading.t().contiguous(), reading.amin(0)
+
+    def _in_object(self, view: View, centre: Tensor) -> list[Tensor]:
+        """The sensors in the object's frame [m], three of ``[S, B]``."""
+        x, y, z = centre
+        assert view.turn is not None
+        turn = view.turn[:, :, self._link]
+        return [-(row[0] * x + row[1] * y + row[2] * z) for row in turn]
+
+    def _to_closest(self, view: View, shape: Shape, centre: Tensor) -> Sequence[Tensor]:
+        """From each sensor to the object's closest point in the link frames [m].
+
+        For a sphere only the direction is right, which is that to its centre.
+        """
+        if isinstance(shape, Sphere):
+            return list(centre)
+        p = self._in_object(view, centre)
+        x, y, z = (a - b for a, b in zip(shape.closest_point(*p), p, strict=True))
+        assert view.turn is not None
+        columns = view.turn[:, :, self._link].transpose(0, 1)
+        return [c[0] * x + c[1] * y + c[2] * z for c in columns]
+
+    def measure(self, scene: Scene, shape: Shape, rows: Tensor, out: Tensor) -> Tensor:
+        """Lower readings to those of one object, and return the least of each row."""
+        reading, least = self._kernel(scene, shape)
+        if self._occluder is not None:
+            reading = self._without_hidden(reading, scene, shape)
+            least = reading.amin(1)
+        out[rows] = torch.minimum(out[rows], reading)
+        return least
+
+    def _without_hidden(self, reading: Tensor, scene: Scene, shape: Shape) -> Tensor:
+        """Readings whose path to the object's closest point is free."""
+        row, sensor = (reading < torch.inf).nonzero().unbind(1)
+        if not len(row):
+            return reading
+        view = self.view(scene, shape)
+        centre = view.centre[:, self._link] - self._offset.to(reading.dtype)
+        way = self._to_closest(view, shape, centre)
+        x, y, z = (w[sensor, row] for w in way)
+        reach = (x * x + y * y + z * z).sqrt()
+        direction = torch.stack((x, y, z))[..., None] / reach.clamp(min=1e-9)[:, None]
+        length = reach - shape.radius if isinstance(shape, Sphere) else reach
+        found = reading[row, sensor][:, None]
+        kept = self.hide(found, scene, sensor, row, direction, length[:, None])
+        reading = reading.clone()
+        reading[row, sensor] = kept[:, 0]
+        return reading

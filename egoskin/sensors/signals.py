@@ -1,75 +1,134 @@
 """Signals: what a policy is given of what sensors measure.
 
-All three read the measurements of a coverage (`egoskin.sensors.field`), so that every
-signal goes with every coverage and whatever corrupts a measurement comes in between.
+All of them read the measurements of a coverage, so that every signal goes with every
+coverage and whatever corrupts a measurement comes in between. A measurement of
+infinity means that nothing is in range; one of NaN (bad input) gives a signal of NaN.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
+from typing import Literal
 
+import pytorch_kinematics as pk
 import torch
 from tensordict import NestedKey
 from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 
-from egoskin.kinematics import rotate_inverse
+from egoskin.kinematics import LinkKinematics, rotate_inverse
 from egoskin.transform import RowTransform
 
 # An infinite range has no scale of its own: distance d reads d / (d + 1 m).
 _HALF_DISTANCE = 1.0
 
 
-class Proximity(RowTransform):
-    """Distance over range: 0 at the sensor, 1 at the range and for nothing.
-
-    Reads ``distance [*B, S]`` [m] (infinite: nothing in range); writes ``signal
-    [*B, S]`` in [0, 1].
+class _Reading(RowTransform):
+    """A signal of one number for each measurement, in [0, 1].
 
     Args:
-        max_range: The range of the sensors [m]. For an infinite one the signal is
-            d / (d + 1 m).
-        in_keys: Key of the distance.
+        validity: Whether the signal's second half says which measurements found
+            anything, 1 or 0: a proximity of 1 may be an object at the range exactly.
+        in_keys: Key of the measurements.
+        out_keys: Key of the signal.
+    """
+
+    def __init__(
+        self,
+        validity: bool,
+        in_keys: Sequence[NestedKey],
+        out_keys: Sequence[NestedKey],
+    ) -> None:
+        super().__init__(in_keys, out_keys)
+        self.validity = validity
+
+    def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """Return the signal, ``[B, S ...]`` flattened."""
+        distance = inputs[0].flatten(1)
+        signal = self._signal(distance)
+        if self.validity:
+            signal = torch.cat((signal, found(distance)), -1)
+        return (signal,)
+
+    def _signal(self, distance: Tensor) -> Tensor:
+        raise NotImplementedError
+
+    def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
+        """Return the spec of the signal."""
+        measured = spec[self.in_keys[0]]
+        size = measured.shape[len(spec.shape) :].numel() * (2 if self.validity else 1)
+        shape = torch.Size((*spec.shape, size))
+        return (Bounded(0.0, 1.0, shape=shape, dtype=measured.dtype),)
+
+
+def found(distance: Tensor) -> Tensor:
+    """Return 1 where something is measured, 0 for nothing, NaN for NaN."""
+    return torch.where(distance.isnan(), distance, (distance < torch.inf).to(distance))
+
+
+class Proximity(_Reading):
+    """Distance over range: 0 at the sensor, 1 at the range and for nothing.
+
+    Reads ``distance [*B, S]`` or ``[*B, S, K]`` [m]; writes ``signal [*B, S K]``,
+    sensor by sensor.
+
+    Args:
+        max_range: The range of the sensors [m], one or one for each. For an infinite
+            one the signal is d / (d + 1 m).
+        closeness: Write 1 - signal instead: 1 at the sensor, 0 at the range and for
+            nothing.
+        validity: Append for each measurement whether it found anything.
+        in_keys: Key of the measurements.
         out_keys: Key of the signal.
 
     Raises:
-        ValueError: If the range is not positive.
+        ValueError: If a range is not positive.
     """
+
+    _scale: Tensor
 
     def __init__(
         self,
-        max_range: float,
+        max_range: float | Sequence[float],
+        *,
+        closeness: bool = False,
+        validity: bool = False,
         in_keys: Sequence[NestedKey] = ("distance",),
         out_keys: Sequence[NestedKey] = ("signal",),
     ) -> None:
-        super().__init__(in_keys, out_keys)
-        if not max_range > 0:
+        super().__init__(validity, in_keys, out_keys)
+        scale = torch.as_tensor(max_range, dtype=torch.float64)
+        if not (scale > 0).all():
             raise ValueError(f"max_range must be positive, got {max_range}")
-        self.max_range = float(max_range)
+        self.register_buffer("_scale", scale.reshape(-1))
+        self._unlimited = bool(scale.isinf().any())
+        self.closeness = closeness
 
-    def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
-        """Return the signal, ``[B, S]``."""
-        (distance,) = inputs
-        if math.isinf(self.max_range):
+    def _signal(self, distance: Tensor) -> Tensor:
+        scale = self._scale.to(distance.dtype)
+        if len(scale) > 1:
+            if distance.shape[1] % len(scale):
+                raise ValueError(
+                    f"{len(scale)} ranges do not fit the {distance.shape[1]} "
+                    f"measurements of {self.in_keys[0]!r}"
+                )
+            scale = scale.repeat_interleave(distance.shape[1] // len(scale))
+        # An infinite distance is nothing (1) whatever the range.
+        limited = (distance / scale).clamp(0.0, 1.0)
+        if self._unlimited:
             # 1 - 1 / (1 + d) is 1 for an infinite distance, where d / (1 + d) is NaN.
-            return (1.0 - _HALF_DISTANCE / (_HALF_DISTANCE + distance),)
-        return ((distance / self.max_range).clamp(0.0, 1.0),)
-
-    def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
-        """Return the spec of the signal."""
-        shape, dtype = spec[self.in_keys[0]].shape, spec[self.in_keys[0]].dtype
-        return (Bounded(0.0, 1.0, shape=shape, dtype=dtype),)
+            unlimited = 1.0 - _HALF_DISTANCE / (_HALF_DISTANCE + distance)
+            limited = torch.where(scale.isinf(), unlimited, limited)
+        return 1.0 - limited if self.closeness else limited
 
 
-class Binary(RowTransform):
-    """Whether each sensor detects anything: 1 or 0.
+class Binary(_Reading):
+    """Whether each measurement finds anything: 1 or 0.
 
-    Reads ``distance [*B, S]`` [m] (infinite: nothing in range); writes ``signal
-    [*B, S]``.
+    Reads ``distance [*B, S]`` or ``[*B, S, K]`` [m]; writes ``signal [*B, S K]``.
 
     Args:
-        in_keys: Key of the distance.
+        in_keys: Key of the measurements.
         out_keys: Key of the signal.
     """
 
@@ -78,47 +137,139 @@ class Binary(RowTransform):
         in_keys: Sequence[NestedKey] = ("distance",),
         out_keys: Sequence[NestedKey] = ("signal",),
     ) -> None:
+        super().__init__(False, in_keys, out_keys)
+
+    def _signal(self, distance: Tensor) -> Tensor:
+        return found(distance)
+
+
+class BeamMinimum(RowTransform):
+    """The smallest of each sensor's beams, for readings that exist already.
+
+    Reads ``distance [*B, S, K]`` [m]; writes ``sensor_distance [*B, S]``. (Where beams
+    need not be kept or corrupted one by one, ``RaySensor(reduce="min")`` is faster.)
+
+    Args:
+        in_keys: Key of the measurements.
+        out_keys: Key of the minima.
+    """
+
+    def __init__(
+        self,
+        in_keys: Sequence[NestedKey] = ("distance",),
+        out_keys: Sequence[NestedKey] = ("sensor_distance",),
+    ) -> None:
         super().__init__(in_keys, out_keys)
 
     def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
-        """Return the signal, ``[B, S]``."""
-        (distance,) = inputs
-        return (distance.isfinite().to(distance.dtype),)
+        """Return the minima, ``[B, S]``."""
+        return (inputs[0].amin(-1),)
 
     def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
-        """Return the spec of the signal."""
-        shape, dtype = spec[self.in_keys[0]].shape, spec[self.in_keys[0]].dtype
-        return (Bounded(0.0, 1.0, shape=shape, dtype=dtype),)
+        """Return the spec of the minima."""
+        measured = spec[self.in_keys[0]]
+        return (Unbounded(shape=measured.shape[:-1], dtype=measured.dtype),)
 
 
 class Localization(RowTransform):
-    """Position of the detected object nearest to the base, in the base frame.
+    """Position of the detected object nearest to the robot's centre frame.
 
-    Reads ``base_pose [*B, 7]``, ``object_pose [*B, O, 7]`` and ``object_detected
-    [*B, O]``; writes ``signal [*B, 3]`` [m], zero if no sensor detects any object.
+    Reads ``base_pose [*B, 7]``, ``object_pose [*B, O, 7]``, any number of
+    ``object_detected [*B, O]`` (an object counts if one of them says so) and, for a
+    centre other than the base, ``joint_pos [*B, J]``. Writes ``signal [*B, 3]`` [m],
+    zero if no sensor detects any object.
 
     Args:
-        in_keys: Keys of the three inputs, in the order above.
+        scale: Divide the position by this [m] (the range, for values below about 1).
+        slots: "nearest" object, or "all": ``signal [*B, 3 O]``, zeros for those that
+            are not detected.
+        yaw_only: Axes that turn with the heading but stay level.
+        centre: Link whose frame the position is given in, with the chain of the
+            robot; None is the base.
+        validity: Append for each slot whether it holds a detected object, 1 or 0.
+        in_keys: Keys of base pose, object pose, detections (one or more) and, with a
+            centre, last, joint positions.
         out_keys: Key of the signal.
+
+    Raises:
+        ValueError: If the link is not in the chain or the scale not positive.
     """
 
     def __init__(
         self,
-        in_keys: Sequence[NestedKey] = ("base_pose", "object_pose", "object_detected"),
+        *,
+        scale: float = 1.0,
+        slots: Literal["nearest", "all"] = "nearest",
+        yaw_only: bool = False,
+        centre: tuple[pk.Chain, str] | None = None,
+        validity: bool = False,
+        in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] = ("signal",),
     ) -> None:
+        if not scale > 0:
+            raise ValueError(f"scale must be positive, got {scale}")
+        if yaw_only and centre is not None:
+            raise ValueError("yaw_only levels the base's axes: give no centre link")
+        if in_keys is None:
+            in_keys = ("base_pose", "object_pose", "object_detected")
+            if centre is not None:
+                in_keys = (*in_keys, "joint_pos")
         super().__init__(in_keys, out_keys)
+        self.scale, self.slots, self.validity = scale, slots, validity
+        self.yaw_only = yaw_only
+        self._centre = None
+        if centre is not None:
+            chain, link = centre
+            self._centre = LinkKinematics(chain, (link,))
 
     def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
-        """Return the signal, ``[B, 3]``."""
-        base_pose, object_pose, detected = inputs
+        """Return the signal, ``[B, 3]``, or more by slots and validity."""
+        base_pose, object_pose, *rest = inputs
+        joint_pos = rest.pop() if self._centre is not None else None
+        detected = torch.stack(rest).any(0)
         offset_w = object_pose[..., :3] - base_pose[:, None, :3]
-        away = offset_w.square().sum(-1).masked_fill(~detected, torch.inf)
-        nearest = away.argmin(-1, keepdim=True)[..., None].expand(-1, -1, 3)
-        position = rotate_inverse(base_pose[:, 3:], offset_w.gather(1, nearest)[:, 0])
-        return (position * detected.any(-1, keepdim=True),)
+        quat = base_pose[:, None, 3:].expand(-1, offset_w.shape[1], -1)
+        position = rotate_inverse(quat, offset_w)
+        away = offset_w.square().sum(-1)
+        if self.yaw_only:
+            position = self._level(base_pose, offset_w)
+        elif self._centre is not None:
+            position = self._in_link(joint_pos, position)
+            away = position.square().sum(-1)
+        if self.slots == "nearest":
+            nearest = away.masked_fill(~detected, torch.inf).argmin(-1, keepdim=True)
+            position = position.gather(1, nearest[..., None].expand(-1, -1, 3))
+            detected = detected.any(-1, keepdim=True)
+        # Not where(): a position of NaN must not turn into a zero.
+        flag = detected.to(position.dtype)
+        signal = (position * flag[..., None] / self.scale).flatten(1)
+        return (torch.cat((signal, flag), -1) if self.validity else signal,)
+
+    def _in_link(self, joint_pos: Tensor | None, position: Tensor) -> Tensor:
+        """Positions in the base frame, taken to the centre link's, ``[B, O, 3]``."""
+        assert self._centre is not None
+        assert joint_pos is not None
+        origin, rotation = self._centre.poses_b(joint_pos)
+        x, y, z = (position - origin).unbind(-1)
+        # p_link = R^T (p - o), written out: the same bits in every batch.
+        columns = rotation.movedim(-1, 0).unbind(0)
+        return torch.stack(
+            [c[..., 0] * x + c[..., 1] * y + c[..., 2] * z for c in columns], -1
+        )
+
+    def _level(self, base_pose: Tensor, offset_w: Tensor) -> Tensor:
+        """Positions in axes that turn with the heading alone, ``[B, O, 3]``."""
+        w, x, y, z = base_pose[:, 3:].unbind(-1)
+        # The heading is the direction of the base's x axis on the ground.
+        c, s = 1 - 2 * (y * y + z * z), 2 * (x * y + w * z)
+        length = (c * c + s * s).sqrt().clamp(min=1e-9)
+        c, s = (c / length)[:, None], (s / length)[:, None]
+        dx, dy, dz = offset_w.unbind(-1)
+        return torch.stack((c * dx + s * dy, c * dy - s * dx, dz), -1)
 
     def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
         """Return the spec of the signal."""
+        slots = spec[self.in_keys[1]].shape[-2] if self.slots == "all" else 1
+        size = slots * (4 if self.validity else 3)
         dtype = spec[self.in_keys[0]].dtype
-        return (Unbounded(shape=torch.Size((*spec.shape, 3)), dtype=dtype),)
+        return (Unbounded(shape=torch.Size((*spec.shape, size)), dtype=dtype),)

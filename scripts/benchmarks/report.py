@@ -31,7 +31,8 @@ def show(text: str) -> None:
 def report(rows: list[Row], path: Path | None) -> None:
     """Print the rows, and write them as JSON where asked."""
     for row in rows:
-        print(f"{row.name:<24} {row.value:12,.0f} {row.unit}  ratio {row.ratio:.3f}")
+        number = f"{row.value:,.0f}" if row.value >= 1000 else f"{row.value:.3g}"
+        print(f"{row.name:<36} {number:>10} {row.unit}  ratio {row.ratio:.3f}")
     if path is not None:
         content = {"rows": [asdict(row) for row in rows]}
         path.write_text(json.dumps(content, indent=2) + "\n")

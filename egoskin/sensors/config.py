@@ -1,0 +1,269 @@
+"""Configuration of a skin and of what its sensors give, and its transforms."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from tensordict import TensorDictBase
+from torchrl.envs import CatTensors, Transform
+
+from egoskin.robots import RobotConfig
+from egoskin.sensors.corruption import Corruption
+from egoskin.sensors.coverage import Field, Ray
+from egoskin.sensors.field import FieldSensor
+from egoskin.sensors.history import HoldLast
+from egoskin.sensors.placement import place_sensors
+from egoskin.sensors.presets import PRESETS
+from egoskin.sensors.ray import RaySensor
+from egoskin.sensors.signals import Binary, Localization, Proximity
+from egoskin.sensors.skin import Skin
+from egoskin.shapes import Shape
+
+# The golden ratio's bits: seeds far apart for sensors of different kinds.
+_GROUP_SEED = 0x9E3779B9
+
+
+@dataclass(frozen=True, kw_only=True)
+class SkinConfig:
+    """Where the sensors sit."""
+
+    path: Path | None = None
+    """Skin file; None places sensors at random on the upper body."""
+    num_sensors: int = 64
+    """Number of sensors to place (ignored with a file)."""
+    seed: int = 0
+    """Seed of the placement (ignored with a file)."""
+    placement: Literal["area_uniform", "poisson_disk"] = "area_uniform"
+    """Independent points or well-spread ones; scripts/skin.py has more to choose."""
+
+    def build(self, robot: RobotConfig) -> Skin:
+        """Return the skin, checked against the robot.
+
+        Raises:
+            ValueError: If the file is no skin of this robot.
+        """
+        if self.path is None:
+            return place_sensors(
+                robot, self.num_sensors, self.seed, method=self.placement
+            )
+        skin = Skin.load(self.path)
+        try:
+            skin.check_links(robot.links)
+        except ValueError as error:
+            raise ValueError(f"skin file {self.path}: {error}") from error
+        return skin
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocalizationConfig:
+    """How the position of a detected ball is given."""
+
+    frame: Literal["base", "yaw", "torso"] = "base"
+    """Axes and origin: the base, level axes at the base, or the torso."""
+    over_range: bool = False
+    """Divide the position by the range."""
+    hold: bool = False
+    """Keep the last position while nothing is detected."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorConfig:
+    """What the sensors of the skin measure, and what the actor is given of it.
+
+    A sensor whose skin file gives it a type or a range of its own keeps them.
+    """
+
+    coverage: Literal["field", "ray", "none"] = "field"
+    """Spherical field, grid of beams, or no sensor at all (a blind robot)."""
+    signal: Literal["localization", "proximity", "closeness", "binary"] = "proximity"
+    """Ball position if any sensor detects it; distance / range; 1 - that; in range?"""
+    range: float = 2.0
+    """Detection range [m], to the ball's surface; "inf" is allowed."""
+    field: Field = dataclasses.field(default_factory=Field)
+    """Field sensors."""
+    ray: Ray = dataclasses.field(default_factory=Ray)
+    """Ray sensors."""
+    reduce: Literal["none", "min"] = "none"
+    """Ray sensors: all beams, or the closest of each sensor's (binary: any beam)."""
+    occlusion: bool = False
+    """Whether the robot's own body hides what lies behind it."""
+    per_object: bool = False
+    """One signal for each ball, instead of that of the nearest."""
+    validity: bool = False
+    """Append to each signal whether it is one, 1 or 0."""
+    corruption: Literal["none", "time_of_flight", "capacitive", "acoustic"] = "none"
+    """Ideal sensors, or a model of real ones (docs/sensor-models.md), of each beam or,
+    reduced, of each sensor's closest."""
+    localization: LocalizationConfig = dataclasses.field(
+        default_factory=LocalizationConfig
+    )
+    """The position of the ball (signal=localization)."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a range that is not positive, or what has no effect."""
+        if not self.range > 0:
+            raise ValueError(f"the sensor range must be positive, got {self.range}")
+        if self.validity and self.signal == "binary":
+            raise ValueError("a binary signal is its own validity: leave validity off")
+        if self.localization.over_range and math.isinf(self.range):
+            raise ValueError("localization.over_range needs a finite range")
+        if self.corruption != "none" and self.signal == "localization":
+            raise ValueError(
+                f"corruption={self.corruption} needs a measured signal: perfect "
+                "localization has no noise"
+            )
+        if self.localization.hold and self.per_object:
+            raise ValueError("localization.hold keeps one position: no per_object")
+        if self.localization != LocalizationConfig() and self.signal != "localization":
+            raise ValueError(
+                f"localization options need signal=localization, not {self.signal}"
+            )
+
+    def filled(self, skin: Skin) -> Skin:
+        """Return a skin whose sensors all have a coverage and a range."""
+        return skin.filled(
+            self.ray if self.coverage == "ray" else self.field, self.range
+        )
+
+    def transforms(
+        self,
+        robot: RobotConfig,
+        skin: Skin,
+        objects: Sequence[Shape],
+        *,
+        dt: float,
+        seed: int = 0,
+        row_offset: int = 0,
+        out_key: str = "signal",
+    ) -> list[Transform]:
+        """Return the transforms that write the signal (none for a blind robot).
+
+        Args:
+            robot: The robot.
+            skin: The sensors.
+            objects: Shapes of what is sensed.
+            dt: Duration of a control step [s].
+            seed: Seed of what real sensors draw.
+            row_offset: Global index of the first row.
+            out_key: Key of the signal.
+        """
+        if self.coverage == "none":
+            return []
+        skin = self.filled(skin)
+        groups = self._groups(skin)
+        transforms: list[Transform] = []
+        detected, signals = [], []
+        for number, (suffix, index) in enumerate(groups.items()):
+            part, key = skin.select(index), f"distance{suffix}"
+            detected.append(f"object_detected{suffix}")
+            transforms.append(self._sensor(robot, part, objects, (key, detected[-1])))
+            if self.signal == "localization":
+                continue
+            if self.corruption != "none":
+                models = PRESETS[self.corruption]()
+                moving = any(model.per_speed > 0 for model in models)
+                transforms.append(
+                    Corruption(
+                        models,
+                        dt=dt,
+                        # Two groups of sensors must not fail alike.
+                        seed=(seed + number * _GROUP_SEED) % 2**32,
+                        row_offset=row_offset,
+                        in_keys=[key, "joint_vel"] if moving else [key],
+                        out_keys=[f"reading{suffix}"],
+                    )
+                )
+                key = f"reading{suffix}"
+            signals.append(f"signal{suffix}" if suffix else out_key)
+            transforms.append(self._signal(part, key, signals[-1]))
+        if self.signal == "localization":
+            transforms += self._localization(robot, detected, out_key)
+        elif len(groups) > 1:
+            transforms.append(CatTensors(signals, out_key, sort=False, del_keys=False))
+        return transforms
+
+    def _groups(self, skin: Skin) -> dict[str, list[int]]:
+        """Return the sensors of each kind, by the suffix of their keys.
+
+        One transform computes one kind; most skins have one, with no suffix.
+        """
+        groups: dict[object, list[int]] = {}
+        for index, own in enumerate(self.filled(skin).coverage):
+            kind = (own.grid, own.sub_beams) if isinstance(own, Ray) else "field"
+            groups.setdefault(kind, []).append(index)
+        if len(groups) == 1:
+            return {"": list(range(len(skin)))}
+        return {f"_{i}": index for i, index in enumerate(groups.values())}
+
+    def detecting(self, skin: Skin, state: TensorDictBase) -> np.ndarray:
+        """Return which sensors detect something in one row, ``[S]`` bool.
+
+        Args:
+            skin: The sensors.
+            state: One row of the environment's output, raw keys kept.
+        """
+        result = np.zeros(len(skin), dtype=bool)
+        if self.coverage != "none":
+            for suffix, index in self._groups(skin).items():
+                distance = state[f"distance{suffix}"].reshape(len(index), -1)
+                result[index] = distance.isfinite().any(-1).numpy()
+        return result
+
+    def _sensor(
+        self,
+        robot: RobotConfig,
+        skin: Skin,
+        objects: Sequence[Shape],
+        out_keys: Sequence[str],
+    ) -> Transform:
+        """Return the coverage of some sensors of one kind."""
+        common: dict[str, Any] = {
+            "body": robot.primitives if self.occlusion else (),
+            "per_object": self.per_object and self.signal != "localization",
+            "out_keys": out_keys,
+        }
+        args = (skin, robot.chain, objects, self.range)
+        if isinstance(skin.coverage[0], Ray):
+            return RaySensor(*args, reduce=self.reduce, **common)
+        return FieldSensor(*args, **common)
+
+    def _signal(self, skin: Skin, in_key: str, out_key: str) -> Transform:
+        """Return the signal of some sensors' readings."""
+        keys: dict[str, Any] = {"in_keys": [in_key], "out_keys": [out_key]}
+        if self.signal == "binary":
+            return Binary(**keys)
+        return Proximity(
+            skin.range.tolist(),
+            closeness=self.signal == "closeness",
+            validity=self.validity,
+            **keys,
+        )
+
+    def _localization(
+        self, robot: RobotConfig, detected: Sequence[str], out_key: str
+    ) -> list[Transform]:
+        """Return the position of what is detected."""
+        options = self.localization
+        in_keys = ["base_pose", "object_pose", *detected]
+        centre = None
+        if options.frame == "torso":
+            centre = (robot.chain, "torso_link")
+            in_keys.append("joint_pos")
+        position = Localization(
+            scale=self.range if options.over_range else 1.0,
+            slots="all" if self.per_object else "nearest",
+            yaw_only=options.frame == "yaw",
+            centre=centre,
+            validity=self.validity,
+            in_keys=in_keys,
+            out_keys=["position" if options.hold else out_key],
+        )
+        if not options.hold:
+            return [position]
+        return [position, HoldLast(["position", *detected], [out_key])]

@@ -1,0 +1,353 @@
+"""Where sensors and objects are relative to each other: what all coverages share.
+
+Kernels work on a structure of arrays with the batch last (``[S, B]``), in the order of
+the skin, and use only +, -, x, / and square roots: a row's result has the same bits
+whatever rows are computed with it, compiled or not. Sines and cosines of the joint
+positions are taken before, uncompiled.
+
+Contract: a reading of infinity means that nothing is in range; NaN in the input gives
+a reading of NaN, never one of nothing.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import pytorch_kinematics as pk
+import torch
+from tensordict import NestedKey
+from torch import Tensor
+from torchrl.data import Binary as BinarySpec
+from torchrl.data import Composite, TensorSpec, Unbounded
+
+from egoskin.kinematics import LinkKinematics, quat_to_matrix
+from egoskin.robots import Primitive
+from egoskin.sensors.coverage import Coverage
+from egoskin.sensors.occlusion import Occluder
+from egoskin.sensors.skin import Skin
+from egoskin.shapes import Shape, Sphere
+from egoskin.transform import RowTransform
+
+# Margin for rounding where rows or pairs are left out [m].
+_SLACK = 1e-3
+
+STATE_KEYS = ("base_pose", "joint_pos", "object_pose", "object_active")
+"""Keys that every proximity sensor reads by default."""
+
+
+class Scene(NamedTuple):
+    """The rows of the world that concern one object."""
+
+    base_pose: Tensor
+    """Pose of the base in the world, ``[B, 7]``."""
+    object_pose: Tensor
+    """Pose of the object in the world, ``[B, 7]``."""
+    sin: Tensor
+    """Sines of the joint positions, ``[J, B]``."""
+    cos: Tensor
+    """Their cosines, ``[J, B]``."""
+    joints: Tensor
+    """Joint positions [rad], ``[J, B]``."""
+
+
+class View(NamedTuple):
+    """One object as the links see it."""
+
+    centre: Tensor
+    """Centre of the object in the link frames [m], ``[3, L, B]``."""
+    turn: Tensor | None
+    """Rotation from the link frames into the object's, ``[3, 3, L, B]``; None for a
+    sphere, which has no orientation."""
+
+
+def stack_frames(frames: list, joints: Tensor) -> tuple[Tensor, Tensor]:
+    """Return link frames as tensors: rotation ``[3, 3, L, B]``, position ``[3, L, B]``.
+
+    Args:
+        frames: What `LinkKinematics.frames_from` returned.
+        joints: Joint positions, ``[J, B]``: they tell batch, dtype and device, also
+            where all frames are constants of the robot.
+    """
+    entries = [e for r, p in frames for e in (*r[0], *r[1], *r[2], *p)]
+    batch = joints.shape[1:]
+    full = [e if isinstance(e, Tensor) else joints.new_full(batch, e) for e in entries]
+    stacked = torch.stack(full).unflatten(0, (len(frames), 12)).transpose(0, 1)
+    return stacked[:9].unflatten(0, (3, 3)), stacked[9:]
+
+
+def product(a: Tensor, b: Tensor) -> Tensor:
+    """Return the matrix product over the first two dimensions, ``[3, 3, *B]``.
+
+    Written out: a library's product may round differently for another batch.
+
+    Args:
+        a: ``[3, 3, *B]``.
+        b: ``[3, 3, *B]``, broadcastable.
+    """
+    return torch.stack(
+        [
+            torch.stack(
+                [a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
+                 for j in range(3)]
+            )
+            for i in range(3)
+        ]
+    )  # fmt: skip
+
+
+class ProximitySensor(RowTransform):
+    """What field and ray sensors share: keys, checks, the loop over objects.
+
+    Args:
+        skin: The sensors; all of the coverage that the subclass computes.
+        chain: Kinematic chain of the robot, rooted at the base.
+        objects: Shape of each object, ``O`` of them.
+        num_readings: Readings of each sensor: ``()`` or ``(K,)``.
+        slant: How much farther than its range each sensor may see, ``[S]``.
+        body: Shapes of the robot that hide what lies behind them; empty for a robot
+            that is transparent to its sensors.
+        per_object: Whether objects are told apart: readings have a last dimension
+            ``O``, instead of those of the nearest object.
+        in_keys: Keys of base pose, joint positions, object poses, active flags.
+        out_keys: Keys of readings and detections.
+
+    Raises:
+        ValueError: If the skin does not fit the chain, or there is no object.
+    """
+
+    _link: Tensor
+    _offset: Tensor
+    _axes: Tensor
+    _range: Tensor
+
+    def __init__(
+        self,
+        skin: Skin,
+        chain: pk.Chain,
+        objects: Sequence[Shape],
+        num_readings: tuple[int, ...],
+        slant: np.ndarray | float,
+        body: Sequence[Primitive],
+        per_object: bool,
+        in_keys: Sequence[NestedKey],
+        out_keys: Sequence[NestedKey],
+    ) -> None:
+        super().__init__(in_keys, out_keys)
+        skin.check_links(chain.get_link_names())
+        if not objects:
+            raise ValueError("a proximity sensor needs at least one object to sense")
+        self.num_sensors, self.objects = len(skin), tuple(objects)
+        self.per_object = per_object
+        self.readings = torch.Size((len(skin), *num_readings))
+        links = tuple(dict.fromkeys(skin.links))
+        self._kinematics = LinkKinematics(chain, links)
+        self._occluder = Occluder(chain, body) if body else None
+
+        def constant(name: str, value: object, dtype: torch.dtype) -> None:
+            self.register_buffer(name, torch.as_tensor(value, dtype=dtype))
+
+        # Constants are float64; they take the dtype of the inputs when used.
+        constant("_link", [links.index(name) for name in skin.links], torch.int64)
+        constant("_offset", skin.position.T[:, :, None], torch.float64)
+        # Columns of the sensor frames in the link frames, [3 (axis), 3, S, 1].
+        constant("_axes", skin.rotation().transpose(2, 1, 0)[..., None], torch.float64)
+        constant("_range", skin.range[:, None], torch.float64)
+        # No object whose centre is farther from the base than this, plus its own
+        # radius, is in range in any pose of the robot [m].
+        reach = np.array(self._kinematics.reach())[self._link.numpy()]
+        reach += np.linalg.norm(skin.position, axis=-1)
+        self._farthest = float((reach + skin.range * slant).max()) + _SLACK
+
+    def view(self, scene: Scene, shape: Shape) -> View:
+        """Return one object as the links see it."""
+        frames = self._kinematics.frames_from(scene.sin, scene.cos, scene.joints)
+        # R^T d, written out: torch's cross product fuses sums, compiled code does not.
+        base = quat_to_matrix(scene.base_pose[:, 3:]).permute(1, 2, 0)
+        x, y, z = (scene.object_pose[:, :3] - scene.base_pose[:, :3]).t()
+        centre = [base[0, i] * x + base[1, i] * y + base[2, i] * z for i in range(3)]
+        seen = []
+        for rotation, position in frames:
+            # q = R^T (c - p)
+            x, y, z = (centre[i] - position[i] for i in range(3))
+            columns = zip(*rotation, strict=True)
+            seen.append(torch.stack([a * x + b * y + c * z for a, b, c in columns]))
+        turn = None
+        if not isinstance(shape, Sphere):
+            thing = quat_to_matrix(scene.object_pose[:, 3:]).permute(1, 2, 0)
+            # Link to base to object: (R_base^T R_object)^T R_link.
+            to_object = product(thing.transpose(0, 1), base)
+            turn = product(to_object[:, :, None], stack_frames(frames, scene.joints)[0])
+        return View(torch.stack(seen, 1), turn)
+
+    def frames_b(
+        self, sin: Tensor, cos: Tensor, joints: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return the sensor frames in the base frame.
+
+        Args:
+            sin: Sines of the joint positions, ``[J, B]``.
+            cos: Their cosines, ``[J, B]``.
+            joints: Joint positions [rad], ``[J, B]``.
+
+        Returns:
+            Position [m] ``[3, S, B]`` and rotation ``[3, 3, S, B]``.
+        """
+        links = stack_frames(self._kinematics.frames_from(sin, cos, joints), joints)
+        turn, position = (x[..., self._link, :] for x in links)
+        axes, o = self._axes.to(turn.dtype).transpose(0, 1), self._offset.to(turn.dtype)
+        # p + R o
+        shift = [row[0] * o[0] + row[1] * o[1] + row[2] * o[2] for row in turn]
+        return position + torch.stack(shift), product(turn, axes)
+
+    def poses_b(self, joint_pos: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the sensors' positions and rotations in the base frame.
+
+        Args:
+            joint_pos: Joint positions [rad], ``[B, J]``.
+
+        Returns:
+            Position [m] ``[B, S, 3]`` and rotation ``[B, S, 3, 3]``, whose columns
+            are the axes of the sensor frames.
+        """
+        position, rotation = self.frames_b(*self._kinematics.trig(joint_pos))
+        return position.permute(2, 1, 0), rotation.permute(3, 2, 0, 1)
+
+    def hide(
+        self,
+        reading: Tensor,
+        scene: Scene,
+        sensor: Tensor,
+        row: Tensor,
+        direction: Tensor,
+        length: Tensor,
+    ) -> Tensor:
+        """Return readings without those of paths that the robot's body blocks.
+
+        Args:
+            reading: Readings of some pairs of sensor and row [m], ``[n, K]``.
+            scene: The rows.
+            sensor: Sensor of each pair, ``[n]``.
+            row: Row of each pair, ``[n]``.
+            direction: Unit directions in the sensors' links, ``[3, n, K]``.
+            length: Lengths of the paths [m], ``[n, K]``.
+
+        Returns:
+            ``[n, K]``, infinite where blocked.
+        """
+        assert self._occluder is not None
+        trig = [x[:, row] for x in (scene.sin, scene.cos, scene.joints)]
+        links = stack_frames(self._kinematics.frames_from(*trig), trig[2])
+        pair = torch.arange(len(row), device=row.device)
+        turn, position = (x[..., self._link[sensor], pair] for x in links)
+        offset = self._offset[:, sensor, 0].to(reading.dtype)
+        # p + R o
+        origin = [
+            p + r[0] * offset[0] + r[1] * offset[1] + r[2] * offset[2]
+            for p, r in zip(position, turn, strict=True)
+        ]
+        way = [
+            r[0, :, None] * direction[0]
+            + r[1, :, None] * direction[1]
+            + r[2, :, None] * direction[2]
+            for r in turn
+        ]
+        sin, cos, joints = trig
+        hidden = self._occluder.blocked(sin, cos, joints, origin, way, length)
+        return torch.where(hidden, torch.inf, reading)
+
+    @abstractmethod
+    def measure(self, scene: Scene, shape: Shape, rows: Tensor, out: Tensor) -> Tensor:
+        """Lower readings to those of one object, and return the least of each row.
+
+        Args:
+            scene: The rows in which the object may be in range, ``n`` of them.
+            shape: The object's shape.
+            rows: Index of each of these rows, ``[n]``.
+            out: Readings of the objects before [m], ``[B, S, ...]``, infinite at
+                first; changed in place.
+
+        Returns:
+            Least reading of this object [m], ``[n]``.
+        """
+
+    def compute(self, *inputs: Tensor, out: Tensor | None = None) -> tuple[Tensor, ...]:
+        """Return (readings ``[B, S, ...]`` [m], detected ``[B, O]``).
+
+        Args:
+            inputs: Base pose, joint positions, object poses, active flags.
+            out: Where to write the readings, contiguous; with ``per_object`` its
+                first dimension is ``O``. A new tensor by default.
+
+        Raises:
+            ValueError: If the number of objects is not that of the sensor.
+        """
+        base_pose, joint_pos, object_pose, active = inputs
+        batch, objects = active.shape
+        if objects != len(self.objects):
+            raise ValueError(
+                f"the sensor was made for {len(self.objects)} objects, "
+                f"{self.in_keys[2]!r} holds {objects}"
+            )
+        if out is None:
+            each = (objects,) if self.per_object else ()
+            out = base_pose.new_empty((*each, batch, *self.readings))
+        out.fill_(torch.inf)
+        detected = torch.zeros_like(active)
+        # NaN anywhere in a row, 0 NaN = NaN, makes all its readings NaN, culled or
+        # not; no comparison discards it.
+        poison = 0.0 * (joint_pos.sum(-1) + base_pose.sum(-1))
+        for i, shape in enumerate(self.objects):
+            pose = object_pose[:, i]
+            pose = pose + (poison + 0.0 * pose.sum(-1))[:, None]
+            away = (pose[:, :3] - base_pose[:, :3]).square().sum(-1)
+            limit = self._farthest + shape.bounding_radius
+            rows = (~(away > limit * limit) & active[:, i]).nonzero()[:, 0]
+            if not len(rows):
+                continue
+            trig = self._kinematics.trig(joint_pos[rows])
+            scene = Scene(base_pose[rows], pose[rows], *trig)
+            least = self.measure(scene, shape, rows, out[i] if self.per_object else out)
+            # A reading of NaN may be anything: the object counts as seen.
+            detected[rows, i] = least != torch.inf
+        return (out.movedim(0, -1) if self.per_object else out), detected
+
+    def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
+        """Return the specs of readings and detections."""
+        batch, objects = spec.shape, len(self.objects)
+        each = (objects,) if self.per_object else ()
+        return (
+            Unbounded(
+                shape=torch.Size((*batch, *self.readings, *each)),
+                dtype=spec[self.in_keys[1]].dtype,
+            ),
+            BinarySpec(shape=torch.Size((*batch, objects)), dtype=torch.bool),
+        )
+
+
+def checked(
+    skin: Skin, coverage: Coverage, max_range: float, kind: type[Coverage]
+) -> tuple[Skin, list]:
+    """Return the skin with nothing left open, and its coverages.
+
+    Args:
+        skin: The sensors.
+        coverage: For sensors without one of their own.
+        max_range: For sensors without a range of their own [m].
+        kind: The coverage that all sensors must have.
+
+    Raises:
+        ValueError: If the range is not positive, or a sensor is of another kind.
+    """
+    if not max_range > 0:
+        raise ValueError(f"max_range must be positive, got {max_range}")
+    skin = skin.filled(coverage, max_range)
+    for index, own in enumerate(skin.coverage):
+        if not isinstance(own, kind):
+            raise ValueError(
+                f"sensor {index} is a {type(own).__name__}, not a {kind.__name__}; "
+                "give this transform the others alone (Skin.select)"
+            )
+    return skin, list(skin.coverage)

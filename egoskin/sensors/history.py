@@ -1,0 +1,119 @@
+"""Memory of observations: the last few of them, or what was seen last."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import NestedKey
+from torch import Tensor
+from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
+
+from egoskin.transform import StatefulTransform
+
+
+class History(StatefulTransform):
+    """The latest values of some entries side by side, oldest first.
+
+    Reads any entries ``[*B, ..., F]`` and writes ``[*B, ..., length F]`` for each. An
+    episode starts with its first value throughout.
+
+    Args:
+        length: How many values, the present one included.
+        in_keys: Keys of the entries.
+        out_keys: Keys of their histories, in the same order.
+
+    Raises:
+        ValueError: If the length is less than 1 or the keys do not pair up.
+    """
+
+    def __init__(
+        self,
+        length: int,
+        in_keys: Sequence[NestedKey] = ("signal",),
+        out_keys: Sequence[NestedKey] = ("signal_history",),
+    ) -> None:
+        if length < 1:
+            raise ValueError(f"length must be at least 1, got {length}")
+        if len(in_keys) != len(out_keys):
+            raise ValueError(
+                f"one out key for each in key, got {list(in_keys)} and {list(out_keys)}"
+            )
+        super().__init__(in_keys, out_keys, state_keys=out_keys)
+        self.length = length
+
+    def start(
+        self,
+        rows: Tensor,
+        inputs: Sequence[Tensor],
+        before: Sequence[Tensor] | None,
+    ) -> list[Tensor]:
+        """Return the first values, repeated."""
+        return [torch.cat([x] * self.length, -1) for x in inputs]
+
+    def advance(
+        self, rows: Tensor, inputs: Sequence[Tensor], state: Sequence[Tensor]
+    ) -> list[Tensor]:
+        """Return the histories without their oldest value and with the present one."""
+        return [
+            torch.cat((past[..., x.shape[-1] :], x), -1)
+            for past, x in zip(state, inputs, strict=True)
+        ]
+
+    def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
+        """Return the specs of the histories, bounded where their entries are."""
+        specs = []
+        for key in self.in_keys:
+            one = spec[key]
+            shape = torch.Size((*one.shape[:-1], self.length * one.shape[-1]))
+            if isinstance(one, Bounded):
+                assert one.space is not None
+                low, high = (
+                    torch.cat([bound.expand(one.shape)] * self.length, -1)
+                    for bound in (one.space.low, one.space.high)
+                )
+                specs.append(Bounded(low, high, shape=shape, dtype=one.dtype))
+            else:
+                specs.append(Unbounded(shape=shape, dtype=one.dtype))
+        return specs
+
+
+class HoldLast(StatefulTransform):
+    """What was seen last: the signal while anything is detected, then its last value.
+
+    Reads ``signal [*B, F]`` (of `Localization`, for example) and ``object_detected
+    [*B, O]``; writes ``last_signal [*B, F]``, zero until something is detected in the
+    episode.
+
+    Args:
+        in_keys: Keys of the signal and of the detections.
+        out_keys: Key of the signal seen last.
+    """
+
+    def __init__(
+        self,
+        in_keys: Sequence[NestedKey] = ("signal", "object_detected"),
+        out_keys: Sequence[NestedKey] = ("last_signal",),
+    ) -> None:
+        super().__init__(in_keys, out_keys, state_keys=out_keys)
+
+    def start(
+        self,
+        rows: Tensor,
+        inputs: Sequence[Tensor],
+        before: Sequence[Tensor] | None,
+    ) -> list[Tensor]:
+        """Return the signal where anything is detected, zero elsewhere."""
+        return self.advance(rows, inputs, [torch.zeros_like(inputs[0])])
+
+    def advance(
+        self, rows: Tensor, inputs: Sequence[Tensor], state: Sequence[Tensor]
+    ) -> list[Tensor]:
+        """Return the signal where anything is detected, its last value elsewhere."""
+        signal, detected = inputs
+        return [torch.where(detected.any(-1, keepdim=True), signal, state[0])]
+
+    def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
+        """Return the spec of the signal seen last."""
+        one = spec[self.in_keys[0]]
+        return [Unbounded(shape=one.shape, dtype=one.dtype)]

@@ -1,0 +1,217 @@
+"""Ray sensors: grids of thin beams, the distance to the first hit of each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Literal
+
+import pytorch_kinematics as pk
+import torch
+from tensordict import NestedKey
+from torch import Tensor
+
+from egoskin.compilation import compiled
+from egoskin.robots import Primitive
+from egoskin.sensors.coverage import Ray
+from egoskin.sensors.geometry import (
+    STATE_KEYS,
+    ProximitySensor,
+    Scene,
+    View,
+    checked,
+    product,
+)
+from egoskin.sensors.skin import Skin
+from egoskin.shapes import Shape, first_hit
+
+# Pairs of sensor and agent are culled with this margin for rounding [m].
+_SLACK = 1e-4
+# Pairs worked on at a time: temporaries then stay in the cache.
+_CHUNK = 2**17
+
+
+class RaySensor(ProximitySensor):
+    """Distance along each beam of each sensor to the closest active object in range.
+
+    Reads ``base_pose [*B, 7]``, ``joint_pos [*B, J]``, ``object_pose [*B, O, 7]`` and
+    ``object_active [*B, O]``. Writes ``distance [*B, S, K]`` [m] (with ``reduce``
+    ``[*B, S]``), infinite where nothing is hit in range and NaN where the input is,
+    and ``object_detected [*B, O]``, whether any beam hits the object. A sensor inside
+    an object reads 0 on every beam. Distances are those of the state given.
+
+    Only pairs of sensor and object whose bounding sphere reaches into the field of
+    view are computed: a few per cent. The result is that of computing all.
+
+    Args:
+        skin: The sensors. Their own coverage and range come first; all must have the
+            same number of beams.
+        chain: Kinematic chain of the robot, rooted at the base.
+        objects: Shape of each object, ``O`` of them.
+        max_range: A distance is detected if it is at most this [m]; may be infinite.
+        coverage: What a sensor sees.
+        reduce: "min" writes the minimum over each sensor's beams, without the grid.
+        body: The robot's shapes, to hide what lies behind them; empty: transparent.
+        per_object: Objects told apart in a last dimension ``O``.
+        cull: Skip pairs that cannot hit; results are the same.
+        compile: Compile the kernels; results are the same.
+        in_keys: Keys of the four inputs, in the order above.
+        out_keys: Keys of the two outputs, in the order above.
+
+    Raises:
+        ValueError: If the range is not positive, the skin does not fit the chain,
+            holds a sensor that is no ray sensor, or sensors of different beams.
+    """
+
+    _beams: Tensor
+    _beam_of: Tensor
+    _depth: Tensor | None
+    _cone: Tensor
+    _reach: Tensor
+
+    def __init__(
+        self,
+        skin: Skin,
+        chain: pk.Chain,
+        objects: Sequence[Shape],
+        max_range: float,
+        coverage: Ray | None = None,
+        *,
+        reduce: Literal["none", "min"] = "none",
+        body: Sequence[Primitive] = (),
+        per_object: bool = False,
+        cull: bool = True,
+        compile: bool = False,
+        in_keys: Sequence[NestedKey] = STATE_KEYS,
+        out_keys: Sequence[NestedKey] = ("distance", "object_detected"),
+    ) -> None:
+        skin, rays = checked(skin, coverage or Ray(), max_range, Ray)
+        kinds = list(dict.fromkeys(rays))
+        directions = [torch.from_numpy(kind.directions()) for kind in kinds]
+        if len({d.shape for d in directions}) > 1:
+            raise ValueError(
+                "the sensors of one RaySensor must have the same number of beams; got "
+                f"grids {', '.join(str(kind.grid) for kind in kinds)}"
+            )
+        self._num_beams, self._sub_beams = directions[0].shape[:2]
+        self.reduce, self._cull = reduce, cull
+        # [3, U, K M] for U different coverages, and which of them each sensor has.
+        beams = torch.stack(directions).flatten(1, 2).movedim(-1, 0)
+        beam_of = torch.tensor([kinds.index(r) for r in rays])
+        # Half angle of the cone about each sensor's beams.
+        cos_h = beams[2].amin(-1)[beam_of]
+        depth = torch.tensor([r.measure == "depth" for r in rays])
+        # A depth within the range may lie farther along a slanted beam.
+        slant = torch.where(depth, 1 / cos_h, 1.0)
+        super().__init__(
+            skin,
+            chain,
+            objects,
+            () if reduce == "min" else (self._num_beams,),
+            slant.numpy(),
+            body,
+            per_object,
+            in_keys,
+            out_keys,
+        )
+        self.register_buffer("_beams", beams)
+        self.register_buffer("_beam_of", beam_of)
+        self.register_buffer("_depth", depth if depth.any() else None)
+        cone = torch.stack((cos_h, (1 - cos_h**2).sqrt()))[..., None]
+        self.register_buffer("_cone", cone)
+        self.register_buffer("_reach", self._range * slant[:, None])
+        self._margin_kernel: Callable[..., tuple[Tensor, View]] = self.margins
+        self._kernel: Callable[..., tuple[Tensor, Tensor]] = self.read
+        if compile:
+            self._margin_kernel = compiled(self.margins)
+            self._kernel = compiled(self.read, dynamic=True)
+        # Temporaries of an uncompiled kernel should stay in the cache.
+        self._chunk = 2**31 if compile else max(1, _CHUNK // self._beams.shape[-1])
+
+    def margins(self, scene: Scene, shape: Shape) -> tuple[Tensor, View]:
+        """Return by how much each sensor may see the object, and the link's view.
+
+        Returns:
+            Margin [m] ``[S, B]``, 0 only where no beam can hit in range.
+        """
+        view = self.view(scene, shape)
+        x, y, z = self._in_sensor(
+            view.centre[:, self._link] - self._offset.to(view.centre.dtype),
+            self._axes.to(view.centre.dtype),
+        )
+        cos_h, sin_h = self._cone.to(x)
+        bound, flat = shape.bounding_radius, x * x + y * y
+        # Outside the range, beside the cone of the beams, or behind the sensor:
+        # R + r - |c|, r - (rho cos h - z sin h), z + r.
+        far = self._reach.to(x) + bound - (flat + z * z).sqrt()
+        beside = bound - (flat.sqrt() * cos_h - z * sin_h)
+        margin = torch.minimum(torch.minimum(far, beside), z + bound)
+        return (margin + _SLACK).clamp(min=0.0), view
+
+    @staticmethod
+    def _in_sensor(v: Tensor, axes: Tensor) -> list[Tensor]:
+        """Coordinates along the axes of the sensor frames."""
+        return [a[0] * v[0] + a[1] * v[1] + a[2] * v[2] for a in axes]
+
+    def read(
+        self, scene: Scene, view: View, sensor: Tensor, row: Tensor, shape: Shape
+    ) -> tuple[Tensor, Tensor]:
+        """Return what some pairs of sensor and row measure of one object.
+
+        Args:
+            scene: The rows.
+            view: The object as the links see it.
+            sensor: Sensor of each pair, ``[n]``.
+            row: Row of each pair, ``[n]``.
+            shape: The object's shape.
+
+        Returns:
+            Readings [m], ``[n, K]`` or reduced ``[n]``, and the least of each pair,
+            ``[n]``.
+        """
+        dtype, link = view.centre.dtype, self._link[sensor]
+        axes = self._axes.to(dtype)[:, :, sensor, 0]
+        offset = self._offset.to(dtype)[:, sensor, 0]
+        centre = self._in_sensor(view.centre[:, link, row] - offset, axes)
+        beams = self._beams.to(dtype)
+        if beams.shape[1] > 1:
+            beams = beams[:, self._beam_of[sensor]]
+        origin, way = [-c[:, None] for c in centre], list(beams)
+        if view.turn is not None:
+            # Sensor to object: M R, the columns of R being the sensor's axes.
+            turn = product(view.turn[:, :, link, row], axes.transpose(0, 1))[..., None]
+            x, y, z = origin
+            origin = [r[0] * x + r[1] * y + r[2] * z for r in turn]
+            way = [r[0] * beams[0] + r[1] * beams[1] + r[2] * beams[2] for r in turn]
+        distance = first_hit(*shape.ray_interval(*origin, *way))
+        if self._occluder is not None:
+            x, y, z = axes[..., None]
+            way = x * beams[0] + y * beams[1] + z * beams[2]
+            distance = self.hide(distance, scene, sensor, row, way, distance)
+        if self._depth is not None:
+            slanted = self._depth[sensor][:, None]
+            distance = torch.where(slanted, distance * beams[2], distance)
+        # Written so that NaN stays NaN.
+        gone = distance > self._range.to(dtype)[sensor]
+        distance = torch.where(gone, torch.inf, distance)
+        if self._sub_beams > 1:
+            distance = distance.unflatten(-1, (-1, self._sub_beams)).amin(-1)
+        least = distance.amin(-1)
+        return (least if self.reduce == "min" else distance), least
+
+    def measure(self, scene: Scene, shape: Shape, rows: Tensor, out: Tensor) -> Tensor:
+        """Lower readings to those of one object, and return the least of each row."""
+        margin, view = self._margin_kernel(scene, shape)
+        if not self._cull:
+            margin = torch.ones_like(margin)
+        num_sensors, num_rows = margin.shape
+        least = margin.new_full((num_rows,), torch.inf)
+        # A view, or an error: a copy would lose what is written.
+        flat = out.view(-1, *out.shape[2:])
+        # Whatever is not 0 may be hit, NaN too.
+        for pairs in margin.view(-1).nonzero()[:, 0].split(self._chunk):
+            sensor, row = pairs // num_rows, pairs % num_rows
+            reading, nearest = self._kernel(scene, view, sensor, row, shape)
+            target = rows[row] * num_sensors + sensor
+            flat[target] = torch.minimum(flat[target], reading)
+            least.scatter_reduce_(0, row, nearest, "amin")
+        return least

@@ -1,0 +1,273 @@
+"""Touch: which links are in contact, and what other tasks make of it.
+
+Everything counts contact per link, ``[*B, L]``; which of the ``L`` links matter is
+told by shell patterns of their names. For a walking task the feet are left out::
+
+    body = [name for name in robot.links if name not in robot.feet]
+    ContactTermination(robot.links, body)
+
+Rewards and ends are TorchRL's own, so `ContactPenalty` and `ContactTermination` write
+the keys they read, as `torchrl.envs.RewardScaling` does.
+"""
+
+from __future__ import annotations
+
+import difflib
+import fnmatch
+from collections.abc import Mapping, Sequence
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary as BinarySpec
+from torchrl.data import Composite, TensorSpec, Unbounded
+from torchrl.envs import Transform
+
+from egoskin.transform import RowTransform, StatefulTransform
+
+
+def _matching(links: Sequence[str], patterns: Sequence[str]) -> Tensor:
+    """Return which links match any of the patterns, ``[L]`` bool.
+
+    Raises:
+        ValueError: If a pattern matches no link.
+    """
+    for pattern in patterns:
+        if not fnmatch.filter(links, pattern):
+            close = difflib.get_close_matches(pattern, links, n=1)
+            hint = f"; did you mean {close[0]!r}?" if close else ""
+            raise ValueError(
+                f"{pattern!r} matches no link{hint} The links are {', '.join(links)}"
+            )
+    return torch.tensor(
+        [any(fnmatch.fnmatchcase(name, p) for p in patterns) for name in links],
+        dtype=torch.bool,
+    )
+
+
+class Tactile(RowTransform):
+    """Whether each link is touched: its contact force is above a threshold.
+
+    Reads ``contact_force [*B, L, n]`` [N]; writes ``tactile [*B, L]`` bool. The last
+    three components are the force, so that MuJoCo's ``cfrc_ext`` (torque, then force)
+    is read as it is. A force that is not a number counts as contact.
+
+    Args:
+        threshold: A link is touched if its force is larger than this [N].
+        in_keys: Key of the forces.
+        out_keys: Key of the contacts.
+
+    Raises:
+        ValueError: If the threshold is negative or no number.
+    """
+
+    def __init__(
+        self,
+        threshold: float,
+        in_keys: Sequence[NestedKey] = ("contact_force",),
+        out_keys: Sequence[NestedKey] = ("tactile",),
+    ) -> None:
+        super().__init__(in_keys, out_keys)
+        if not threshold >= 0:
+            raise ValueError(f"threshold must not be negative, got {threshold}")
+        self.threshold = float(threshold)
+
+    def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """Return the contacts, ``[B, L]`` bool."""
+        (force,) = inputs
+        # Not `>`, which is false for NaN: a broken simulation must not read as free.
+        return (~(force[..., -3:].norm(dim=-1) <= self.threshold),)
+
+    def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
+        """Return the spec of the contacts."""
+        shape = spec[self.in_keys[0]].shape[:-1]
+        return (BinarySpec(shape=shape, dtype=torch.bool),)
+
+
+class ContactPenalty(Transform):
+    """Lowers the reward by a price for each link that touches something.
+
+    Reads ``tactile [*B, L]`` and ``reward [*B, 1]``; writes ``reward``.
+
+    Args:
+        links: Names of the links, in the order of ``tactile``.
+        prices: What a step of contact costs, by link name pattern; each pattern
+            counts for every link that it matches, and a link that none does is free.
+        in_keys: Keys of the two inputs, in the order above.
+        out_keys: Key of the reward.
+
+    Raises:
+        ValueError: If a pattern matches no link.
+    """
+
+    _prices: Tensor
+
+    def __init__(
+        self,
+        links: Sequence[str],
+        prices: Mapping[str, float],
+        in_keys: Sequence[NestedKey] = ("tactile", "reward"),
+        out_keys: Sequence[NestedKey] = ("reward",),
+    ) -> None:
+        super().__init__(in_keys=list(in_keys), out_keys=list(out_keys))
+        parts = [price * _matching(links, [p]) for p, price in prices.items()]
+        self.register_buffer("_prices", torch.stack(parts).sum(0))
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        tactile, reward = (next_tensordict[key] for key in self.in_keys)
+        cost = tactile.to(reward.dtype) @ self._prices.to(reward.dtype)
+        return next_tensordict.set(self.out_keys[0], reward - cost[..., None])
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the reward of any tensordict that holds the in keys."""
+        return self._call(tensordict)
+
+    def transform_reward_spec(self, reward_spec: TensorSpec) -> TensorSpec:
+        """Return the spec with a reward that is not bounded."""
+        assert isinstance(reward_spec, Composite)
+        old = reward_spec[self.in_keys[1]]
+        reward_spec[self.out_keys[0]] = Unbounded(
+            shape=old.shape, dtype=old.dtype, device=old.device
+        )
+        return reward_spec
+
+
+class ContactTermination(Transform):
+    """Ends the episode when a link touches something.
+
+    Reads ``tactile [*B, L]``, ``terminated [*B, 1]`` and ``done [*B, 1]``; writes
+    ``terminated`` and ``done``. ``truncated`` stays as it is. A contact in the state
+    after a reset does not end the episode.
+
+    Args:
+        links: Names of the links, in the order of ``tactile``.
+        counted: Name patterns of the links whose contact ends the episode.
+        in_keys: Keys of the three inputs, in the order above.
+        out_keys: Keys of the two outputs, in the order above.
+
+    Raises:
+        ValueError: If a pattern matches no link.
+    """
+
+    _counted: Tensor
+
+    def __init__(
+        self,
+        links: Sequence[str],
+        counted: Sequence[str] = ("*",),
+        in_keys: Sequence[NestedKey] = ("tactile", "terminated", "done"),
+        out_keys: Sequence[NestedKey] = ("terminated", "done"),
+    ) -> None:
+        super().__init__(in_keys=list(in_keys), out_keys=list(out_keys))
+        self.register_buffer("_counted", _matching(links, counted))
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        tactile, *ends = (next_tensordict[key] for key in self.in_keys)
+        touched = torch.any(tactile & self._counted, -1, keepdim=True)
+        for key, end in zip(self.out_keys, ends, strict=True):
+            next_tensordict.set(key, end | touched)
+        return next_tensordict
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the ends of any tensordict that holds the in keys."""
+        return self._call(tensordict)
+
+
+class ContactFree(StatefulTransform):
+    """Whether the trajectory has been free of contact so far.
+
+    Reads ``tactile [*B, L]``; writes ``contact_free [*B, 1]`` bool, which is its
+    state. At the last step of a trajectory it is the label that `contact_free` gives
+    to the whole of it.
+
+    Args:
+        links: Names of the links, in the order of ``tactile``.
+        counted: Name patterns of the links whose contact counts.
+        in_keys: Key of the contacts.
+        out_keys: Key of the label.
+
+    Raises:
+        ValueError: If a pattern matches no link.
+    """
+
+    _counted: Tensor
+
+    def __init__(
+        self,
+        links: Sequence[str],
+        counted: Sequence[str] = ("*",),
+        in_keys: Sequence[NestedKey] = ("tactile",),
+        out_keys: Sequence[NestedKey] = ("contact_free",),
+    ) -> None:
+        super().__init__(in_keys, out_keys, state_keys=out_keys)
+        self.register_buffer("_counted", _matching(links, counted))
+
+    def start(
+        self,
+        rows: Tensor,
+        inputs: Sequence[Tensor],
+        before: Sequence[Tensor] | None,
+    ) -> Sequence[Tensor]:
+        """Return whether the first state is free of contact, ``[B, 1]``."""
+        (tactile,) = inputs
+        return (~(tactile & self._counted).any(-1, keepdim=True),)
+
+    def advance(
+        self, rows: Tensor, inputs: Sequence[Tensor], state: Sequence[Tensor]
+    ) -> Sequence[Tensor]:
+        """Return whether it still is, ``[B, 1]``."""
+        (now,) = self.start(rows, inputs, None)
+        return (state[0] & now,)
+
+    def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
+        """Return the spec of the label."""
+        return (BinarySpec(shape=torch.Size((*spec.shape, 1)), dtype=torch.bool),)
+
+
+def _trajectory(done: Tensor) -> Tensor:
+    """Return the number of each step's trajectory: the ends before it."""
+    return done.long().cumsum(-2) - done.long()
+
+
+def contact_free(tactile: Tensor, done: Tensor) -> Tensor:
+    """Return whether the whole trajectory that a step belongs to is free of contact.
+
+    Args:
+        tactile: Contacts after each step, ``[*B, T, L]`` bool; give only the links
+            that count (without feet: ``tactile[..., body]``).
+        done: Whether the step was the last of its trajectory, ``[*B, T, 1]`` bool. A
+            last trajectory without an end counts by the steps that it has.
+
+    Returns:
+        One label for each step, ``[*B, T, 1]`` bool.
+    """
+    trajectory = _trajectory(done)
+    touched = tactile.any(-1, keepdim=True).long()
+    contacts = torch.zeros_like(trajectory).scatter_add_(-2, trajectory, touched)
+    return contacts.gather(-2, trajectory) == 0
+
+
+def split_by_contact(
+    data: TensorDictBase, tactile: Tensor, done: Tensor
+) -> tuple[list[TensorDictBase], list[TensorDictBase]]:
+    """Return the contact-free trajectories of stored steps, and the others.
+
+    Args:
+        data: Steps ``[*B, T]``.
+        tactile: As for `contact_free`.
+        done: As for `contact_free`.
+
+    Returns:
+        Two lists of trajectories, a tensordict ``[T_i]`` each, in the order of the
+        data; views of it where that is contiguous.
+    """
+    flat = data.reshape(-1)
+    number = _trajectory(done).reshape(-1, data.shape[-1])
+    # A row of T steps holds at most T trajectories: no number comes twice.
+    row = torch.arange(len(number), device=number.device)
+    number = number + data.shape[-1] * row[:, None]
+    _, lengths = number.reshape(-1).unique_consecutive(return_counts=True)
+    # A trajectory has one label: that of its last step.
+    free = contact_free(tactile, done).reshape(-1)[lengths.cumsum(0) - 1]
+    pieces = list(zip(flat.split(lengths.tolist()), free.tolist(), strict=True))
+    return [p for p, ok in pieces if ok], [p for p, ok in pieces if not ok]

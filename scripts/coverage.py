@@ -1,0 +1,253 @@
+"""Show what a skin sees, before any training: a picture, a table and JSON.
+
+python scripts/coverage.py --out coverage.png --json coverage.json
+python scripts/coverage.py --skin.path skin.json --coverages field ray --ranges 0.5 1
+
+A robot stands still in its default pose. Balls come straight at its base from all
+directions, straight at every part of its surface, and as the task throws them. A ball
+is seen from the first moment at which any sensor detects it. Cells (a coverage at a
+range) that see alike leave a policy the same time to act: in an ablation only their
+signals can set them apart.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import tyro
+
+try:
+    import matplotlib
+
+    matplotlib.use("Agg")  # no display is needed
+    from matplotlib import pyplot as plt
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+except ImportError:
+    print(
+        "error: the picture needs matplotlib: `pip install 'egoskin[plot]'`",
+        file=sys.stderr,
+    )
+    raise SystemExit(2) from None
+
+from egoskin.analysis import Analysis, analyse
+from egoskin.cli import clear_errors, to_plain
+from egoskin.envs.physics import PhysicsConfig
+from egoskin.envs.throws import ThrowConfig
+from egoskin.robots import ROBOTS
+from egoskin.sensors import Field, Ray
+from egoskin.sensors.config import SkinConfig
+
+# Cells whose warning differs for fewer hits than this see alike.
+ALIKE = 0.05
+BLIND, NOWHERE = "#c1272d", "#e6e6e6"
+
+
+@dataclass(frozen=True, kw_only=True)
+class CoverageConfig:
+    """Show what a skin sees, before any training: a picture, a table and JSON."""
+
+    robot: Literal["h1_2"] = "h1_2"
+    """Robot by name."""
+    skin: SkinConfig = dataclasses.field(default_factory=SkinConfig)
+    """Where the sensors sit; what a sensor's file says of its type and range holds."""
+    coverages: Annotated[
+        tuple[Literal["field", "ray"], ...], tyro.conf.arg(metavar="{field,ray} ...")
+    ] = ("field", "ray")
+    """Coverages compared."""
+    ranges: tuple[float, ...] = (0.2, 0.5, 1.0, 2.0)
+    """Ranges compared [m]."""
+    field: Field = dataclasses.field(default_factory=Field)
+    """Field sensors."""
+    ray: Ray = dataclasses.field(default_factory=Ray)
+    """Ray sensors."""
+    throws: ThrowConfig = dataclasses.field(default_factory=ThrowConfig)
+    """The balls and how they are thrown."""
+    num_throws: int = 2000
+    """Throws followed."""
+    seed: int = 0
+    """Seed of the throws and of the points on the surface."""
+    out: Path = Path("coverage.png")
+    """Picture to write."""
+    json: Path = Path("coverage.json")
+    """All figures, to write."""
+
+
+def show_progress(what: str, share: float) -> None:
+    """Show what is in work, on a terminal."""
+    if sys.stdout.isatty():
+        # The line is wiped when it is done.
+        text = f"{what} {share:.0%}" if share < 1 else ""
+        print(f"\r{text}\x1b[K", end="", flush=True)
+
+
+def print_table(analysis: Analysis, report: dict[str, Any]) -> None:
+    """Print a line for each cell, and which cells see alike."""
+    print(
+        f"{report['hits']} of {report['throws']} throws hit the standing robot\n"
+        f"{'directions':>25}{'blind':>8}{'surface':>9}{'hits':>8}{'warning [ms]':>16}"
+        f"{'sensors':>11}\n"
+        f"{'cell':15}{'seen':>10}{'cone':>8}{'blind':>9}{'seen':>8}"
+        f"{'5 %':>6}{'50 %':>6}{'95 %':>6}{'at once':>9}"
+    )
+    for cell, row in zip(analysis.cells, report["cells"], strict=True):
+        warning = row["warning"]
+        shares = [row["directions_seen"], row["surface_blind"], warning.get("seen")]
+        seen, blind, hits = ("-" if x is None else f"{x:.1%}" for x in shares)
+        cone = f"{row['widest_blind_cone_deg']['half_angle']:.0f} deg"
+        times = "".join(
+            f"{1e3 * warning[key]:6.0f}" if warning["hits"] else "     -"
+            for key in ("5%", "median", "95%")
+        )
+        at_once = row["sensors_at_once"]["median"] or 0
+        print(
+            f"{cell!s:15s}{seen:>10}{cone:>8}{blind:>9}{hits:>8}{times}{at_once:9.0f}"
+        )
+    if report["differing_share"] is None:
+        return
+    for a, one in enumerate(analysis.cells):
+        for b, other in enumerate(analysis.cells[:a]):
+            share = report["differing_share"][a][b]
+            if share < ALIKE:
+                print(
+                    f"{other} and {one} see alike: {share:.1%} of the warnings "
+                    "differ by more than a control step"
+                )
+
+
+def draw_map(axes: Axes, analysis: Analysis, cell: int, seen: float | None) -> Any:
+    """Draw the world map of a cell; return its image, for the colour bar."""
+    colours = plt.get_cmap("viridis").with_extremes(bad=NOWHERE, under=BLIND)
+    # Just under 0 where nothing is seen before the contact.
+    share = analysis.clearance_map(cell) / analysis.cells[cell].range
+    share = np.where(share <= 0, -1.0, share)
+    image = axes.imshow(
+        share,
+        origin="lower",
+        extent=(-180, 180, -90, 90),
+        cmap=colours,
+        vmin=0,
+        vmax=1,
+        interpolation="nearest",
+    )
+    # As the robot sees it: its left on the left.
+    axes.set_xlim(180, -180)
+    axes.set_xticks([180, 90, 0, -90, -180], ["back", "left", "front", "right", "back"])
+    axes.set_yticks([-90, -45, 0, 45, 90])
+    axes.axhline(0, color="white", linewidth=0.5, alpha=0.6)
+    axes.axvline(0, color="white", linewidth=0.5, alpha=0.6)
+    axes.tick_params(labelsize=7, length=2)
+    text = "no path" if seen is None else f"{seen:.1%} of directions seen"
+    axes.set_title(f"{analysis.cells[cell]}: {text}", fontsize=9)
+    axes.set_ylabel("elevation [deg]", fontsize=7)
+    return image
+
+
+def draw_warnings(axes: Axes, analysis: Analysis, ranges: int) -> None:
+    """Draw the share of hits with at least some warning."""
+    palette = plt.get_cmap("plasma")(np.linspace(0.0, 0.8, ranges))
+    for cell, warning in enumerate(analysis.warning.numpy()):
+        time = np.append(0.0, np.sort(warning))
+        share = np.linspace(1.0, 0.0, len(time))
+        style = ("-", "--", ":")[cell // ranges % 3]
+        label = str(analysis.cells[cell])
+        axes.step(1e3 * time, share, style, color=palette[cell % ranges], label=label)
+    period = 1e3 * analysis.control_period
+    axes.axvline(period, color="grey", linewidth=0.8)
+    axes.text(period, 1.03, " 1 control step", fontsize=7, color="grey")
+    axes.set(xlabel="warning before contact [ms]", ylabel="share of hits with at least")
+    axes.set_xlim(left=0)
+    axes.set_ylim(0, 1.1)
+    axes.legend(fontsize=7, frameon=False, loc="upper right")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.set_title("Warning of thrown balls", fontsize=10)
+
+
+def draw_table(
+    axes: Axes, values: np.ndarray, rows: list[str], columns: list[str], title: str
+) -> None:
+    """Draw shares as a coloured table; NaN stays grey."""
+    colours = plt.get_cmap("Reds").with_extremes(bad=NOWHERE)
+    axes.imshow(values, cmap=colours, vmin=0, vmax=1, aspect="auto")
+    for (i, j), value in np.ndenumerate(values):
+        if np.isfinite(value):
+            colour = "white" if value > 0.6 else "black"
+            text = f"{100 * value:.0f}"
+            axes.text(j, i, text, ha="center", va="center", fontsize=6, color=colour)
+    axes.set_xticks(range(len(columns)), columns, rotation=45, ha="right", fontsize=7)
+    axes.set_yticks(range(len(rows)), rows, fontsize=6.5)
+    axes.tick_params(length=0)
+    axes.set_title(title, fontsize=10)
+
+
+def draw(analysis: Analysis, report: dict[str, Any], title: str) -> Figure:
+    """Return the picture: maps above, warnings and tables below."""
+    names = list(dict.fromkeys(c.coverage for c in analysis.cells))
+    ranges = len(analysis.cells) // len(names)
+    figure = plt.figure(figsize=(16, 2.4 * len(names) + 5.6), layout="constrained")
+    figure.suptitle(title, fontsize=12)
+    heights = [2.2 * len(names), 5.0]
+    above, below = figure.subfigures(2, 1, height_ratios=heights, squeeze=False).flat
+    maps = above.subplots(len(names), ranges, squeeze=False)
+    images = [
+        draw_map(axes, analysis, cell, report["cells"][cell]["directions_seen"])
+        for cell, axes in enumerate(maps.flat)
+    ]
+    bar = above.colorbar(images[0], ax=maps, extend="min", shrink=0.9, pad=0.01)
+    bar.set_label(
+        "clearance when first seen / range\n(red: never; grey: no path)", size=8
+    )
+
+    left, middle, right = below.subplots(1, 3, width_ratios=[1.3, 1.2, 1.0])
+    draw_warnings(left, analysis, ranges)
+    cells = [str(cell) for cell in analysis.cells]
+    by_link = [row["surface_blind_by_link"] for row in report["cells"]]
+    links = [name for name in by_link[0] if by_link[0][name] is not None]
+    blind = np.array([[row[name] for row in by_link] for name in links], dtype=float)
+    text = "Surface that a ball reaches unseen [%]"
+    draw_table(middle, blind, links, cells, text)
+    differs = analysis.differing_share()
+    text = "Hits whose warning differs by > 1 control step [%]"
+    draw_table(right, differs, cells, cells, text)
+    return figure
+
+
+def main(args: list[str]) -> None:
+    """Run the command."""
+    config = tyro.cli(CoverageConfig, args=args, description=__doc__)
+    robot = ROBOTS[config.robot]
+    skin = config.skin.build(robot)
+    physics = PhysicsConfig()
+    coverages = {"field": config.field, "ray": config.ray}
+    analysis = analyse(
+        robot,
+        skin,
+        {name: coverages[name] for name in config.coverages},
+        sorted(config.ranges),
+        config.throws,
+        num_throws=config.num_throws,
+        seed=config.seed,
+        timestep=physics.timestep,
+        control_period=1 / physics.control_hz,
+        progress=show_progress,
+    )
+    report = analysis.report()
+    print_table(analysis, report)
+    content = {"config": to_plain(config), "sensors": len(skin), **report}
+    config.json.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+    title = f"What {len(skin)} sensors on {robot.name} see"
+    figure = draw(analysis, report, title)
+    figure.savefig(config.out, dpi=110)
+    plt.close(figure)
+    print(f"picture {config.out}, figures {config.json}")
+
+
+if __name__ == "__main__":
+    with clear_errors():
+        main(sys.argv[1:])

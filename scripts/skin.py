@@ -1,0 +1,279 @@
+"""Make, convert and look at skins.
+
+python scripts/skin.py place --num-sensors 64 --method poisson_disk --out skin.json
+python scripts/skin.py import gentact.xacro --parent torso_link --out skin.json
+python scripts/skin.py export skin.json --out gentact.csv
+python scripts/skin.py show skin.json --picture skin.png
+"""
+
+from __future__ import annotations
+
+import egoskin  # noqa: F401  (before torch: it says how torch's threads wait)
+
+# isort: split
+
+import math
+import sys
+import textwrap
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import torch
+import tyro
+from tensordict import TensorDict
+
+from egoskin.cli import clear_errors
+from egoskin.film import check_path, save_picture
+from egoskin.kinematics import LinkKinematics
+from egoskin.rendering import CameraConfig, Painter
+from egoskin.robots import ROBOTS, RobotConfig
+from egoskin.sensors import Skin
+from egoskin.sensors.coverage import Coverage
+from egoskin.sensors.gentact import load_gentact, save_gentact
+from egoskin.sensors.mesh_surface import Meshes, meshes_in_folder, meshes_of_mjcf
+from egoskin.sensors.placement import place_sensors
+
+# The picture: size of each of its two views [px], and how normals are drawn [m].
+_VIEW_SIZE = (640, 960)
+_NORMAL_LENGTH, _NORMAL_RADIUS = 0.08, 0.003
+_NORMAL_RGBA = (0.1, 0.95, 1.0, 1.0)
+
+
+def _pairs(values: Sequence[str], option: str) -> dict[str, str]:
+    """Return what options of the form ``name=value`` say."""
+    for value in values:
+        if not all(value.rpartition("=")[::2]):
+            raise ValueError(f"{option} takes name=value, got {value!r}")
+    return {v.rpartition("=")[0]: v.rpartition("=")[2] for v in values}
+
+
+def _meshes(path: Path, robot: RobotConfig) -> Meshes:
+    """Return the meshes of a folder or of a MuJoCo model."""
+    try:
+        if path.is_dir():
+            return meshes_in_folder(path, robot.links)
+        return meshes_of_mjcf(path)
+    except ImportError as error:
+        # It says which package is missing: the user's to mend, not a fault of ours.
+        raise ValueError(f"--meshes: {error}") from error
+
+
+@dataclass(frozen=True, kw_only=True)
+class Place:
+    """Place sensors at random on a robot's surface."""
+
+    out: Path
+    """Skin file to write (JSON)."""
+    robot: Literal["h1_2"] = "h1_2"
+    """Robot by name."""
+    num_sensors: int | None = 64
+    """Number of sensors; None: as many as the spacing lets in."""
+    method: Literal["area_uniform", "poisson_disk"] = "area_uniform"
+    """Independent of each other, or with distances kept between them."""
+    seed: int = 0
+    """Seed of the placement."""
+    links: tuple[str, ...] | None = None
+    """Links to cover; None: the robot's upper body."""
+    density: tuple[str, ...] = ()
+    """Relative density of sensors on links, LINK=WEIGHT, where LINK may be a shell
+    pattern; 1 on the others."""
+    spacing: float | None = None
+    """Least distance between sensors [m] (poisson_disk); None: as far as they go."""
+    stand_off: float = 0.0
+    """Height of the sensors above the surface [m]."""
+    meshes: Path | None = None
+    """Folder of meshes named after links, or MJCF with meshes; None: the robot's
+    primitives."""
+
+    def run(self) -> None:
+        """Write the skin."""
+        check_path(self.out, (".json",))
+        density = {}
+        for link, weight in _pairs(self.density, "--density").items():
+            try:
+                density[link] = float(weight)
+            except ValueError:
+                raise ValueError(
+                    f"--density: the weight of {link} must be a number, got {weight!r}"
+                ) from None
+        robot = ROBOTS[self.robot]
+        skin = place_sensors(
+            robot,
+            self.num_sensors,
+            self.seed,
+            method=self.method,
+            links=self.links,
+            density=density or None,
+            spacing=self.spacing,
+            stand_off=self.stand_off,
+            meshes=None if self.meshes is None else _meshes(self.meshes, robot),
+        )
+        skin.save(self.out)
+        print(table(skin, str(self.out)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Import:
+    """Turn an export of GenTact's (CSV, xacro, URDF) into a skin file."""
+
+    file: Annotated[Path, tyro.conf.Positional]
+    """File exported from GenTact."""
+    out: Path
+    """Skin file to write (JSON)."""
+    robot: Literal["h1_2"] = "h1_2"
+    """Robot by name."""
+    scale: float | None = None
+    """Metres of one unit of the file; None: that of the dialect."""
+    link_map: tuple[str, ...] = ()
+    """Link for a part of a Parent path, or for a whole path, PART=LINK."""
+    parent: str | None = None
+    """Link of the sensors in a file that names none (xacro)."""
+
+    def run(self) -> None:
+        """Write the skin."""
+        check_path(self.out, (".json",))
+        robot = ROBOTS[self.robot]
+        skin = load_gentact(
+            self.file,
+            robot_name=robot.name,
+            links=robot.links,
+            primitives=robot.primitives,
+            scale=self.scale,
+            link_map=_pairs(self.link_map, "--link-map"),
+            parent=self.parent,
+        )
+        skin.save(self.out)
+        print(table(skin, str(self.out)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export:
+    """Write a skin file as GenTact's CSV."""
+
+    skin: Annotated[Path, tyro.conf.Positional]
+    """Skin file (JSON)."""
+    out: Path
+    """CSV file to write."""
+
+    def run(self) -> None:
+        """Write the CSV."""
+        check_path(self.out, (".csv",))
+        skin = Skin.load(self.skin)
+        lost = save_gentact(skin, self.out)
+        note = f"; GenTact's format does not hold {', '.join(lost)}" if lost else ""
+        print(f"{self.out}: {len(skin)} sensors{note}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Show:
+    """Say what is in a skin file, and draw it."""
+
+    skin: Annotated[Path, tyro.conf.Positional]
+    """Skin file (JSON)."""
+    picture: Path | None = None
+    """Picture to write, .png: the robot from the front and from behind."""
+
+    def run(self) -> None:
+        """Print the summary; write the picture."""
+        if self.picture is not None:
+            check_path(self.picture, (".png",))
+        skin = Skin.load(self.skin)
+        robot = ROBOTS.get(skin.robot)
+        if robot is not None:
+            skin.check_links(robot.links)
+        print(table(skin, str(self.skin)))
+        if self.picture is not None:
+            if robot is None:
+                raise ValueError(
+                    f"{self.skin} is for the robot {skin.robot!r}; pictures can be "
+                    f"drawn of {', '.join(ROBOTS)}"
+                )
+            save_picture(self.picture, views(robot, skin))
+
+
+def describe(coverage: Coverage | None) -> str:
+    """Return a sensor's type in words: its kind, and what is not the default."""
+    if coverage is None:
+        return "as configured"
+    default = type(coverage)()
+    changed = [
+        f"{f.name}={getattr(coverage, f.name)}"
+        for f in fields(coverage)
+        if getattr(coverage, f.name) != getattr(default, f.name)
+    ]
+    return " ".join([type(coverage).__name__.lower(), *changed])
+
+
+def table(skin: Skin, title: str) -> str:
+    """Return how many sensors of which type and range there are on each link."""
+
+    def distance(value: float) -> str:
+        return "as configured" if math.isnan(value) else f"{value:g} m"
+
+    kinds = [describe(c) for c in skin.coverage]
+    ranges = [distance(float(r)) for r in skin.range]
+    groups = Counter(zip(skin.links, kinds, ranges, strict=True))
+    rows = [("link", "sensors", "type", "range")]
+    rows += [(link, str(n), kind, r) for (link, kind, r), n in sorted(groups.items())]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = [
+        f"  {link:<{widths[0]}}  {number:>{widths[1]}}  {kind:<{widths[2]}}  {reach}"
+        for link, number, kind, reach in rows
+    ]
+    head = f"{title}: {len(skin)} sensors on links of {skin.robot}"
+    notes = [
+        "  " + textwrap.shorten(f"{name}: {value}", 100, placeholder=" ...")
+        for name, value in skin.provenance.items()
+    ]
+    return "\n".join([head, *lines, *notes])
+
+
+def views(robot: RobotConfig, skin: Skin) -> np.ndarray:
+    """Return the robot in its default pose with sensors and normals.
+
+    Returns:
+        Front and back view side by side, ``[height, width, 3]`` uint8.
+    """
+    joint_pos = torch.from_numpy(robot.default_joint_pos)
+    base = np.array([0.0, 0.0, robot.default_base_height])
+    state = TensorDict(
+        {
+            "base_pose": torch.tensor([*base, 1.0, 0.0, 0.0, 0.0]),
+            "joint_pos": joint_pos,
+            "object_pose": torch.zeros(0, 7),
+            "object_active": torch.zeros(0, dtype=torch.bool),
+        }
+    )
+    position, rotation = LinkKinematics(robot.chain, skin.links).poses_b(
+        joint_pos[None]
+    )
+    turn, shift = rotation[0].numpy(), base + position[0].numpy()
+    starts = shift + (turn @ skin.position[:, :, None])[..., 0]
+    ends = starts + _NORMAL_LENGTH * (turn @ skin.normal[:, :, None])[..., 0]
+    images = []
+    for azimuth in (0.0, 180.0):
+        camera = CameraConfig(distance=3.4, azimuth_deg=azimuth, elevation_deg=8.0)
+        painter = Painter(robot, skin, (), size=_VIEW_SIZE, camera=camera)
+        with painter:
+            painter.draw(state, time=0.0)
+            # The scene is still there, sensors and all: draw into it, read it again.
+            for start, end in zip(starts, ends, strict=True):
+                painter._canvas.add_line(start, end, _NORMAL_RADIUS, _NORMAL_RGBA)
+            images.append(painter._canvas.read())
+    return np.concatenate(images, axis=1)
+
+
+def main(args: list[str]) -> None:
+    """Run the command."""
+    commands = {"place": Place, "import": Import, "export": Export, "show": Show}
+    config = tyro.extras.subcommand_cli_from_dict(commands, args=args)
+    config.run()
+
+
+if __name__ == "__main__":
+    with clear_errors():
+        main(sys.argv[1:])
