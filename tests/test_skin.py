@@ -1,4 +1,4 @@
-"""The skin, its sensor frames, its file, and the random placement."""
+"""The skin, its sensor frames and its file."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from egoskin.robots import H1_2
-from egoskin.sensors import Skin, place_area_uniform
+from egoskin.sensors import Skin
 
 
 def make_skin(normal, **changes) -> Skin:
@@ -173,35 +173,3 @@ def test_an_unknown_link_is_refused_with_the_closest_name():
         match=r"sensor 0 sits on 'xyz', which h1_2 does not have\. Its links",
     ):
         skin.check_links(H1_2.links)
-
-
-# --- placement ------------------------------------------------------------------
-
-
-def test_placement_is_decided_by_its_seed():
-    first, again, other = (place_area_uniform(H1_2, 50, seed) for seed in (1, 1, 2))
-    assert first.links == again.links
-    np.testing.assert_array_equal(first.position, again.position)
-    np.testing.assert_array_equal(first.normal, again.normal)
-    assert not np.isclose(first.position, other.position).all(-1).any()
-
-
-def test_placement_covers_the_skin_links_alone():
-    skin = place_area_uniform(H1_2, 1000, seed=0)
-    assert len(skin) == 1000
-    carrying = {shape.link for shape in H1_2.primitives}
-    assert set(skin.links) == set(H1_2.skin_links) & carrying
-    skin.check_links(H1_2.links)
-
-
-def test_placement_covers_the_links_asked_for():
-    skin = place_area_uniform(H1_2, 20, seed=0, links=["pelvis"])
-    assert set(skin.links) == {"pelvis"}
-    assert skin.provenance["links"] == ["pelvis"]
-
-
-def test_placement_refuses_what_it_cannot_place():
-    with pytest.raises(ValueError, match="must be positive, got 0"):
-        place_area_uniform(H1_2, 0, seed=0)
-    with pytest.raises(ValueError, match="no link 'chest'"):
-        place_area_uniform(H1_2, 5, seed=0, links=["torso_link", "chest"])

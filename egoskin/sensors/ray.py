@@ -84,6 +84,8 @@ class RaySensor(ProximitySensor):
         in_keys: Sequence[NestedKey] = STATE_KEYS,
         out_keys: Sequence[NestedKey] = ("distance", "object_detected"),
     ) -> None:
+        if reduce not in ("none", "min"):
+            raise ValueError(f"reduce must be 'none' or 'min', got {reduce!r}")
         skin, rays = checked(skin, coverage or Ray(), max_range, Ray)
         kinds = list(dict.fromkeys(rays))
         directions = [torch.from_numpy(kind.directions()) for kind in kinds]
