@@ -1,6 +1,6 @@
 """Proximity sensors on Gymnasium's Humanoid, in a plain TorchRL environment.
 
-python scripts/reuse_gymnasium.py
+python scripts/reuse_gymnasium.py       (needs `pip install "gymnasium[mujoco]"`)
 
 The pattern for any environment: one transform of your own that says where the base,
 the joints and the objects are, then the sensors as they come.

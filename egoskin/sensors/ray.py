@@ -210,7 +210,9 @@ class RaySensor(ProximitySensor):
         # A view, or an error: a copy would lose what is written.
         flat = out.view(-1, *out.shape[2:])
         # Whatever is not 0 may be hit, NaN too.
-        for pairs in margin.view(-1).nonzero()[:, 0].split(self._chunk):
+        wanted = margin.view(-1).nonzero()[:, 0]
+        # Nothing wanted would still be a part, and compiled for its own sake.
+        for pairs in wanted.split(self._chunk) if len(wanted) else ():
             sensor, row = pairs // num_rows, pairs % num_rows
             reading, nearest = self._kernel(scene, view, sensor, row, shape)
             target = rows[row] * num_sensors + sensor

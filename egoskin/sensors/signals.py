@@ -208,6 +208,8 @@ class Localization(RowTransform):
     ) -> None:
         if not scale > 0:
             raise ValueError(f"scale must be positive, got {scale}")
+        if slots not in ("nearest", "all"):
+            raise ValueError(f"slots must be 'nearest' or 'all', got {slots!r}")
         if yaw_only and centre is not None:
             raise ValueError("yaw_only levels the base's axes: give no centre link")
         if in_keys is None:
@@ -240,9 +242,9 @@ class Localization(RowTransform):
             nearest = away.masked_fill(~detected, torch.inf).argmin(-1, keepdim=True)
             position = position.gather(1, nearest[..., None].expand(-1, -1, 3))
             detected = detected.any(-1, keepdim=True)
-        # Not where(): a position of NaN must not turn into a zero.
+        # A detected object of NaN stays NaN; what is not in play may be anywhere.
         flag = detected.to(position.dtype)
-        signal = (position * flag[..., None] / self.scale).flatten(1)
+        signal = position.masked_fill(~detected[..., None], 0.0).flatten(1) / self.scale
         return (torch.cat((signal, flag), -1) if self.validity else signal,)
 
     def _in_link(self, joint_pos: Tensor | None, position: Tensor) -> Tensor:

@@ -1,0 +1,146 @@
+"""What the robot's body hides from its sensors, against MuJoCo's rays."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from egoskin.kinematics import rotate_inverse
+from egoskin.robots import H1_2
+from egoskin.sensors import FieldSensor, Ray, RaySensor, Skin
+from egoskin.shapes import Box, Capsule, Ellipsoid, Sphere
+
+RANGE = 2.0
+SHAPES = (
+    Sphere(radius=0.15),
+    Box(half_extents=(0.1, 0.2, 0.05)),
+    Capsule(radius=0.05, half_length=0.3),
+    Ellipsoid(semi_axes=(0.2, 0.1, 0.15)),
+)
+BALL = SHAPES[0]
+KEYS = ("base_pose", "joint_pos", "object_pose", "object_active")
+SEED = st.integers(0, 2**32 - 1)
+WIDE = Ray(grid=(4, 4), fov_deg=120)
+BODY = H1_2.primitives
+
+
+def measure(sensor, state):
+    """(distance, detected) of a state."""
+    return sensor.compute(*(state[key] for key in KEYS))
+
+
+def crowd(random_state, seed: int):
+    """States in float64 with four active objects, turned anyhow."""
+    state = random_state(6, seed, torch.float64, objects=4)
+    quat = torch.from_numpy(np.random.default_rng(seed).normal(size=(6, 4, 4)))
+    state["object_pose"][..., 3:] = torch.nn.functional.normalize(quat, dim=-1)
+    state["object_active"][:] = True
+    return state
+
+
+def mujoco_blocks(skin, state, row, sensor, ways, lengths, larger: float) -> np.ndarray:
+    """Whether a robot larger by some length [m] stands in the way, ``[n]``.
+
+    Paths are given by their row, sensor, direction in the sensor's frame and length.
+    """
+    spec = H1_2.spec()
+    for geom in spec.geoms:
+        geom.size = np.where(geom.size > 0, geom.size + larger, geom.size)
+    model = spec.compile()
+    data, frames, geom = mujoco.MjData(model), skin.rotation(), np.zeros(1, np.int32)
+    result = []
+    for r, s, way, length in zip(row, sensor, ways, lengths, strict=True):
+        data.qpos[:7], data.qpos[7:] = state["base_pose"][r], state["joint_pos"][r]
+        mujoco.mj_kinematics(model, data)
+        link = data.body(skin.links[s])
+        turn = link.xmat.reshape(3, 3)
+        way = turn @ frames[s] @ way
+        # Off the surface that the sensor sits on.
+        place = link.xpos + turn @ skin.position[s] + 1e-4 * way
+        hit = mujoco.mj_ray(model, data, place, way, None, 1, -1, geom)
+        result.append(0 <= hit < length)
+    return np.array(result, dtype=bool)
+
+
+def assert_hidden_as_in_mujoco(hidden, *paths) -> None:
+    """Blocked by a robot thinner by 5 mm: hidden; not even touched: seen."""
+    surely, touched = (mujoco_blocks(*paths, larger) for larger in (-5e-3, 0.0))
+    assert hidden[surely].all()
+    assert not hidden[~touched].any()
+
+
+@settings(max_examples=25)
+@given(SEED)
+def test_a_ray_sees_what_mujoco_sees_before_the_robot(skin, random_state, seed):
+    some = skin.select(np.random.default_rng(seed).permutation(len(skin))[:16])
+    state = crowd(random_state, seed)
+    clear, solid = (
+        measure(
+            RaySensor(some, H1_2.chain, SHAPES, RANGE, WIDE, body=b, per_object=True),
+            state,
+        )[0]
+        for b in ((), BODY)
+    )
+    # The same or nothing, never more.
+    assert (solid.isinf() | (solid == clear)).all()
+    row, sensor, beam, _ = places = clear.isfinite().nonzero().unbind(1)
+    hidden = solid[places].isinf().numpy()
+    ways = WIDE.directions()[beam, 0]
+    assert_hidden_as_in_mujoco(hidden, some, state, row, sensor, ways, clear[places])
+
+
+@settings(max_examples=25)
+@given(SEED)
+def test_a_field_sees_what_mujoco_sees_before_the_robot(skin, random_state, seed):
+    some = skin.select(np.random.default_rng(seed).permutation(len(skin))[:32])
+    state = crowd(random_state, seed)
+    state["object_pose"] = state["object_pose"][:, :1]
+    state["object_active"] = state["object_active"][:, :1]
+    clear, solid = (
+        FieldSensor(some, H1_2.chain, [BALL], RANGE, body=b) for b in ((), BODY)
+    )
+    distance, seen = measure(clear, state)[0], measure(solid, state)[0]
+    assert (seen.isinf() | (seen == distance)).all()
+    # The path to a ball's closest point leads to its centre.
+    position, rotation = clear.poses_b(state["joint_pos"])
+    offset = state["object_pose"][:, 0, :3] - state["base_pose"][:, :3]
+    centre = rotate_inverse(state["base_pose"][:, 3:], offset)
+    ways = torch.nn.functional.normalize(centre[:, None] - position, dim=-1)
+    ways = (rotation.mT @ ways[..., None])[..., 0]
+    near = distance.isfinite() & (distance > 1e-3)
+    row, sensor = near.nonzero().unbind(1)
+    assert_hidden_as_in_mujoco(
+        seen[near].isinf().numpy(),
+        *(some, state, row, sensor, ways[near].numpy(), distance[near]),
+    )
+
+
+# --- by hand --------------------------------------------------------------------
+
+
+def chest(front: bool) -> Skin:
+    """A sensor on the middle of the front or the back of the torso's box."""
+    (box,) = (p for p in BODY if p.link == "torso_link" and p.kind == "box")
+    x = np.array([1.0 if front else -1.0, 0, 0])
+    return Skin(
+        robot="h1_2",
+        links=("torso_link",),
+        position=(box.position + box.rotation @ (x * box.size))[None],
+        normal=(box.rotation @ x)[None],
+    )
+
+
+def look(sensor, skin, way, quat=(1, 0, 0, 0)):
+    """(distance, detected) of an object some way from a sensor, default pose."""
+    joint_pos = torch.from_numpy(H1_2.default_joint_pos)[None]
+    position, _ = sensor.poses_b(joint_pos)
+    base = torch.tensor([[0, 0, 0, 1, 0, 0, 0]], dtype=torch.float64)
+    centre = position[0, 0] + torch.tensor(way, dtype=torch.float64)
+    pose = torch.cat((centre, torch.tensor(quat, dtype=torch.float64)))[None, None]
+    distance, detected = sensor.compute(
+        base, joint_pos, pose, torch.ones(1, 1, dtype=torch.bool)
+    )
+    return distance.min().item(), detected.item()
