@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import functools
+import math
 import warnings
 from collections.abc import Callable
+from types import FunctionType, MethodType
 from typing import ParamSpec, TypeVar
 
 import torch
@@ -45,14 +47,42 @@ def exact_sqrt(x: Tensor) -> Tensor:
     return x.double().sqrt_().float()
 
 
+# pi/2 = HIGH + MIDDLE + LOW: a few bits each in the first two (Cephes), so that their
+# products with a small integer are exact.
+_HIGH, _MIDDLE, _LOW = 1.5703125, 4.837512969970703125e-4, 7.54978995489188216e-8
+
+
+def sincos(x: Tensor) -> tuple[Tensor, Tensor]:
+    """Return (sine, cosine) to the last bit or two, by sums and products alone.
+
+    PyTorch's own differ between compiled code, vector code and the tail of an array.
+
+    Args:
+        x: Angles [rad] of joints: up to some hundreds.
+    """
+    # x = n pi/2 + r, |r| <= pi/4
+    n = (x * (2 / math.pi)).round()
+    r = ((x - n * _HIGH) - n * _MIDDLE) - n * _LOW
+    z, terms = r * r, 9 if x.dtype == torch.float64 else 5
+    # Taylor's series; the first term left out is below half of the last bit.
+    s, c = torch.zeros_like(r), torch.zeros_like(r)
+    for i in range(terms - 1, 0, -1):
+        s = (s + (-1) ** i / math.factorial(2 * i + 1)) * z
+        c = (c + (-1) ** (i + 1) / math.factorial(2 * i + 2)) * z
+    s, c = r + r * s, 1 + z * (c - 0.5)
+    half = (n * 0.5).floor()
+    swapped, sign = n - 2 * half > 0.5, 1 - 2 * (half - 2 * (half * 0.5).floor())
+    return torch.where(swapped, c, s) * sign, torch.where(swapped, -s, c) * sign
+
+
 def compiled(
     function: Callable[P, T], *, dynamic: bool | None = None
 ) -> Callable[P, T]:
     """Return a function compiled by torch, or itself where there is no compiler.
 
-    Only for functions of +, -, x, /, square roots and comparisons: these round alike
-    in vector code, scalar code and PyTorch's own kernels, so that compiling changes
-    no bit.
+    Only for functions of +, -, x, /, comparisons, `exact_sqrt` and `sincos`: these
+    round alike in vector code, scalar code and PyTorch's own kernels, so that
+    compiling changes no bit.
 
     Args:
         function: What to compile, at its first call.
@@ -60,4 +90,20 @@ def compiled(
     """
     if not can_compile():
         return function
-    return torch.compile(function, dynamic=dynamic, fullgraph=True)
+    return torch.compile(_copy(function), dynamic=dynamic, fullgraph=True)
+
+
+def _copy(function: Callable[P, T]) -> Callable[P, T]:
+    """Return the function or method with code of its own.
+
+    Torch compiles one piece of code at most eight times, whatever object it belongs
+    to: the methods of a ninth sensor would be refused.
+    """
+    plain = getattr(function, "__func__", function)
+    assert isinstance(plain, FunctionType)
+    copy = FunctionType(
+        plain.__code__.replace(), plain.__globals__, closure=plain.__closure__
+    )
+    copy.__defaults__, copy.__kwdefaults__ = plain.__defaults__, plain.__kwdefaults__
+    owner = getattr(function, "__self__", None)
+    return copy if owner is None else MethodType(copy, owner)

@@ -19,6 +19,8 @@ import pytorch_kinematics as pk
 import torch
 from torch import Tensor
 
+from egoskin.compilation import sincos
+
 Entry = Tensor | float
 """One matrix entry: a ``[B]`` tensor, or a constant of the robot."""
 
@@ -184,6 +186,13 @@ class LinkKinematics:
                 f"{', '.join(chain.get_link_names())}"
             )
         self._slots = [slots[name] for name in self.links]
+        # The joints that matter; steps count among them from here on.
+        used = {s.joint for s in self._steps if s.joint_type != "fixed"}
+        self._joints = sorted(used)
+        self._steps = [
+            s._replace(joint=self._joints.index(s.joint)) if s.joint in used else s
+            for s in self._steps
+        ]
 
     def reach(self) -> list[float]:
         """Return how far each link's origin can be from the base [m], at most.
@@ -210,7 +219,7 @@ class LinkKinematics:
         return self.frames_from(*self.trig(joint_pos))
 
     def trig(self, joint_pos: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return (sine, cosine, value) of the joint positions, ``[J, B]`` each.
+        """Return (sine, cosine, value) of the U joints that matter, ``[U, B]`` each.
 
         Args:
             joint_pos: Joint positions, ``[B, J]``.
@@ -218,13 +227,17 @@ class LinkKinematics:
         Raises:
             ValueError: If J is not the chain's number of joints.
         """
+        joints = self._used(joint_pos)
+        return *sincos(joints), joints
+
+    def _used(self, joint_pos: Tensor) -> Tensor:
+        """Return the positions of the joints that lead to the links, ``[U, B]``."""
         if joint_pos.shape[-1] != self.num_joints:
             raise ValueError(
                 f"joint positions must be [B, {self.num_joints}], one column for each "
                 f"joint of the chain, got {list(joint_pos.shape)}"
             )
-        joints = joint_pos.t().contiguous()
-        return joints.sin(), joints.cos(), joints
+        return joint_pos.t()[self._joints]
 
     def frames_from(self, sin: Tensor, cos: Tensor, joints: Tensor) -> list[Frame]:
         """Return `link_frames` from what `trig` returns, by sums and products alone.
@@ -232,9 +245,9 @@ class LinkKinematics:
         Those round alike whoever evaluates them, so this part can be compiled.
 
         Args:
-            sin: Sines of the joint positions, ``[J, B]``.
-            cos: Cosines of the joint positions, ``[J, B]``.
-            joints: Joint positions, ``[J, B]``.
+            sin: Sines of the joint positions, ``[U, B]``.
+            cos: Cosines of the joint positions, ``[U, B]``.
+            joints: Joint positions, ``[U, B]``.
 
         Returns:
             As `link_frames`.
@@ -249,7 +262,9 @@ class LinkKinematics:
         """
         unit = torch.eye(3, dtype=joint_pos.dtype, device=joint_pos.device)[:, :, None]
         root: Frame = [list(unit.unbind(1))], [torch.zeros_like(unit[:, 0])]
-        frames = self._evaluate(root, *self.trig(joint_pos))
+        joints = self._used(joint_pos)
+        # A few calls instead of the many of `sincos`.
+        frames = self._evaluate(root, joints.sin(), joints.cos(), joints)
         # All are tensors, because the root's are.
         return cast(Any, [(axes, position) for (axes,), (position,) in frames])
 

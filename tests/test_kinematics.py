@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 
 import mujoco
 import numpy as np
@@ -11,6 +12,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from egoskin.compilation import sincos
 from egoskin.kinematics import (
     LinkKinematics,
     pad_rows,
@@ -184,3 +186,21 @@ def test_quaternions_take_any_leading_dimensions():
     product = (quat_to_matrix(quat) @ vector[..., None])[..., 0]
     torch.testing.assert_close(rotate(quat, vector), product)
     torch.testing.assert_close(rotate_inverse(quat, product), vector)
+
+
+@pytest.mark.parametrize(
+    ("dtype", "atol"), [(torch.float32, 1e-7), (torch.float64, 4e-16)]
+)
+@given(st.lists(st.floats(-100, 100, width=32), min_size=1, max_size=40))
+def test_sines_and_cosines_are_right_to_the_last_bits(dtype, atol, angles):
+    x = torch.tensor(angles, dtype=dtype)
+    exact = np.array(angles)
+    sin, cos = sincos(x)
+    assert sin.dtype == cos.dtype == dtype
+    np.testing.assert_allclose(sin, np.sin(exact), 0, atol)
+    np.testing.assert_allclose(cos, np.cos(exact), 0, atol)
+
+
+def test_sines_of_nan_are_nan():
+    for value in sincos(torch.tensor([math.nan, 0.0])):
+        assert value.isnan().tolist() == [True, False]

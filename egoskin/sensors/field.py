@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 
@@ -73,7 +74,17 @@ class FieldSensor(ProximitySensor):
     ) -> None:
         skin, fields = checked(skin, coverage or Field(), max_range, Field)
         super().__init__(
-            skin, chain, objects, (), 1.0, body, per_object, in_keys, out_keys
+            skin,
+            chain,
+            objects,
+            (),
+            1.0,
+            body,
+            per_object,
+            # What the body hides is found for some pairs: their number is no constant.
+            compile and not body,
+            in_keys,
+            out_keys,
         )
         # None where every sensor sees all around, or measures to the surface.
         cos_half = to_centre = None
@@ -84,13 +95,24 @@ class FieldSensor(ProximitySensor):
             to_centre = torch.tensor([[f.measure == "centre"] for f in fields])
         self.register_buffer("_cos_half", cos_half)
         self.register_buffer("_to_centre", to_centre)
-        self._kernel: Callable[..., tuple[Tensor, Tensor]] = self.distances
-        if compile:
+        self._kernel: Callable[..., Tensor] = self.distances
+        if self._compile:
             self._kernel = compiled(self.distances)
 
-    def distances(self, scene: Scene, shape: Shape) -> tuple[Tensor, Tensor]:
-        """Return readings of one object [m], ``[B, S]``, and the least, ``[B]``."""
-        view = self.view(scene, shape)
+    def distances(self, scene: Scene) -> Tensor:
+        """Return readings of each object [m], ``[O, B, S]``."""
+        readings = []
+        for view, shape, on in zip(
+            self.views(scene), self.objects, scene.active, strict=True
+        ):
+            reading = torch.where(on, self._distance(view, shape), torch.inf)
+            if self._occluder is not None:
+                reading = self._without_hidden(reading, view, shape, scene)
+            readings.append(reading.t().contiguous())
+        return torch.stack(readings)
+
+    def _distance(self, view: View, shape: Shape) -> Tensor:
+        """Readings of one object [m], ``[S, B]``."""
         # From each sensor to the object's centre, in the sensor's link.
         x, y, z = v = view.centre[:, self._link] - self._offset.to(view.centre.dtype)
         to_centre = exact_sqrt(x * x + y * y + z * z)
@@ -112,8 +134,7 @@ class FieldSensor(ProximitySensor):
             distance = torch.where(self._to_centre, measured, distance)
         # Written so that NaN stays NaN.
         gone = distance > self._range.to(x.dtype)
-        reading = torch.where(gone, torch.inf, distance)
-        return reading.t().contiguous(), reading.amin(0)
+        return torch.where(gone, torch.inf, distance)
 
     def _in_object(self, view: View, centre: Tensor) -> list[Tensor]:
         """The sensors in the object's frame [m], three of ``[S, B]``."""
@@ -135,29 +156,32 @@ class FieldSensor(ProximitySensor):
         columns = view.turn[:, :, self._link].transpose(0, 1)
         return [c[0] * x + c[1] * y + c[2] * z for c in columns]
 
-    def measure(self, scene: Scene, shape: Shape, rows: Tensor, out: Tensor) -> Tensor:
-        """Lower readings to those of one object, and return the least of each row."""
-        reading, least = self._kernel(scene, shape)
-        if self._occluder is not None:
-            reading = self._without_hidden(reading, scene, shape)
-            least = reading.amin(1)
-        out[rows] = torch.minimum(out[rows], reading)
-        return least
+    def measure(self, scene: Scene, rows: Tensor | None, out: Tensor) -> Tensor:
+        """Write the readings of some rows, and return the least of each object."""
+        # Minima within the kernel would cost more.
+        readings = self._kernel(scene)
+        nearest = readings
+        if not self.per_object:
+            nearest = functools.reduce(torch.minimum, readings)
+        if rows is None:
+            out.copy_(nearest)
+        else:
+            out[..., rows, :] = nearest
+        return readings.amin(-1)
 
-    def _without_hidden(self, reading: Tensor, scene: Scene, shape: Shape) -> Tensor:
-        """Readings whose path to the object's closest point is free."""
-        row, sensor = (reading < torch.inf).nonzero().unbind(1)
+    def _without_hidden(
+        self, reading: Tensor, view: View, shape: Shape, scene: Scene
+    ) -> Tensor:
+        """Readings ``[S, B]`` whose path to the object's closest point is free."""
+        sensor, row = (reading < torch.inf).nonzero().unbind(1)
         if not len(row):
             return reading
-        view = self.view(scene, shape)
         centre = view.centre[:, self._link] - self._offset.to(reading.dtype)
         way = self._to_closest(view, shape, centre)
         x, y, z = (w[sensor, row] for w in way)
         reach = (x * x + y * y + z * z).sqrt()
         direction = torch.stack((x, y, z))[..., None] / reach.clamp(min=1e-9)[:, None]
         length = reach - shape.radius if isinstance(shape, Sphere) else reach
-        found = reading[row, sensor][:, None]
+        found = reading[sensor, row][:, None]
         kept = self.hide(found, scene, sensor, row, direction, length[:, None])
-        reading = reading.clone()
-        reading[row, sensor] = kept[:, 0]
-        return reading
+        return reading.index_put((sensor, row), kept[:, 0])

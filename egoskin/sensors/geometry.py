@@ -1,9 +1,8 @@
 """Where sensors and objects are relative to each other: what all coverages share.
 
 Kernels work on a structure of arrays with the batch last (``[S, B]``), in the order of
-the skin, and use only +, -, x, / and square roots: a row's result has the same bits
-whatever rows are computed with it, compiled or not. Sines and cosines of the joint
-positions are taken before, uncompiled.
+the skin, and use only +, -, x, /, `sincos` and `exact_sqrt` (`egoskin.compilation`): a
+row's result has the same bits whatever rows are computed with it, compiled or not.
 
 Contract: a reading of infinity means that nothing is in range; NaN in the input gives
 a reading of NaN, never one of nothing.
@@ -12,7 +11,7 @@ a reading of NaN, never one of nothing.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +22,7 @@ from torch import Tensor
 from torchrl.data import Binary as BinarySpec
 from torchrl.data import Composite, TensorSpec, Unbounded
 
+from egoskin.compilation import compiled
 from egoskin.kinematics import LinkKinematics, quat_to_matrix
 from egoskin.robots import Primitive
 from egoskin.sensors.coverage import Coverage
@@ -39,18 +39,20 @@ STATE_KEYS = ("base_pose", "joint_pos", "object_pose", "object_active")
 
 
 class Scene(NamedTuple):
-    """The rows of the world that concern one object."""
+    """What kernels compute from, the batch last and contiguous: vectors are loaded."""
 
-    base_pose: Tensor
-    """Pose of the base in the world, ``[B, 7]``."""
-    object_pose: Tensor
-    """Pose of the object in the world, ``[B, 7]``."""
+    base: Tensor
+    """Pose of the base in the world, ``[7, B]``."""
+    objects: Tensor
+    """Poses of the objects in the world, ``[O, 7, B]``; all NaN where any input is."""
+    active: Tensor
+    """Which objects are in play, ``[O, B]`` bool."""
     sin: Tensor
-    """Sines of the joint positions, ``[J, B]``."""
+    """Sines of the joint positions that matter, ``[U, B]``."""
     cos: Tensor
-    """Their cosines, ``[J, B]``."""
+    """Their cosines, ``[U, B]``."""
     joints: Tensor
-    """Joint positions [rad], ``[J, B]``."""
+    """These joint positions, ``[U, B]``."""
 
 
 class View(NamedTuple):
@@ -63,17 +65,17 @@ class View(NamedTuple):
     sphere, which has no orientation."""
 
 
-def stack_frames(frames: list, joints: Tensor) -> tuple[Tensor, Tensor]:
+def stack_frames(frames: list, like: Tensor) -> tuple[Tensor, Tensor]:
     """Return link frames as tensors: rotation ``[3, 3, L, B]``, position ``[3, L, B]``.
 
     Args:
-        frames: What `LinkKinematics.frames_from` returned.
-        joints: Joint positions, ``[J, B]``: they tell batch, dtype and device, also
-            where all frames are constants of the robot.
+        frames: What `LinkKinematics.link_frames` returned.
+        like: ``[..., B]``: tells batch, dtype and device, also where all frames are
+            constants of the robot.
     """
     entries = [e for r, p in frames for e in (*r[0], *r[1], *r[2], *p)]
-    batch = joints.shape[1:]
-    full = [e if isinstance(e, Tensor) else joints.new_full(batch, e) for e in entries]
+    batch = like.shape[-1:]
+    full = [e if isinstance(e, Tensor) else like.new_full(batch, e) for e in entries]
     stacked = torch.stack(full).unflatten(0, (len(frames), 12)).transpose(0, 1)
     return stacked[:9].unflatten(0, (3, 3)), stacked[9:]
 
@@ -98,6 +100,19 @@ def product(a: Tensor, b: Tensor) -> Tensor:
     )  # fmt: skip
 
 
+def _poison(base_pose: Tensor, joint_pos: Tensor) -> Tensor:
+    """Return 0 or, for rows with NaN anywhere, NaN, ``[B]``: 0 NaN = NaN.
+
+    It makes all readings of the row NaN, culled or not; no comparison discards it.
+    """
+    return 0.0 * (joint_pos.sum(-1) + base_pose.sum(-1))
+
+
+def _matrix(quat: Tensor) -> Tensor:
+    """Return rotation matrices ``[3, 3, B]`` of unit quaternions ``[4, B]``."""
+    return quat_to_matrix(quat.t()).permute(1, 2, 0)
+
+
 class ProximitySensor(RowTransform):
     """What field and ray sensors share: keys, checks, the loop over objects.
 
@@ -111,6 +126,7 @@ class ProximitySensor(RowTransform):
             that is transparent to its sensors.
         per_object: Whether objects are told apart: readings have a last dimension
             ``O``, instead of those of the nearest object.
+        compile: Whether the kernels are compiled.
         in_keys: Keys of base pose, joint positions, object poses, active flags.
         out_keys: Keys of readings and detections.
 
@@ -132,6 +148,7 @@ class ProximitySensor(RowTransform):
         slant: np.ndarray | float,
         body: Sequence[Primitive],
         per_object: bool,
+        compile: bool,
         in_keys: Sequence[NestedKey],
         out_keys: Sequence[NestedKey],
     ) -> None:
@@ -140,11 +157,17 @@ class ProximitySensor(RowTransform):
         if not objects:
             raise ValueError("a proximity sensor needs at least one object to sense")
         self.num_sensors, self.objects = len(skin), tuple(objects)
-        self.per_object = per_object
+        self.per_object, self._compile = per_object, compile
+        self._prepare: Callable[..., Scene] = self.scene
+        if compile:
+            self._prepare = compiled(self.scene)
         self.readings = torch.Size((len(skin), *num_readings))
-        links = tuple(dict.fromkeys(skin.links))
+        self._occluder = Occluder(body) if body else None
+        links = list(dict.fromkeys(skin.links))
+        self._num_links = len(links)
+        if self._occluder is not None:
+            links += [name for name in self._occluder.links if name not in links]
         self._kinematics = LinkKinematics(chain, links)
-        self._occluder = Occluder(chain, body) if body else None
 
         def constant(name: str, value: object, dtype: torch.dtype) -> None:
             self.register_buffer(name, torch.as_tensor(value, dtype=dtype))
@@ -161,59 +184,87 @@ class ProximitySensor(RowTransform):
         reach += np.linalg.norm(skin.position, axis=-1)
         self._farthest = float((reach + skin.range * slant).max()) + _SLACK
 
-    def view(self, scene: Scene, shape: Shape) -> View:
-        """Return one object as the links see it."""
-        frames = self._kinematics.frames_from(scene.sin, scene.cos, scene.joints)
-        # R^T d, written out: torch's cross product fuses sums, compiled code does not.
-        base = quat_to_matrix(scene.base_pose[:, 3:]).permute(1, 2, 0)
-        x, y, z = (scene.object_pose[:, :3] - scene.base_pose[:, :3]).t()
-        centre = [base[0, i] * x + base[1, i] * y + base[2, i] * z for i in range(3)]
-        seen = []
-        for rotation, position in frames:
-            # q = R^T (c - p)
-            x, y, z = (centre[i] - position[i] for i in range(3))
-            columns = zip(*rotation, strict=True)
-            seen.append(torch.stack([a * x + b * y + c * z for a, b, c in columns]))
-        turn = None
-        if not isinstance(shape, Sphere):
-            thing = quat_to_matrix(scene.object_pose[:, 3:]).permute(1, 2, 0)
-            # Link to base to object: (R_base^T R_object)^T R_link.
-            to_object = product(thing.transpose(0, 1), base)
-            turn = product(to_object[:, :, None], stack_frames(frames, scene.joints)[0])
-        return View(torch.stack(seen, 1), turn)
+    def scene(
+        self, base_pose: Tensor, joint_pos: Tensor, object_pose: Tensor, active: Tensor
+    ) -> Scene:
+        """Return what the kernels compute from, given the four inputs.
+
+        Compiled apart from them: otherwise their loops would load with strides, one
+        number at a time.
+        """
+        poison = _poison(base_pose, joint_pos)[:, None] + 0.0 * object_pose.sum(-1)
+        objects = (object_pose + poison[..., None]).permute(1, 2, 0).contiguous()
+        base, on = base_pose.t().contiguous(), active.t().contiguous()
+        return Scene(base, objects, on, *self._kinematics.trig(joint_pos))
+
+    def views(self, scene: Scene) -> list[View]:
+        """Return each object as the links see it."""
+        trig = scene.sin, scene.cos, scene.joints
+        frames = self._kinematics.frames_from(*trig)[: self._num_links]
+        base = _matrix(scene.base[3:])
+        views = []
+        for pose, shape in zip(scene.objects.unbind(0), self.objects, strict=True):
+            # R^T d, written out: torch's cross product fuses sums, compiled code does
+            # not.
+            x, y, z = pose[:3] - scene.base[:3]
+            centre = [
+                base[0, i] * x + base[1, i] * y + base[2, i] * z for i in range(3)
+            ]
+            seen = []
+            for rotation, position in frames:
+                # q = R^T (c - p)
+                x, y, z = (c - p for c, p in zip(centre, position, strict=True))
+                columns = zip(*rotation, strict=True)
+                seen.append(torch.stack([a * x + b * y + c * z for a, b, c in columns]))
+            turn = None
+            if not isinstance(shape, Sphere):
+                # Link to base to object: (R_base^T R_object)^T R_link.
+                to_object = product(_matrix(pose[3:]).transpose(0, 1), base)
+                links = stack_frames(frames, scene.base)[0]
+                turn = product(to_object[:, :, None], links)
+            views.append(View(torch.stack(seen, 1), turn))
+        return views
 
     def frames_b(
         self, sin: Tensor, cos: Tensor, joints: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Return the sensor frames in the base frame.
+    ) -> tuple[list[Tensor], list[list[Tensor]]]:
+        """Return the sensor frames in the base frame, entry by entry.
 
         Args:
-            sin: Sines of the joint positions, ``[J, B]``.
-            cos: Their cosines, ``[J, B]``.
-            joints: Joint positions [rad], ``[J, B]``.
+            sin: Sines of the joint positions that matter, ``[U, B]``.
+            cos: Their cosines, ``[U, B]``.
+            joints: These joint positions, ``[U, B]``.
 
         Returns:
-            Position [m] ``[3, S, B]`` and rotation ``[3, 3, S, B]``.
+            Position [m], three of ``[S, B]``, and the rows of the rotation, 3 x 3 of
+            ``[S, B]``; its columns are the axes of the sensor frames.
         """
-        links = stack_frames(self._kinematics.frames_from(sin, cos, joints), joints)
-        turn, position = (x[..., self._link, :] for x in links)
-        axes, o = self._axes.to(turn.dtype).transpose(0, 1), self._offset.to(turn.dtype)
-        # p + R o
-        shift = [row[0] * o[0] + row[1] * o[1] + row[2] * o[2] for row in turn]
-        return position + torch.stack(shift), product(turn, axes)
+        frames = self._kinematics.frames_from(sin, cos, joints)
+        turn, origin = stack_frames(frames[: self._num_links], joints)
+        offset = self._offset.to(turn.dtype)
+        axes = self._axes.to(turn.dtype)
+        position, rotation = [], []
+        for row, along in zip(turn, origin, strict=True):
+            x, y, z = row[:, self._link]
+            # p + R o
+            shift = x * offset[0] + y * offset[1] + z * offset[2]
+            position.append(along[self._link] + shift)
+            rotation.append([x * a[0] + y * a[1] + z * a[2] for a in axes])
+        return position, rotation
 
     def poses_b(self, joint_pos: Tensor) -> tuple[Tensor, Tensor]:
         """Return the sensors' positions and rotations in the base frame.
 
         Args:
-            joint_pos: Joint positions [rad], ``[B, J]``.
+            joint_pos: Joint positions, ``[B, J]``.
 
         Returns:
             Position [m] ``[B, S, 3]`` and rotation ``[B, S, 3, 3]``, whose columns
             are the axes of the sensor frames.
         """
         position, rotation = self.frames_b(*self._kinematics.trig(joint_pos))
-        return position.permute(2, 1, 0), rotation.permute(3, 2, 0, 1)
+        rows = [torch.stack(row, -1).transpose(0, 1) for row in rotation]
+        return torch.stack(position, -1).transpose(0, 1), torch.stack(rows, -2)
 
     def hide(
         self,
@@ -239,7 +290,8 @@ class ProximitySensor(RowTransform):
         """
         assert self._occluder is not None
         trig = [x[:, row] for x in (scene.sin, scene.cos, scene.joints)]
-        links = stack_frames(self._kinematics.frames_from(*trig), trig[2])
+        frames = self._kinematics.frames_from(*trig)
+        links = stack_frames(frames[: self._num_links], trig[2])
         pair = torch.arange(len(row), device=row.device)
         turn, position = (x[..., self._link[sensor], pair] for x in links)
         offset = self._offset[:, sensor, 0].to(reading.dtype)
@@ -254,23 +306,22 @@ class ProximitySensor(RowTransform):
             + r[2, :, None] * direction[2]
             for r in turn
         ]
-        sin, cos, joints = trig
-        hidden = self._occluder.blocked(sin, cos, joints, origin, way, length)
+        by_name = dict(zip(self._kinematics.links, frames, strict=True))
+        hidden = self._occluder.blocked(by_name, origin, way, length)
         return torch.where(hidden, torch.inf, reading)
 
     @abstractmethod
-    def measure(self, scene: Scene, shape: Shape, rows: Tensor, out: Tensor) -> Tensor:
-        """Lower readings to those of one object, and return the least of each row.
+    def measure(self, scene: Scene, rows: Tensor | None, out: Tensor) -> Tensor:
+        """Write the readings of some rows, and return the least of each object.
 
         Args:
-            scene: The rows in which the object may be in range, ``n`` of them.
-            shape: The object's shape.
-            rows: Index of each of these rows, ``[n]``.
-            out: Readings of the objects before [m], ``[B, S, ...]``, infinite at
-                first; changed in place.
+            scene: The rows, ``n`` of them.
+            rows: Index of each of them, ``[n]``, all others being infinite already;
+                None if they are all.
+            out: Readings [m], ``[B, S, ...]`` or, told apart, ``[O, B, S, ...]``.
 
         Returns:
-            Least reading of this object [m], ``[n]``.
+            Least reading of each object [m], ``[O, n]``, infinite if it is not active.
         """
 
     def compute(self, *inputs: Tensor, out: Tensor | None = None) -> tuple[Tensor, ...]:
@@ -284,8 +335,7 @@ class ProximitySensor(RowTransform):
         Raises:
             ValueError: If the number of objects is not that of the sensor.
         """
-        base_pose, joint_pos, object_pose, active = inputs
-        batch, objects = active.shape
+        batch, objects = inputs[3].shape
         if objects != len(self.objects):
             raise ValueError(
                 f"the sensor was made for {len(self.objects)} objects, "
@@ -293,26 +343,36 @@ class ProximitySensor(RowTransform):
             )
         if out is None:
             each = (objects,) if self.per_object else ()
-            out = base_pose.new_empty((*each, batch, *self.readings))
-        out.fill_(torch.inf)
-        detected = torch.zeros_like(active)
-        # NaN anywhere in a row, 0 NaN = NaN, makes all its readings NaN, culled or
-        # not; no comparison discards it.
-        poison = 0.0 * (joint_pos.sum(-1) + base_pose.sum(-1))
-        for i, shape in enumerate(self.objects):
-            pose = object_pose[:, i]
-            pose = pose + (poison + 0.0 * pose.sum(-1))[:, None]
-            away = (pose[:, :3] - base_pose[:, :3]).square().sum(-1)
-            limit = self._farthest + shape.bounding_radius
-            rows = (~(away > limit * limit) & active[:, i]).nonzero()[:, 0]
-            if not len(rows):
-                continue
-            trig = self._kinematics.trig(joint_pos[rows])
-            scene = Scene(base_pose[rows], pose[rows], *trig)
-            least = self.measure(scene, shape, rows, out[i] if self.per_object else out)
-            # A reading of NaN may be anything: the object counts as seen.
-            detected[rows, i] = least != torch.inf
+            out = inputs[0].new_empty((*each, batch, *self.readings))
+        if self._compile:
+            # Compiled, all rows together cost less than to find those that matter.
+            least = self.measure(self._prepare(*inputs), None, out)
+            detected = least.t() != torch.inf
+        else:
+            rows = self._rows_in_reach(*inputs)
+            out.fill_(torch.inf)
+            detected = torch.zeros_like(inputs[3])
+            if len(rows):
+                scene = self._prepare(*(x[rows] for x in inputs))
+                least = self.measure(scene, rows, out)
+                # A reading of NaN may be anything: the object counts as seen.
+                detected[rows] = least.t() != torch.inf
         return (out.movedim(0, -1) if self.per_object else out), detected
+
+    def _rows_in_reach(
+        self,
+        base_pose: Tensor,
+        joint_pos: Tensor,
+        object_pose: Tensor,
+        active: Tensor,
+    ) -> Tensor:
+        """Rows with an active object that may be in range, or with NaN, ``[n]``."""
+        bounds = [shape.bounding_radius for shape in self.objects]
+        limit = self._farthest + object_pose.new_tensor(bounds)
+        away = (object_pose[..., :3] - base_pose[:, None, :3]).square().sum(-1)
+        away = away + _poison(base_pose, joint_pos)[:, None]
+        away = away + 0.0 * object_pose.sum(-1)
+        return (~(away > limit * limit) & active).any(1).nonzero()[:, 0]
 
     def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
         """Return the specs of readings and detections."""

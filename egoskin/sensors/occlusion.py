@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
-import pytorch_kinematics as pk
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from egoskin.kinematics import LinkKinematics
+from egoskin.kinematics import Frame
 from egoskin.robots import Primitive
 from egoskin.shapes import shape_of
 
@@ -17,21 +16,18 @@ from egoskin.shapes import shape_of
 _DEPTH = 1e-3
 
 
-class Occluder(nn.Module):
+class Occluder:
     """The body of a robot as an obstacle to straight paths.
 
     Args:
-        chain: Kinematic chain of the robot, rooted at the base.
         primitives: The robot's body.
     """
 
-    def __init__(self, chain: pk.Chain, primitives: Sequence[Primitive]) -> None:
-        super().__init__()
-        links = tuple(dict.fromkeys(p.link for p in primitives))
-        self._kinematics = LinkKinematics(chain, links)
+    def __init__(self, primitives: Sequence[Primitive]) -> None:
+        self.links = tuple(dict.fromkeys(p.link for p in primitives))
         self._parts = [
             (
-                links.index(p.link),
+                p.link,
                 shape_of(p.kind, p.size.tolist()),
                 p.position.tolist(),
                 p.rotation.T.tolist(),
@@ -41,9 +37,7 @@ class Occluder(nn.Module):
 
     def blocked(
         self,
-        sin: Tensor,
-        cos: Tensor,
-        joints: Tensor,
+        frames: Mapping[str, Frame],
         origin: Sequence[Tensor],
         direction: Sequence[Tensor],
         length: Tensor,
@@ -51,9 +45,7 @@ class Occluder(nn.Module):
         """Return whether straight paths run through the robot.
 
         Args:
-            sin: Sines of the joint positions of each path's row, ``[J, n]``.
-            cos: Their cosines, ``[J, n]``.
-            joints: Joint positions [rad], ``[J, n]``.
+            frames: Frames of ``links`` in the base frame, of each path's row.
             origin: Start of each path in the base frame [m], three of ``[n]``.
             direction: Unit directions in the base frame, three of ``[n, K]``.
             length: Lengths of the paths [m], ``[n, K]``.
@@ -61,7 +53,6 @@ class Occluder(nn.Module):
         Returns:
             ``[n, K]`` bool.
         """
-        frames = self._kinematics.frames_from(sin, cos, joints)
         hidden = torch.zeros_like(length, dtype=torch.bool)
         for link, shape, centre, turn in self._parts:
             rotation, position = frames[link]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Literal
 
+import numpy as np
 import pytorch_kinematics as pk
 import torch
 from tensordict import NestedKey
@@ -112,6 +113,7 @@ class RaySensor(ProximitySensor):
             slant.numpy(),
             body,
             per_object,
+            compile,
             in_keys,
             out_keys,
         )
@@ -121,7 +123,8 @@ class RaySensor(ProximitySensor):
         cone = torch.stack((cos_h, (1 - cos_h**2).sqrt()))[..., None]
         self.register_buffer("_cone", cone)
         self.register_buffer("_reach", self._range * slant[:, None])
-        self._margin_kernel: Callable[..., tuple[Tensor, View]] = self.margins
+        self._margin_kernel: Callable[..., tuple[Tensor, list[View]]]
+        self._margin_kernel = self.margins
         self._kernel: Callable[..., tuple[Tensor, Tensor]] = self.read
         if compile:
             self._margin_kernel = compiled(self.margins)
@@ -129,17 +132,29 @@ class RaySensor(ProximitySensor):
         # Temporaries of an uncompiled kernel should stay in the cache.
         self._chunk = 2**31 if compile else max(1, _CHUNK // self._beams.shape[-1])
 
-    def margins(self, scene: Scene, shape: Shape) -> tuple[Tensor, View]:
-        """Return by how much each sensor may see the object, and the link's view.
+    def margins(self, scene: Scene) -> tuple[Tensor, list[View]]:
+        """Return by how much each sensor may see each object.
 
         Returns:
-            Margin [m] ``[S, B]``, 0 only where no beam can hit in range.
+            Margin [m] ``[O, B, S]``, 0 only where no beam can hit in range, and the
+            objects as the links see them.
         """
-        view = self.view(scene, shape)
+        views = self.views(scene)
+        margins = [
+            torch.where(on, self._margin(view, shape), 0.0).t().contiguous()
+            for view, shape, on in zip(views, self.objects, scene.active, strict=True)
+        ]
+        return torch.stack(margins), views
+
+    def _margin(self, view: View, shape: Shape) -> Tensor:
+        """Margins of one object [m], ``[S, B]``."""
         x, y, z = self._in_sensor(
             view.centre[:, self._link] - self._offset.to(view.centre.dtype),
             self._axes.to(view.centre.dtype),
         )
+        if not self._cull:
+            # 1, or NaN.
+            return 1.0 + 0.0 * x
         cos_h, sin_h = self._cone.to(x)
         bound, flat = shape.bounding_radius, x * x + y * y
         # Outside the range, beside the cone of the beams, or behind the sensor:
@@ -147,7 +162,7 @@ class RaySensor(ProximitySensor):
         far = self._reach.to(x) + bound - (flat + z * z).sqrt()
         beside = bound - (flat.sqrt() * cos_h - z * sin_h)
         margin = torch.minimum(torch.minimum(far, beside), z + bound)
-        return (margin + _SLACK).clamp(min=0.0), view
+        return (margin + _SLACK).clamp(min=0.0)
 
     @staticmethod
     def _in_sensor(v: Tensor, axes: Tensor) -> list[Tensor]:
@@ -155,7 +170,12 @@ class RaySensor(ProximitySensor):
         return [a[0] * v[0] + a[1] * v[1] + a[2] * v[2] for a in axes]
 
     def read(
-        self, scene: Scene, view: View, sensor: Tensor, row: Tensor, shape: Shape
+        self,
+        scene: Scene,
+        view: View,
+        sensor: Tensor,
+        row: Tensor,
+        shape: Shape,
     ) -> tuple[Tensor, Tensor]:
         """Return what some pairs of sensor and row measure of one object.
 
@@ -200,22 +220,61 @@ class RaySensor(ProximitySensor):
         least = distance.amin(-1)
         return (least if self.reduce == "min" else distance), least
 
-    def measure(self, scene: Scene, shape: Shape, rows: Tensor, out: Tensor) -> Tensor:
-        """Lower readings to those of one object, and return the least of each row."""
-        margin, view = self._margin_kernel(scene, shape)
-        if not self._cull:
-            margin = torch.ones_like(margin)
-        num_sensors, num_rows = margin.shape
-        least = margin.new_full((num_rows,), torch.inf)
-        # A view, or an error: a copy would lose what is written.
-        flat = out.view(-1, *out.shape[2:])
-        # Whatever is not 0 may be hit, NaN too.
-        wanted = margin.view(-1).nonzero()[:, 0]
-        # Nothing wanted would still be a part, and compiled for its own sake.
-        for pairs in wanted.split(self._chunk) if len(wanted) else ():
-            sensor, row = pairs // num_rows, pairs % num_rows
-            reading, nearest = self._kernel(scene, view, sensor, row, shape)
-            target = rows[row] * num_sensors + sensor
-            flat[target] = torch.minimum(flat[target], reading)
-            least.scatter_reduce_(0, row, nearest, "amin")
+    def measure(self, scene: Scene, rows: Tensor | None, out: Tensor) -> Tensor:
+        """Write the readings of some rows, and return the least of each object."""
+        if rows is None:
+            out.fill_(torch.inf)
+        margins, views = self._margin_kernel(scene)
+        least = torch.full_like(margins[..., 0], torch.inf)
+        for i, (view, shape) in enumerate(zip(views, self.objects, strict=True)):
+            target = out[i] if self.per_object else out
+            # A view, or an error: a copy would lose what is written.
+            flat = target.view(-1, *target.shape[2:])
+            # Whatever is not 0 may be hit, NaN too.
+            pairs = _nonzero(margins[i])
+            # Nothing wanted would still be a part, and compiled for its own sake.
+            for part in pairs.split(self._chunk) if len(pairs) else ():
+                row, sensor = part // self.num_sensors, part % self.num_sensors
+                reading, nearest = self._kernel(scene, view, sensor, row, shape)
+                place = part
+                if rows is not None:
+                    place = rows[row] * self.num_sensors + sensor
+                if i and not self.per_object:
+                    reading = torch.minimum(_take(flat, place), reading)
+                _put(flat, place, reading)
+                least[i].scatter_reduce_(0, row, nearest, "amin")
         return least
+
+
+def _nonzero(x: Tensor) -> Tensor:
+    """Return the indices of the entries that are not 0, ``[n]``."""
+    if x.is_cpu:
+        # PyTorch's takes several times as long.
+        return torch.from_numpy(np.flatnonzero(x.detach().numpy() != 0))
+    return x.flatten().nonzero()[:, 0]
+
+
+# Rows of a grid are short: NumPy moves each as one item, PyTorch number by number,
+# which takes four times as long.
+
+
+def _items(x: Tensor) -> np.ndarray:
+    """Return the rows of a tensor as one item each, ``[n]``: a view."""
+    array = x.numpy()
+    return array.view(np.dtype((np.void, array[:1].nbytes))).reshape(-1)
+
+
+def _take(grid: Tensor, rows: Tensor) -> Tensor:
+    """Return some rows of a grid."""
+    if not grid.is_cpu or grid.requires_grad:
+        return grid[rows]
+    found = _items(grid)[rows.numpy()]
+    return torch.from_numpy(found.view(grid.numpy().dtype)).view(-1, *grid.shape[1:])
+
+
+def _put(grid: Tensor, rows: Tensor, values: Tensor) -> None:
+    """Write some rows of a grid."""
+    if not grid.is_cpu or values.requires_grad or grid.requires_grad:
+        grid[rows] = values
+    else:
+        _items(grid)[rows.numpy()] = _items(values.contiguous())

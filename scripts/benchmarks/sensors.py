@@ -155,14 +155,16 @@ def _measure(config: SensorBench) -> list[Row]:
     proximity = Proximity(_RANGE)
 
     for suffix, fast in (("", True), ("_eager", False)):
-        kernel = compiled(plain.frames_b) if fast else plain.frames_b
+        trig, kernel = plain._kinematics.trig, plain.frames_b
+        if fast:
+            trig, kernel = compiled(trig), compiled(kernel)
         field = FieldSensor(*args, [ball], _RANGE, compile=fast)
         ray = RaySensor(*args, [ball], _RANGE, compile=fast)
         ray_two = RaySensor(*args, [ball, ball], _RANGE, compile=fast)
         ray_min = RaySensor(*args, [ball], _RANGE, reduce="min", compile=fast)
 
-        def frames(state: State, kernel: Any = kernel) -> Any:
-            return kernel(*plain._kinematics.trig(state[1]))
+        def frames(state: State, trig: Any = trig, kernel: Any = kernel) -> Any:
+            return kernel(*trig(state[1]))
 
         def signal(state: State, sensor: FieldSensor = field) -> Any:
             return proximity.compute(sensor.compute(*state)[0])
