@@ -9,16 +9,26 @@ key                         shape         content                       read by
 =========================== ============= ============================= ==============
 from `egoskin.envs.dodgeball.DodgeballEnv` (all its keys: its docstring)
 ``base_pose``               ``[*B, 7]``   pose in the world [m]         sensors
-``joint_pos``               ``[*B, J]``   joint positions [rad]         sensors
+``joint_pos``               ``[*B, J]``   hinges [rad], slides [m]      sensors
 ``object_pose``             ``[*B, O, 7]`` pose in the world [m]        sensors
 ``object_active``           ``[*B, O]``   bool: in play                 sensors
-``tactile``                 ``[*B, L]``   bool: link touched something  -
+``tactile``                 ``[*B, L]``   bool: link touched something  tactile
 ``reward``, ``done``, ...   ``[*B, 1]``   TorchRL's                     PPO
 from `egoskin.sensors.FieldSensor` or ``RaySensor``
 ``distance``                ``[*B, S]``   or ``[*B, S, K]`` [m], inf: none signals
 ``object_detected``         ``[*B, O]``   bool: by any sensor           signals
+from `egoskin.sensors.corruption.Corruption`
+``reading``                 as distance   as a real sensor reports it   signals
+``reading_clock``           ``[*B, 2]``   episode, step                 itself
+``reading_i_*``             any           state of the i-th imperfection itself
 from `egoskin.sensors.Proximity`, ``Binary`` or ``Localization``
 ``signal``                  ``[*B, S]``   or ``[*B, 3]`` (localization) actor, critic
+from `egoskin.sensors.history`
+``last_signal``             as signal     the last one that saw         actor, critic
+``signal_history``          ``[*B, ...]`` the last signals              actor, critic
+from `egoskin.sensors.tactile`, in tasks of your own
+``contact_force``           ``[*B, L, 3]`` yours [N]                     tactile
+``contact_free``            ``[*B, 1]``   bool: untouched so far        -
 from `egoskin.observations`
 ``observation``             ``[*B, 6+2J]`` proprioception               actor, critic
 ``privileged_observation``  ``[*B, P]``   told in training only         critic

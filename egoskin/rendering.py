@@ -249,13 +249,30 @@ class Painter:
             pose = np.asarray(state["object_pose"], float)
             self._draw_sensors(detecting, pose[active], active)
         return Frame(
-            image=self._canvas.read(),
+            image=self.image(),
             time=time,
             gap=self._gap(active),
             num_detecting=int(detecting.sum()),
             num_sensors=len(detecting),
             ending=ending,
         )
+
+    def draw_line(
+        self, start: np.ndarray, end: np.ndarray, radius: float, rgba: Sequence[float]
+    ) -> None:
+        """Add a line to the state drawn last; it lasts until the next.
+
+        Args:
+            start: One end in the world [m], ``[3]``.
+            end: The other.
+            radius: Radius of the line [m].
+            rgba: Its colour and opacity.
+        """
+        self._canvas.add_line(start, end, radius, rgba)
+
+    def image(self) -> np.ndarray:
+        """Return the picture of the state drawn last, ``[H, W, 3]`` uint8."""
+        return self._canvas.read()
 
     def _place(self, state: TensorDictBase, active: np.ndarray) -> None:
         """Put the robot and the balls of the visual model where the state says."""

@@ -260,10 +260,9 @@ def views(robot: RobotConfig, skin: Skin) -> np.ndarray:
         painter = Painter(robot, skin, (), size=_VIEW_SIZE, camera=camera)
         with painter:
             painter.draw(state, time=0.0)
-            # The scene is still there, sensors and all: draw into it, read it again.
             for start, end in zip(starts, ends, strict=True):
-                painter._canvas.add_line(start, end, _NORMAL_RADIUS, _NORMAL_RGBA)
-            images.append(painter._canvas.read())
+                painter.draw_line(start, end, _NORMAL_RADIUS, _NORMAL_RGBA)
+            images.append(painter.image())
     return np.concatenate(images, axis=1)
 
 

@@ -19,7 +19,7 @@ ALLOWED = {
     "compilation": set(),
     "shapes": {"compilation"},
     "draws": set(),
-    "kinematics": set(),
+    "kinematics": {"compilation"},
     "surface": {"robots", "kinematics"},
     "transform": {"kinematics"},
     "observations": {"kinematics", "transform"},

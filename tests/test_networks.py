@@ -5,8 +5,15 @@ from __future__ import annotations
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.modules import IndependentNormal
 
-from egoskin.agents.networks import Agent, KeyedMLP, NetworkConfig, RunningNorm
+from egoskin.agents.networks import (
+    Agent,
+    KeyedMLP,
+    NetworkConfig,
+    RunningNorm,
+    SharedStdNormal,
+)
 
 SIZES = {"observation": 6, "signal": 5, "privileged_observation": 4}
 ACTOR = ["observation", "signal"]
@@ -109,3 +116,16 @@ def test_the_standard_deviation_stays_in_its_bounds():
 def test_bad_sizes_are_refused(field: dict, text: str):
     with pytest.raises(ValueError, match=text):
         NetworkConfig(**field)
+
+
+def test_the_distribution_is_that_of_torch():
+    generator = torch.Generator().manual_seed(0)
+    loc, action = torch.randn(2, 50, 3, generator=generator)
+    scale = torch.tensor([0.3, 1.0, 2.0]).expand(50, 3)
+    ours, theirs = SharedStdNormal(loc, scale), IndependentNormal(loc, scale)
+    torch.testing.assert_close(ours.log_prob(action), theirs.log_prob(action))
+    torch.testing.assert_close(ours.entropy(), theirs.entropy())
+    torch.manual_seed(1)
+    drawn = ours.sample()
+    torch.manual_seed(1)
+    assert torch.equal(drawn, theirs.sample())

@@ -240,7 +240,21 @@ def test_bench_loop_gives_its_rows(tmp_path: Path):
     )
     assert done.returncode == 0, done.stderr
     rows = json.loads((tmp_path / "loop.json").read_text())["rows"]
-    names = ["raw", "env", "sensors", "policy", "train_field"]
-    assert [row["name"] for row in rows] == names
+    by_name = {row["name"]: row for row in rows}
+    speeds = [
+        "raw",
+        "task",
+        "env",
+        "sensors",
+        "policy",
+        "train_field",
+        "train_ray_grid",
+    ]
+    for name in [*speeds, "memory_field", "memory_ray"]:
+        assert by_name[name]["value"] > 0
+    assert rows[0]["name"] == "raw"
     assert rows[0]["ratio"] == 1.0
-    assert all(row["value"] > 0 for row in rows)
+    # The parts of the wall time are what the whole of a step takes.
+    parts = [row["value"] for row in rows if row["name"].endswith("_wall")]
+    assert len(parts) == 7
+    assert sum(parts) == pytest.approx(1e6 / by_name["train_field"]["value"])

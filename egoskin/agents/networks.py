@@ -7,6 +7,7 @@ concatenation.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -78,7 +79,9 @@ class RunningNorm(nn.Module):
     def update(self, x: Tensor) -> None:
         """Take a batch of data into the statistics, ``[*B, size]``."""
         x = x.reshape(-1, x.shape[-1]).double()
-        n, mean, var = float(len(x)), x.mean(0), x.var(0, unbiased=False)
+        n, mean = float(len(x)), x.mean(0)
+        # Several times as fast as x.var(0).
+        var = (x - mean).square_().mean(0)
         total = self.count + n
         delta = mean - self.mean
         # Chan et al., parallel variance: M2 = M2a + M2b + delta^2 na nb / n.
@@ -172,6 +175,31 @@ class GaussianHead(nn.Module):
         self.log_std.clamp_(*self._bounds)
 
 
+class SharedStdNormal(IndependentNormal):
+    """Independent Gaussians whose standard deviations are the same in every row.
+
+    Its logarithm, and divisions by it, are those of one row: a tenth of an update.
+    """
+
+    def _row(self) -> Tensor:
+        scale = self.base_dist.scale
+        return scale.reshape(-1, scale.shape[-1])[0]
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Return the log-density of actions ``[*B, J]``, ``[*B]``."""
+        row = self._row()
+        # log p = -|(a - loc) / std|^2 / 2 - sum log std - J log(2 pi) / 2
+        z = (value - self.base_dist.loc) * row.reciprocal()
+        constant = row.log().sum() + 0.5 * math.log(2 * math.pi) * len(row)
+        return -0.5 * z.square().sum(-1) - constant
+
+    def entropy(self) -> Tensor:
+        """Return the entropy, ``[*B]``."""
+        row = self._row()
+        each = row.log().sum() + 0.5 * math.log(2 * math.pi * math.e) * len(row)
+        return each.expand(self.batch_shape)
+
+
 class Agent(nn.Module):
     """Actor, critic and their normalisers.
 
@@ -222,9 +250,11 @@ class Agent(nn.Module):
             ),
             in_keys=["loc", "scale"],
             out_keys=["action"],
-            distribution_class=IndependentNormal,
+            distribution_class=SharedStdNormal,
             # TorchRL's default is the mean, with which PPO learns nothing.
             default_interaction_type=InteractionType.RANDOM,
+            # A check of every number, at every call, for what cannot happen.
+            distribution_kwargs={"validate_args": False},
             return_log_prob=True,
             log_prob_key="action_log_prob",
         )

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import statistics
+import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
+import psutil
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.envs import EnvBase
 
 from benchmarks.report import Row, show
+from egoskin.agents.networks import RunningNorm
 from egoskin.agents.ppo import PPO, PPOConfig, collect
 from egoskin.checkpoint import part
 from egoskin.envs.dodgeball import DodgeballEnv
@@ -32,11 +37,12 @@ from egoskin.workers import WorkerPool
 
 @dataclass(frozen=True, kw_only=True)
 class LoopConfig:
-    """Environment steps/s of the training loop, layer by layer.
+    """Environment steps/s of the training loop, layer by layer, and where time goes.
 
     Every layer starts from the same recorded state of a training and replays its
     actions (raw also its throws and resets). Ratios to raw are medians over pairs
-    measured in turn, so that a busy machine does not bend them.
+    measured in turn, so that a busy machine does not bend them. What a layer adds to
+    the one before is told as wall time and as CPU time of all processes.
     """
 
     num_envs: int = 4096
@@ -105,6 +111,10 @@ class RecordingEnv(DodgeballEnv):
     physics_class = Recording
 
 
+Layer = tuple[Callable[[], Any], Callable[[Any], None]]
+"""What makes a layer ready, and what is timed."""
+
+
 def replay_raw(physics: Physics, written: list[tuple[str, tuple]]) -> None:
     """Do again what was written down, with nothing but MuJoCo's steps."""
     for method, args in written:
@@ -114,110 +124,243 @@ def replay_raw(physics: Physics, written: list[tuple[str, tuple]]) -> None:
 
 
 def loop(config: LoopConfig) -> list[Row]:
-    """Return the rows of the loop benchmark."""
-    workers = check_num_workers(config.num_envs, config.num_workers)
-    skin = config.env.skin.build(config.env.robot_config)
-    pools = {
-        name: make_env(
+    """Return the rows of the loop benchmark, of the field and of the ray grid."""
+    check_num_workers(config.num_envs, config.num_workers)
+    rows = []
+    for coverage in ("field", "ray"):
+        sensor = replace(config.env.sensor, coverage=coverage, reduce="none")
+        env = replace(config.env, sensor=sensor)
+        rows += _Loop(replace(config, env=env), coverage).rows()
+    return rows
+
+
+class _Loop:
+    """The layers of one training."""
+
+    def __init__(self, config: LoopConfig, coverage: str) -> None:
+        self.config, self._coverage = config, coverage
+        self._skin = config.env.skin.build(config.env.robot_config)
+        self._workers = check_num_workers(config.num_envs, config.num_workers)
+        self._steps = config.ppo.rollout_steps
+
+    def rows(self) -> list[Row]:
+        """Measure; return what is known of this training."""
+        pool = self._pool = self._make_pool()
+        pools = [pool]
+        try:
+            memory = self._train_and_record()
+            layers = {"raw": self._raw()}
+            again = partial(self._restore, pool)
+            if self._coverage == "field":
+                bare = self._make_pool(bare=True)
+                pools.append(bare)
+                layers["task"] = self._task()
+                layers["env"] = partial(self._restore, bare), self._replay(bare)
+                layers["sensors"] = again, self._replay(pool)
+                layers["policy"] = again, self._collect
+                layers["train_field"] = again, self._train
+                layers["normalisation"] = lambda: None, self._normalise
+            else:
+                layers["train_ray_grid"] = again, self._train
+            return [*self._time(layers), memory]
+        finally:
+            for each in pools:
+                each.close()
+
+    def _make_pool(self, bare: bool = False) -> WorkerPool:
+        config = self.config
+        return make_env(
             config.env,
-            skin,
+            self._skin,
             num_envs=config.num_envs,
-            num_workers=workers,
+            num_workers=self._workers,
             seed=config.seed,
-            bare=name == "env",
+            bare=bare,
         )
-        for name in ("env", "sensors")
-    }
-    try:
-        return _measure(config, skin, pools, workers)
-    finally:
-        for pool in pools.values():
-            pool.close()
 
+    def _train_and_record(self) -> Row:
+        """Train for a while, note a rollout to do again; return the memory it took."""
+        config, env = self.config, self._pool
+        torch.manual_seed(config.seed)
+        spec = PolicySpec(
+            env=config.env,
+            skin=self._skin,
+            network=config.ppo.network,
+            sizes={
+                k: env.observation_spec[k].shape[-1] for k in config.env.critic_keys
+            },
+            num_actions=env.action_spec.shape[-1],
+        )
+        self._agent = spec.build_agent()
+        self._ppo = PPO(self._agent, config.ppo)
+        root = env.reset()
+        with PeakMemory() as memory:
+            for i in range(max(config.warmup, 1)):
+                show(f"warming up: rollout {i + 1}/{config.warmup}")
+                rollout, root, _ = collect(env, self._agent, root, self._steps)
+                self._ppo.update(rollout)
+        self._start = save_env_state(env, root)
+        self._rollout, _, _ = collect(env, self._agent, root, self._steps)
+        self._actions = self._rollout["action"]
+        return Row(
+            name=f"memory_{self._coverage}",
+            value=memory.peak / 1e9,
+            unit="GB of PSS, all processes",
+            ratio=1.0,
+        )
 
-def _measure(
-    config: LoopConfig, skin: Any, pools: dict[str, WorkerPool], workers: int
-) -> list[Row]:
-    env, steps = pools["sensors"], config.ppo.rollout_steps
-    torch.manual_seed(config.seed)
-    spec = PolicySpec(
-        env=config.env,
-        skin=skin,
-        network=config.ppo.network,
-        sizes={k: env.observation_spec[k].shape[-1] for k in config.env.critic_keys},
-        num_actions=env.action_spec.shape[-1],
-    )
-    agent = spec.build_agent()
-    ppo = PPO(agent, config.ppo)
-    root = env.reset()
-    for i in range(config.warmup):
-        show(f"warming up: rollout {i + 1}/{config.warmup}")
-        rollout, root, _ = collect(env, agent, root, steps)
-        ppo.update(rollout)
-    start = save_env_state(env, root)
-    rollout, _, _ = collect(env, agent, root, steps)
-    actions = rollout["action"]
-    simulation = part("simulation", start)
-    recorder = RecordingEnv(
-        config.env.robot_config,
-        config.env.task,
-        num_envs=config.num_envs,
-        seed=config.seed,
-        num_threads=workers,
-    )
-    physics = recorder.physics
-    assert isinstance(physics, Recording)
-    physics.forget()
-    frame = recorder.reset()
-    recorder.load_simulation_state(simulation)
-    physics.forget()
-    for action in actions:
-        frame["action"] = action
-        _, frame = recorder.step_and_maybe_reset(frame)
-    written = physics.written
+    def _restore(self, pool: WorkerPool) -> TensorDictBase:
+        return load_env_state(pool, self._start)
 
-    def restore(pool: WorkerPool) -> TensorDictBase:
-        return load_env_state(pool, start)
+    def _replay(self, env: EnvBase) -> Callable[[TensorDictBase], None]:
+        def run(root: TensorDictBase) -> None:
+            for action in self._actions.reshape(self._steps, *root.batch_size, -1):
+                root["action"] = action
+                _, root = env.step_and_maybe_reset(root)
 
-    def replay(pool: WorkerPool, root: TensorDictBase) -> None:
-        for action in actions.reshape(steps, *root.batch_size, -1):
-            root["action"] = action
-            _, root = pool.step_and_maybe_reset(root)
+        return run
 
-    def policy(root: TensorDictBase) -> None:
-        collect(env, agent, root, steps)
+    def _collect(self, root: TensorDictBase) -> None:
+        collect(self._pool, self._agent, root, self._steps)
 
-    def train(root: TensorDictBase) -> None:
-        ppo.update(collect(env, agent, root, steps)[0])
+    def _train(self, root: TensorDictBase) -> None:
+        self._ppo.update(collect(self._pool, self._agent, root, self._steps)[0])
 
-    layers: dict[str, tuple[Callable[[], Any], Callable[[Any], None]]] = {
-        "raw": (
+    def _normalise(self, _: None) -> None:
+        """Take a rollout into the normalisers, as an update does, and back out."""
+        norms = self._agent.norms
+        before = {k: v.clone() for k, v in norms.state_dict().items()}
+        for key, norm in norms.items():
+            assert isinstance(norm, RunningNorm)
+            norm.update(self._rollout[key])
+        norms.load_state_dict(before)
+
+    def _recorder(self) -> RecordingEnv:
+        env = RecordingEnv(
+            self.config.env.robot_config,
+            self.config.env.task,
+            num_envs=self.config.num_envs,
+            seed=self.config.seed,
+            num_threads=self._workers,
+        )
+        assert isinstance(env.physics, Recording)
+        env.physics.forget()
+        return env
+
+    def _raw(self) -> Layer:
+        """MuJoCo's steps alone, in this process."""
+        env, simulation = self._recorder(), part("simulation", self._start)
+        physics = env.physics
+        assert isinstance(physics, Recording)
+        root = env.reset()
+        env.load_simulation_state(simulation)
+        physics.forget()
+        self._replay(env)(root)
+        written = physics.written
+        return (
             lambda: physics.load_state(simulation["physics"]),
             lambda _: replay_raw(physics, written),
-        ),
-        "env": (lambda: restore(pools["env"]), lambda r: replay(pools["env"], r)),
-        "sensors": (lambda: restore(env), lambda r: replay(env, r)),
-        "policy": (lambda: restore(env), policy),
-        "train_field": (lambda: restore(env), train),
+        )
+
+    def _task(self) -> Layer:
+        """The task in this process, without workers, observations and sensors."""
+        env, simulation = self._recorder(), part("simulation", self._start)
+        env.reset()
+
+        def restore() -> TensorDictBase:
+            root = env.reset()
+            env.load_simulation_state(simulation)
+            cast(Recording, env.physics).forget()
+            return root
+
+        return restore, self._replay(env)
+
+    def _time(self, layers: dict[str, Layer]) -> list[Row]:
+        """Time the layers in turn; return their speeds and what each adds."""
+        frames = self._steps * self.config.num_envs
+        wall: dict[str, list[float]] = {name: [] for name in layers}
+        cpu: dict[str, list[float]] = {name: [] for name in layers}
+        for i in range(self.config.rounds):
+            for name, (prepare, run) in layers.items():
+                show(f"round {i + 1}/{self.config.rounds}: {name}")
+                prepared = prepare()
+                begin, used = time.perf_counter(), _cpu_time()
+                run(prepared)
+                wall[name].append(1e6 * (time.perf_counter() - begin) / frames)
+                cpu[name].append(1e6 * (_cpu_time() - used) / frames)
+        show("")
+        raw = wall["raw"]
+        rows = [
+            Row(
+                name=name if name != "raw" or self._coverage == "field" else "raw_ray",
+                value=1e6 / statistics.median(values),
+                unit="environment steps/s",
+                ratio=statistics.median(
+                    r / v for r, v in zip(raw, values, strict=True)
+                ),
+            )
+            for name, values in wall.items()
+            if name != "normalisation"
+        ]
+        if self._coverage == "field":
+            rows += _parts(wall, "wall") + _parts(cpu, "CPU")
+        return rows
+
+
+def _processes() -> list[psutil.Process]:
+    """This process and all that it started."""
+    return [psutil.Process(), *psutil.Process().children(recursive=True)]
+
+
+def _cpu_time() -> float:
+    """CPU time of all processes so far [s]."""
+    times = [process.cpu_times() for process in _processes()]
+    return sum(t.user + t.system for t in times)
+
+
+def _parts(times: dict[str, list[float]], kind: str) -> list[Row]:
+    """What each layer adds to the one before, as shares of physics [us]."""
+    median = {name: statistics.median(values) for name, values in times.items()}
+    loss = median["train_field"] - median["policy"] - median["normalisation"]
+    parts = {
+        "physics": median["raw"],
+        "task": median["task"] - median["raw"],
+        "transport": median["env"] - median["task"],
+        "sensors": median["sensors"] - median["env"],
+        "policy": median["policy"] - median["sensors"],
+        "normalisation": median["normalisation"],
+        "loss": loss,
     }
-    speeds: dict[str, list[float]] = {name: [] for name in layers}
-    frames = steps * config.num_envs
-    for i in range(config.rounds):
-        for name, (prepare, run) in layers.items():
-            show(f"round {i + 1}/{config.rounds}: {name}")
-            prepared = prepare()
-            begin = time.perf_counter()
-            run(prepared)
-            speeds[name].append(frames / (time.perf_counter() - begin))
-    show("")
     return [
         Row(
-            name=name,
-            value=statistics.median(values),
-            unit="environment steps/s",
-            ratio=statistics.median(
-                v / raw for v, raw in zip(values, speeds["raw"], strict=True)
-            ),
+            name=f"{name}_{kind.lower()}",
+            value=value,
+            unit=f"us of {kind} time per environment step",
+            ratio=value / parts["physics"],
         )
-        for name, values in speeds.items()
+        for name, value in parts.items()
     ]
+
+
+class PeakMemory:
+    """Largest proportional set size of all processes while it is open."""
+
+    def __init__(self) -> None:
+        self.peak = 0
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._watch)
+
+    def __enter__(self) -> PeakMemory:
+        """Start to watch."""
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        """Stop watching."""
+        self._closed.set()
+        self._thread.join()
+
+    def _watch(self) -> None:
+        while not self._closed.wait(0.1):
+            now = sum(p.memory_full_info().pss for p in _processes())
+            self.peak = max(self.peak, now)
