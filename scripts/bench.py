@@ -3,6 +3,7 @@
 python scripts/bench.py loop --json loop.json
 python scripts/bench.py sensors
 python scripts/bench.py physics
+python scripts/bench.py accuracy
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import sys
 
 import tyro
 
+from benchmarks.accuracy import AccuracyBench, accuracy_rows
 from benchmarks.loop import LoopConfig, loop
 from benchmarks.physics import PhysicsBench, physics_rows
 from benchmarks.report import report
@@ -24,12 +26,19 @@ from egoskin.cli import clear_errors
 
 def main(args: list[str]) -> None:
     """Run the command."""
-    benches = {"loop": LoopConfig, "physics": PhysicsBench, "sensors": SensorBench}
+    benches = {
+        "loop": LoopConfig,
+        "physics": PhysicsBench,
+        "sensors": SensorBench,
+        "accuracy": AccuracyBench,
+    }
     config = tyro.extras.subcommand_cli_from_dict(benches, args=args)
     if isinstance(config, LoopConfig):
         rows = loop(config)
     elif isinstance(config, PhysicsBench):
         rows = physics_rows(config)
+    elif isinstance(config, AccuracyBench):
+        rows = accuracy_rows(config)
     else:
         rows = sensor_rows(config)
     report(rows, config.json)

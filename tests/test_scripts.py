@@ -258,3 +258,14 @@ def test_bench_loop_gives_its_rows(tmp_path: Path):
     parts = [row["value"] for row in rows if row["name"].endswith("_wall")]
     assert len(parts) == 7
     assert sum(parts) == pytest.approx(1e6 / by_name["train_field"]["value"])
+
+
+def test_bench_accuracy_compares_two_rates(tmp_path: Path):
+    args = ("--throws", "6", "--json", tmp_path / "accuracy.json")
+    done = run("bench.py", "accuracy", *args)
+    assert done.returncode == 0, done.stderr
+    rows = json.loads((tmp_path / "accuracy.json").read_text())["rows"]
+    by_name = {row["name"]: row for row in rows}
+    # Standing shows the same forces; the ball is met within a control step.
+    assert by_name["stand_floor_force"]["ratio"] < 0.01
+    assert 0 < by_name["impact_time"]["ratio"] < 1
