@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 ARGS ?=
 
-.PHONY: train test test-slow check bench clean
+.PHONY: train test test-slow test-memory verify check bench clean
 
 train: $(VENV)/run
 	$(BIN)/python scripts/ppo.py $(ARGS)
@@ -14,6 +14,13 @@ test: $(VENV)/dev
 
 test-slow: $(VENV)/dev
 	$(BIN)/python -m pytest -m slow $(ARGS)
+
+# Half an hour of training: does it grow?
+test-memory: $(VENV)/dev
+	EGOSKIN_MEMORY_MINUTES=30 $(BIN)/python -m pytest -m slow -s -k memory $(ARGS)
+
+verify: $(VENV)/run
+	$(BIN)/python scripts/verify.py $(ARGS)
 
 check: $(VENV)/dev
 	$(BIN)/ruff check .

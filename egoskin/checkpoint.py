@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,8 @@ from safetensors.torch import save
 from torch import Tensor
 
 _HEADER = "egoskin"
+# Names of files that were being written when their writer was killed.
+PARTIAL = ".*.partial"
 
 
 def save_tensors(
@@ -35,6 +38,17 @@ def save_tensors(
         {key: value.detach().cpu().contiguous() for key, value in tensors.items()},
         metadata={_HEADER: json.dumps(header)},
     )
+    write_file(path, content)
+
+
+def write_file(path: Path, content: bytes) -> None:
+    """Write a file; it is complete, on disk, or as it was before.
+
+    A process that is killed while it writes leaves a file that `PARTIAL` matches.
+
+    Raises:
+        OSError: If it cannot be written; the text names the file.
+    """
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         with open(partial, "wb") as file:
@@ -42,13 +56,21 @@ def save_tensors(
             file.flush()
             os.fsync(file.fileno())
         os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
-    folder = os.open(path.parent, os.O_RDONLY)
+        sync(path.parent)
+    except OSError as error:
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)
+        # The system's own text of a full disk names no file.
+        raise OSError(error.errno, error.strerror, str(path)) from error
+
+
+def sync(path: Path) -> None:
+    """Wait until a file or folder is on disk."""
+    descriptor = os.open(path, os.O_RDONLY)
     try:
-        os.fsync(folder)
+        os.fsync(descriptor)
     finally:
-        os.close(folder)
+        os.close(descriptor)
 
 
 def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:

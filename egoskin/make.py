@@ -95,6 +95,7 @@ def make_worker_env(
     hold: bool = False,
     keep_raw: bool = False,
     bare: bool = False,
+    compile_kernels: bool = False,
 ) -> TransformedEnv:
     """Return the batched environment of one process, with its transforms.
 
@@ -109,6 +110,7 @@ def make_worker_env(
         keep_raw: Whether the raw state stays in the output.
         bare: Whether to leave out observations and sensors (to measure what they
             cost).
+        compile_kernels: Whether to compile the sensors; results are the same.
     """
     robot = config.robot_config
     env = DodgeballEnv(
@@ -137,6 +139,7 @@ def make_worker_env(
                 seed=seed,
                 row_offset=row_offset,
                 out_key=f"signal{suffix}",
+                compile_kernels=compile_kernels,
             ),
         ]
         if suffix:
@@ -163,8 +166,10 @@ def make_env(
     num_envs: int,
     seed: int,
     num_workers: int | None = None,
+    num_threads: int = 1,
     hold: bool = False,
     bare: bool = False,
+    compile_kernels: bool = False,
 ) -> WorkerPool:
     """Return a ParallelEnv of ``num_workers`` processes, ``[W, num_envs / W]`` rows.
 
@@ -175,8 +180,10 @@ def make_env(
         seed: Seed of all draws; results do not depend on the number of workers.
         num_workers: Processes; by default the largest divisor of ``num_envs`` not
             above the cores.
+        num_threads: Physics threads of each worker.
         hold: Whether the robots are held rigid in their default pose.
         bare: Whether to leave out observations and sensors.
+        compile_kernels: Whether to compile the sensors; results are the same.
 
     Raises:
         ValueError: If the workers do not divide the agents.
@@ -192,11 +199,14 @@ def make_env(
                 num_envs=rows,
                 seed=seed,
                 row_offset=i * rows,
+                num_threads=num_threads,
                 hold=hold,
                 bare=bare,
+                compile_kernels=compile_kernels,
             )
             for i in range(workers)
-        ]
+        ],
+        compiles=compile_kernels,
     )
 
 

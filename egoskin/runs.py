@@ -6,6 +6,7 @@
     metrics.csv              one line for each rollout; TensorBoard files beside it
     checkpoint.safetensors   everything needed to go on, at most a minute old
     policies/<frames>.safetensors   self-contained policies, from the first on
+    not-finite-<frames>.safetensors   an update that failed, for scripts/replay.py
 
 Contract: a checkpoint is written atomically, and metrics written after it are dropped
 on resume, so that a log has neither a gap nor a repetition.
@@ -17,11 +18,13 @@ import argparse
 import csv
 import datetime
 import importlib.metadata
+import io
 import json
 import os
 import platform
 import subprocess
 import sys
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,14 +33,14 @@ from typing import Annotated, Any
 import torch
 import tyro
 from torch import Tensor
-from torch.utils.tensorboard.writer import SummaryWriter
 
 from egoskin.agents.ppo import PPOConfig
-from egoskin.checkpoint import load_tensors, save_tensors
+from egoskin.checkpoint import PARTIAL, load_tensors, save_tensors, sync, write_file
 from egoskin.cli import changed_fields, from_plain, to_plain
+from egoskin.compilation import can_compile
+from egoskin.events import EventFile
 from egoskin.make import EnvConfig, check_num_workers
 from egoskin.policies import CHECKPOINT_NAME
-from egoskin.sensors import Skin
 
 _PACKAGES = ("egoskin", "torch", "torchrl", "tensordict", "mujoco", "numpy")
 _PACKAGES += ("pytorch-kinematics", "gymnasium")
@@ -67,6 +70,10 @@ class TrainConfig:
     """Folder of the run; None: a new one under runs/, named after time and sensor."""
     snapshot_frames: int = 5_000_000
     """Environment steps between the policies kept for learning curves."""
+    checkpoint_interval: float = 60.0
+    """A checkpoint is at most this old [s]."""
+    compile_kernels: bool = False
+    """Compile the sensors, for the same results; takes up to a minute at each start."""
     resume: Path | None = None
     """Run folder to go on with; only --total-frames may be changed, to a later end."""
 
@@ -83,6 +90,10 @@ class TrainConfig:
             raise ValueError(
                 f"learner_threads must be at least 1, got {self.learner_threads}"
             )
+        if not self.checkpoint_interval > 0:
+            raise ValueError(
+                f"checkpoint_interval must be positive, got {self.checkpoint_interval}"
+            )
         check_num_workers(self.num_envs, self.num_workers)
         frames = self.num_envs * self.ppo.rollout_steps
         if frames < self.ppo.num_mini_batches:
@@ -95,6 +106,20 @@ class TrainConfig:
     def frames_per_batch(self) -> int:
         """Environment steps of one rollout."""
         return self.num_envs * self.ppo.rollout_steps
+
+    def check_machine(self) -> None:
+        """Raise ValueError for what this machine lacks: the device, a C++ compiler."""
+        self.learner_device()
+        if not self.compile_kernels:
+            return
+        with warnings.catch_warnings():
+            # It says that kernels will run uncompiled: not here.
+            warnings.simplefilter("ignore")
+            if not can_compile():
+                raise ValueError(
+                    "the run compiles its kernels (compile_kernels), but there is no "
+                    "C++ compiler here: install g++"
+                )
 
     def learner_device(self) -> torch.device:
         """Return the device of the learner.
@@ -171,16 +196,17 @@ class Run:
 
     def __init__(self, path: Path, config: TrainConfig) -> None:
         self.path, self.config = path, config
-        self._writer: SummaryWriter | None = None
+        self._events: EventFile | None = None
         self._columns: list[str] | None = None
 
     @classmethod
-    def create(cls, config: TrainConfig, skin: Skin) -> Run:
+    def create(cls, config: TrainConfig) -> Run:
         """Return a new run folder that holds the configuration and the skin.
 
         Raises:
-            ValueError: If the folder holds anything already.
+            ValueError: If the folder holds anything already, or the skin is none.
         """
+        skin = config.env.skin.build(config.env.robot_config)
         path = config.run_dir
         if path is None:
             sensor = config.env.sensor
@@ -196,8 +222,9 @@ class Run:
             )
         (path / "policies").mkdir(parents=True)
         run = cls(path, config)
-        run.write_config()
         skin.save(run.skin_path)
+        # Last: a folder with a configuration can be resumed.
+        run.write_config()
         return run
 
     @classmethod
@@ -221,9 +248,7 @@ class Run:
         content = to_plain(self.config)
         for name in _CALL_FIELDS:
             content[name] = None
-        partial = self.path / ".config.json.partial"
-        partial.write_text(json.dumps(content, indent=2) + "\n")
-        os.replace(partial, self.path / "config.json")
+        self._write_json("config.json", content)
 
     def record_start(self) -> None:
         """Append versions, machine, git state and command of this start."""
@@ -240,7 +265,10 @@ class Run:
                 "git": _git_state(),
             }
         )
-        file.write_text(json.dumps(starts, indent=2) + "\n")
+        self._write_json(file.name, starts)
+
+    def _write_json(self, name: str, content: Any) -> None:
+        write_file(self.path / name, (json.dumps(content, indent=2) + "\n").encode())
 
     @property
     def skin_path(self) -> Path:
@@ -256,12 +284,30 @@ class Run:
         """The policy kept after a number of environment steps."""
         return self.path / "policies" / f"{frames:012d}.safetensors"
 
+    def dump_path(self, frames: int) -> Path:
+        """Where an update that is not finite is written, after a number of steps."""
+        return self.path / f"not-finite-{frames:012d}.safetensors"
+
+    @property
+    def _metrics_path(self) -> Path:
+        return self.path / "metrics.csv"
+
+    def is_new(self) -> bool:
+        """Whether there is nothing to go on from, though it may have been started."""
+        return not (self.checkpoint_path.exists() or self._metrics_path.exists())
+
+    def how_to_go_on(self) -> str:
+        """Return what to do after a stop or a failure."""
+        if not (self.path / "config.json").is_file():
+            return f"{self.path} cannot be gone on with: start a new run"
+        return f"go on with: python scripts/ppo.py --resume {self.path}"
+
     def save_checkpoint(
         self, tensors: Mapping[str, Tensor], header: Mapping[str, Any]
     ) -> None:
-        """Replace the checkpoint; everything logged so far is on disk before it."""
-        if self._writer is not None:
-            self._writer.flush()
+        """Replace the checkpoint; all metrics so far are on disk before it."""
+        if self._metrics_path.exists():
+            sync(self._metrics_path)
         save_tensors(self.checkpoint_path, tensors, header)
 
     def load_checkpoint(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -270,26 +316,24 @@ class Run:
 
     def start_metrics(self, frames: int) -> None:
         """Open the logs, dropping what was logged after a number of frames."""
-        file = self.path / "metrics.csv"
-        if file.exists():
-            with open(file, newline="") as source:
+        for left in self.path.rglob(PARTIAL):
+            left.unlink()
+        if self._metrics_path.exists():
+            with open(self._metrics_path, newline="") as source:
                 rows = list(csv.DictReader(source))
             # A line that a crash cut short lacks columns.
             whole = [row for row in rows if None not in row.values()]
             kept = [row for row in whole if int(row["frames"]) <= frames]
             if kept:
                 self._columns = list(kept[0])
-                partial = file.with_suffix(".partial")
-                with open(partial, "w", newline="") as target:
-                    writer = csv.DictWriter(target, self._columns)
-                    writer.writeheader()
-                    writer.writerows(kept)
-                os.replace(partial, file)
+                text = io.StringIO()
+                writer = csv.DictWriter(text, self._columns)
+                writer.writeheader()
+                writer.writerows(kept)
+                write_file(self._metrics_path, text.getvalue().encode())
             else:
-                file.unlink()
-        self._writer = SummaryWriter(
-            str(self.path), purge_step=frames + 1 if frames else None
-        )
+                self._metrics_path.unlink()
+        self._events = EventFile(self.path, frames)
 
     def log(self, metrics: Mapping[str, float]) -> None:
         """Append a line of metrics; the first fixes the columns.
@@ -297,24 +341,21 @@ class Run:
         Args:
             metrics: Values by name; "frames" is the x axis.
         """
-        assert self._writer is not None, "start_metrics first"
+        assert self._events is not None, "start_metrics first"
         first = self._columns is None
         if self._columns is None:
             self._columns = list(metrics)
-        with open(self.path / "metrics.csv", "a", newline="") as file:
+        with open(self._metrics_path, "a", newline="") as file:
             writer = csv.DictWriter(file, self._columns)
             if first:
                 writer.writeheader()
             writer.writerow(dict(metrics))
-        frames = int(metrics["frames"])
-        for name, value in metrics.items():
-            if name != "frames":
-                self._writer.add_scalar(name, value, frames)
+        self._events.log(metrics)
 
     def close(self) -> None:
         """Close the logs."""
-        if self._writer is not None:
-            self._writer.close()
+        if self._events is not None:
+            self._events.close()
 
 
 def _version(package: str) -> str | None:

@@ -3,32 +3,49 @@
 TorchRL's parent polls shared flags in a busy loop, which takes a core away from the
 physics; reports of a dead worker only that it is dead; and waits thousands of seconds
 for one that hangs. Everything else is TorchRL's.
+
+Contract: no worker and no file of a pool outlives the parent, however it ends.
 """
 
 from __future__ import annotations
 
+import atexit
+import functools
 import os
 import shutil
 import signal
+import subprocess
 import tempfile
 import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from multiprocessing import parent_process, set_forkserver_preload
+from multiprocessing import (
+    forkserver,
+    parent_process,
+    resource_tracker,
+    set_forkserver_preload,
+    util,
+)
 from pathlib import Path
+from threading import Event, Thread
+from typing import NoReturn
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase, ParallelEnv, Transform, TransformedEnv
 
+from egoskin import watchdog
+from egoskin.watchdog import Watch
+
 # Shorter than a hundredth of any batched step, long enough to cost no CPU [s].
 _POLL = 2e-4
-# How often the health of the workers is looked at [s].
-_HEALTH_CHECK = 0.2
-# A worker that takes longer than this for one command hangs [s].
-_HANG = 25.0
+# The reset and the first steps of a worker that compiles [commands], and how long it
+# may take for each: compilers of several workers share the cores [s].
+_COMPILE_COMMANDS, _COMPILE_LIMIT = 4, 600.0
+# The server tells of a death soon after the channel of the dead closes [s].
+_DEATH_NOTICE = 5.0
 
 
 class WorkerError(RuntimeError):
@@ -76,6 +93,11 @@ class WorkerEnv(TransformedEnv):
         with _reported(self._report):
             return super().reset(tensordict, **kwargs)
 
+    def answer(self, method: str, *args: object) -> object:
+        """Return what a method of the base environment returns."""
+        with _reported(self._report):
+            return getattr(self.base_env, method)(*args)
+
 
 @contextmanager
 def _reported(report: Path) -> Iterator[None]:
@@ -91,16 +113,51 @@ class _Build:
 
     def __init__(self, build: Callable[[], WorkerEnv | EnvBase], report: Path) -> None:
         self._build, self._report = build, report
+        self._parent = os.getpid()
 
     def __call__(self) -> WorkerEnv:
-        if parent_process() is not None:
-            # Ctrl-C reaches the whole group; when to end is the parent's decision.
-            signal.signal(signal.SIGINT, signal.SIG_IGN)
+        # TorchRL also builds one in the parent, to read its specs.
+        in_worker = os.getpid() != self._parent
+        if in_worker:
+            Thread(target=_end_with_parent, daemon=True).start()
         with _reported(self._report):
             env = self._build()
             assert isinstance(env, TransformedEnv)
             base, transform = env.base_env, env.transform.clone()
-            return WorkerEnv(base, transform, self._report)
+            built = WorkerEnv(base, transform, self._report)
+        if in_worker:
+            _ready(self._report).touch()
+        return built
+
+
+def _end_with_parent() -> None:
+    """End as soon as the parent has, which may have got a SIGKILL."""
+    parent = parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+@functools.cache
+def _temporary_folder() -> str:
+    """Return a folder that is removed when this process ends, however it does.
+
+    It is multiprocessing's own, with the socket of the server that forks the workers.
+    A process that is killed removes nothing, so a shell waits for its end: for a line
+    if multiprocessing will remove the folder, for the end of file if nobody does.
+    """
+    folder = util.get_temp_dir()
+    script = 'trap "" INT TERM HUP; read -r line || rm -rf -- "$0"'
+    command = ["sh", "-c", script, folder]
+    # In a session of its own: a SIGKILL may go to the whole group.
+    shell = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)
+    atexit.register(shell.communicate, b"\n")
+    return folder
+
+
+def _ready(report: Path) -> Path:
+    """File that says that the worker of a report has built its env."""
+    return report.with_suffix(".ready")
 
 
 class WorkerPool(ParallelEnv):
@@ -108,10 +165,15 @@ class WorkerPool(ParallelEnv):
 
     Args:
         builders: What builds the transformed environment of each worker.
+        compiles: Whether the workers compile kernels in their first steps, so that
+            these may take minutes.
     """
 
-    def __init__(self, builders: Sequence[Callable[[], EnvBase]]) -> None:
-        self._reports = Path(tempfile.mkdtemp(prefix="egoskin-workers-"))
+    def __init__(
+        self, builders: Sequence[Callable[[], EnvBase]], *, compiles: bool = False
+    ) -> None:
+        self._reports = Path(tempfile.mkdtemp(dir=_temporary_folder()))
+        self._compiles = compiles
         threads = torch.get_num_threads()
         # Workers are forked from a clean server that has imported everything once:
         # no thread of this process is copied, and no import is paid for per worker.
@@ -133,39 +195,128 @@ class WorkerPool(ParallelEnv):
         """Give every worker the state of all rows; each takes its own."""
         self._ask("load_simulation_state", state)
 
+    def step_and_maybe_reset(
+        self, tensordict: TensorDictBase
+    ) -> tuple[TensorDictBase, TensorDictBase]:
+        """Return TorchRL's (step, next root) pair."""
+        with self._death_explained():
+            return super().step_and_maybe_reset(tensordict)
+
+    def reset(
+        self, tensordict: TensorDictBase | None = None, **kwargs: object
+    ) -> TensorDictBase:
+        """Return the reset tensordict."""
+        with self._death_explained():
+            return super().reset(tensordict, **kwargs)
+
     def _ask(self, method: str, *args: object) -> list:
         """Return what a method of every worker's environment answers."""
         if self.is_closed:
             self.start()
-        for channel in self.parent_channels:
-            channel.send((method, (args, {})))
-        return [channel.recv()[1] for channel in self.parent_channels]
+        channels = self.parent_channels
+        with self._death_explained():
+            # Tensors travel in shared memory: a message never fills the channel.
+            for channel in channels:
+                channel.send(("answer", ((method, *args), {})))
+            self._wait(range(len(channels)), lambda worker: channels[worker].poll())
+            return [channel.recv()[1] for channel in channels]
 
     def _report(self, worker: int) -> Path:
         return self._reports / f"worker-{worker}.txt"
 
+    def _start_workers(self) -> None:
+        """Start the workers; raise if one cannot."""
+        # Ctrl-C and a batch system's SIGTERM reach the whole group, but when to end is
+        # the parent's decision. The server and the workers inherit the signal mask.
+        # The tracker comes first: its own start unblocks them.
+        resource_tracker.ensure_running()
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+        try:
+            forkserver.ensure_running()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        self._reports.mkdir(exist_ok=True)
+        self._compile_commands = _COMPILE_COMMANDS if self._compiles else 0
+        started = Event()
+        self._workers, self._hung = [], {}
+        watch = Thread(target=self._watch_start, args=(started,), daemon=True)
+        watch.start()
+        try:
+            super()._start_workers()
+        finally:
+            started.set()
+            watch.join()
+
+    def _watch_start(self, started: Event) -> None:
+        """Kill workers that hang while they start: the parent blocks on a channel."""
+        watches: dict[int, Watch] = {}
+        while not started.wait(watchdog.INTERVAL):
+            for worker, process in enumerate(list(self._workers)):
+                if _ready(self._report(worker)).exists():
+                    continue
+                watch = watches.setdefault(worker, Watch(process.pid))
+                watch.look()
+                if watch.hangs(watchdog.LIMIT):
+                    self._hung[worker] = watch.describe()
+                    process.kill()
+
+    def _cleanup_failed_worker_startup(self) -> None:
+        """Raise; TorchRL calls this when a worker has ended while it was started."""
+        self._explain_death()
+
     def _wait_for_workers(self, workers_range: Iterable[int]) -> None:
         """Sleep until the workers have set their flags; raise if one cannot."""
-        pending = [self._worker_indices[i] for i in workers_range]
-        waited, flags = list(pending), self._shm_done_flags
-        start = last_check = time.monotonic()
-        while True:
-            pending = [i for i in pending if not flags[i]]
-            if not pending:
-                break
+        workers, flags = list(workers_range), self._shm_done_flags
+        indices = self._worker_indices
+        self._wait(workers, lambda worker: bool(flags[indices[worker]]))
+        for worker in workers:
+            flags[indices[worker]] = 0
+
+    def _wait(self, workers: Iterable[int], answered: Callable[[int], bool]) -> None:
+        """Sleep until the workers have answered a command; raise if one cannot."""
+        limit = watchdog.LIMIT
+        if self._compile_commands:
+            limit, self._compile_commands = _COMPILE_LIMIT, self._compile_commands - 1
+        watches = {worker: Watch(self._workers[worker].pid) for worker in workers}
+        looked = time.monotonic()
+        while watches := {i: w for i, w in watches.items() if not answered(i)}:
             now = time.monotonic()
-            if now - last_check > _HEALTH_CHECK:
-                last_check = now
-                for worker in pending:
-                    if not self._workers[worker].is_alive() and not flags[worker]:
+            if now - looked > watchdog.INTERVAL:
+                looked = now
+                for worker, watch in watches.items():
+                    if not self._workers[worker].is_alive() and not answered(worker):
                         self._fail(worker, self._death(worker))
-                    if now - start > _HANG:
-                        self._fail(worker, f"hung: no answer within {_HANG:.0f} s")
+                    watch.look()
+                    if watch.hangs(limit):
+                        self._fail(worker, f"hung: {watch.describe()}")
             time.sleep(_POLL)
-        for worker in waited:
-            flags[worker] = 0
+
+    @contextmanager
+    def _death_explained(self) -> Iterator[None]:
+        """Say how a worker ended, where TorchRL or a channel only say that one did."""
+        if not self.is_closed:
+            for worker, process in enumerate(self._workers):
+                if not process.is_alive():
+                    self._fail(worker, self._death(worker))
+        try:
+            yield
+        except (EOFError, ConnectionError):
+            self._explain_death()
+
+    def _explain_death(self) -> NoReturn:
+        """Raise, saying which worker ended and how."""
+        deadline = time.monotonic() + _DEATH_NOTICE
+        while time.monotonic() < deadline:
+            for worker, process in enumerate(self._workers):
+                if not process.is_alive():
+                    self._fail(worker, self._death(worker))
+            time.sleep(_POLL)
+        self._end()
+        raise WorkerError("the channel to a worker broke; all were ended")
 
     def _death(self, worker: int) -> str:
+        if worker in self._hung:
+            return f"hung while it started: {self._hung[worker]}"
         report = self._report(worker)
         if report.exists():
             return f"raised\n{report.read_text()}"
@@ -174,8 +325,13 @@ class WorkerPool(ParallelEnv):
             return f"was killed by {signal.Signals(-code).name}"
         return f"ended with exit status {code}"
 
-    def _fail(self, worker: int, reason: str) -> None:
+    def _fail(self, worker: int, reason: str) -> NoReturn:
         """End all workers and raise."""
+        self._end()
+        raise WorkerError(f"worker {worker} of {self.num_workers} {reason}")
+
+    def _end(self) -> None:
+        """Kill all workers."""
         for process in self._workers:
             process.kill()
         for process in self._workers:
@@ -185,10 +341,12 @@ class WorkerPool(ParallelEnv):
         # Nothing is left to close; TorchRL would wait for answers that never come.
         self.is_closed = True
         shutil.rmtree(self._reports, ignore_errors=True)
-        raise WorkerError(f"worker {worker} of {self.num_workers} {reason}")
 
     def close(self, *, raise_if_closed: bool = False) -> None:
         """End the workers; closing twice is allowed."""
         if not self.is_closed:
-            super().close(raise_if_closed=raise_if_closed)
+            if all(process.is_alive() for process in self._workers):
+                super().close(raise_if_closed=raise_if_closed)
+            else:
+                self._end()
         shutil.rmtree(self._reports, ignore_errors=True)

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 import time
 from functools import partial
+from pathlib import Path
 
 import pytest
 import torch
 from torchrl.envs import Transform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
+from egoskin import watchdog
 from egoskin.make import (
     EnvConfig,
     load_env_state,
@@ -159,6 +163,177 @@ def test_a_worker_that_raises_is_reported_with_its_traceback(skin):
     with pytest.raises(WorkerError, match="ZeroDivisionError: the third step"):
         pool.step_and_maybe_reset(root)
     assert not any(process.is_alive() for process in processes)
+    pool.close()
+
+
+class Stuck(Transform):
+    """Never answers from the second step on."""
+
+    count = 0
+
+    def __init__(self, loop: bool) -> None:
+        super().__init__()
+        self._loop = loop
+
+    def _step(self, tensordict, next_tensordict):
+        self.count += 1
+        while self.count == 2:
+            if not self._loop:
+                time.sleep(1000)
+        return next_tensordict
+
+
+def build_stuck(skin, loop: bool) -> TransformedEnv:
+    env = make_worker_env(EnvConfig(), skin, num_envs=4, seed=0)
+    env.append_transform(Stuck(loop))
+    return env
+
+
+@pytest.mark.parametrize(
+    ("loop", "seen", "limit"),
+    [
+        (False, "now asleep", 2.0),
+        (True, "now running", 2.0),
+        pytest.param(False, "now asleep", None, marks=pytest.mark.slow),
+        pytest.param(True, "now running", None, marks=pytest.mark.slow),
+    ],
+)
+def test_a_worker_that_hangs_is_ended(skin, loop, seen, limit, monkeypatch):
+    if limit is not None:
+        monkeypatch.setattr(watchdog, "LIMIT", limit)
+    stuck = partial(build_stuck, skin, loop)
+    pool = WorkerPool([partial(build_faulty, skin), stuck])
+    root = pool.reset()
+    processes = list(pool._workers)
+    root["action"] = torch.zeros(*root.batch_size, 21)
+    pool.step_and_maybe_reset(root.clone())
+    start = time.monotonic()
+    with pytest.raises(WorkerError, match=f"worker 1 of 2 hung: .*{seen}"):
+        pool.step_and_maybe_reset(root)
+    assert time.monotonic() - start < 30
+    assert not any(process.is_alive() for process in processes)
+    pool.close()
+
+
+def test_a_worker_that_hangs_ends_with_a_killed_parent():
+    code = f"""
+import sys
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+import test_workers as tests
+pool = tests.WorkerPool([
+    tests.partial(tests.build_stuck, tests.place_sensors(tests.H1_2, 8, seed=0), False)
+])
+root = pool.reset()
+root["action"] = tests.torch.zeros(*root.batch_size, 21)
+pool.step_and_maybe_reset(root.clone())
+print(pool._workers[0].pid, flush=True)
+pool.step_and_maybe_reset(root)
+"""
+    command = [sys.executable, "-c", code]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        worker = Path("/proc") / parent.stdout.readline().strip() / "stat"
+        time.sleep(0.5)
+        assert worker.exists()
+        parent.kill()
+    deadline = time.monotonic() + 5
+    # An ended process is gone, or a zombie until its new parent has noticed.
+    while worker.exists() and worker.read_text().rpartition(")")[2].split()[0] != "Z":
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def test_a_starved_worker_is_waited_for(skin, monkeypatch):
+    monkeypatch.setattr(watchdog, "LIMIT", 1.0)
+    pool = make_pool(skin, 1)
+    root = pool.reset()
+    root["action"] = torch.zeros(*root.batch_size, 21)
+    # A three hundredth of one core is left to it.
+    pid, core = pool._workers[0].pid, {min(os.sched_getaffinity(0))}
+    with subprocess.Popen([sys.executable, "-S", "-c", "while True: pass"]) as hog:
+        os.sched_setaffinity(hog.pid, core)
+        for thread in os.listdir(f"/proc/{pid}/task"):
+            os.sched_setaffinity(int(thread), core)
+            os.sched_setscheduler(int(thread), os.SCHED_IDLE, os.sched_param(0))
+        try:
+            start = time.monotonic()
+            while time.monotonic() - start < 2.5:
+                pool.step_and_maybe_reset(root.clone())
+        finally:
+            hog.kill()
+    pool.close()
+
+
+def build_badly(parent: int, fault: str, skin) -> TransformedEnv:
+    """Fail in a worker, but not where the parent reads the specs."""
+    if os.getpid() != parent:
+        if fault == "raise":
+            raise ZeroDivisionError("while building")
+        if fault == "killed":
+            os.kill(os.getpid(), signal.SIGKILL)
+        time.sleep(1000)
+    return make_worker_env(EnvConfig(), skin, num_envs=4, seed=0)
+
+
+@pytest.mark.parametrize(
+    ("fault", "message"),
+    [
+        ("raise", "raised\n(.|\n)*ZeroDivisionError: while building"),
+        ("killed", "was killed by SIGKILL"),
+        ("hang", "hung while it started: .*now asleep"),
+    ],
+)
+def test_a_worker_that_fails_while_it_starts_is_reported(
+    skin, fault, message, monkeypatch
+):
+    monkeypatch.setattr(watchdog, "LIMIT", 2.0)
+    good = partial(make_worker_env, EnvConfig(), skin, num_envs=4, seed=0)
+    pool = WorkerPool([good, partial(build_badly, os.getpid(), fault, skin)])
+    with pytest.raises(WorkerError, match=f"worker 1 of 2 {message}"):
+        pool.reset()
+    assert not any(process.is_alive() for process in pool._workers)
+    pool.close()
+
+
+def test_a_worker_that_fails_when_asked_is_reported(skin, monkeypatch):
+    pool = make_pool(skin, 2)
+    pool.reset()
+    with pytest.raises(WorkerError, match=r"raised\n(.|\n)*AttributeError.*'nonsense'"):
+        pool._ask("nonsense")
+    pool.close()
+    monkeypatch.setattr(watchdog, "LIMIT", 1.0)
+    pool = make_pool(skin, 2)
+    pool.reset()
+    os.kill(pool._workers[0].pid, signal.SIGSTOP)
+    with pytest.raises(WorkerError, match=r"worker 0 of 2 hung: .*now stopped"):
+        pool.simulation_state()
+    pool.close()
+
+
+def test_a_worker_that_dies_between_commands_is_reported(skin):
+    pool = make_pool(skin, 2)
+    root = pool.reset()
+    root["action"] = torch.zeros(*root.batch_size, 21)
+    os.kill(pool._workers[0].pid, signal.SIGKILL)
+    time.sleep(0.5)
+    with pytest.raises(WorkerError, match="worker 0 of 2 was killed by SIGKILL"):
+        pool.step_and_maybe_reset(root)
+    pool.close()
+    pool = make_pool(skin, 2)
+    pool.reset()
+    processes = list(pool._workers)
+    os.kill(processes[0].pid, signal.SIGKILL)
+    time.sleep(0.5)
+    # Closing says nothing: whoever closes does not wait for it.
+    pool.close()
+    assert not any(process.is_alive() for process in processes)
+
+
+def test_a_closed_pool_can_be_used_again(skin):
+    pool = make_pool(skin, 2)
+    first = pool.reset()
+    pool.close()
+    assert_same(first, pool.reset())
     pool.close()
 
 

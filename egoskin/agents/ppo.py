@@ -6,8 +6,9 @@ the value of a time-out is taken from the terminal observation, before the reset
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -25,7 +26,16 @@ _KL_FRAMES = 4096
 
 
 class NonFiniteError(RuntimeError):
-    """A loss, gradient or weight is not finite; the agent must not be saved."""
+    """A loss, gradient or weight is not finite; the agent must not be saved.
+
+    Args:
+        text: What is not finite.
+        batch: The data it was met on.
+    """
+
+    def __init__(self, text: str, batch: TensorDictBase) -> None:
+        super().__init__(text)
+        self.batch: dict[str, Tensor] = dict(batch.items())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -178,6 +188,8 @@ class PPO:
             entropy_bonus=True,
             entropy_coeff=config.entropy_coeff,
             critic_coeff=config.critic_coeff,
+            # A metric of the whole rollout, not of each minibatch.
+            log_explained_variance=False,
             loss_critic_type="l2",
             normalize_advantage=False,
         )
@@ -185,13 +197,27 @@ class PPO:
         self._actor = [p for p in agent.actor.parameters() if p.requires_grad]
         self._critic = [p for p in agent.critic.parameters() if p.requires_grad]
         self.optimizer = torch.optim.Adam(
-            [*self._actor, *self._critic], lr=config.learning_rate, eps=1e-5
+            [*self._actor, *self._critic], lr=config.learning_rate, eps=1e-5, fused=True
         )
 
     @property
     def learning_rate(self) -> float:
         """Current learning rate."""
         return self.optimizer.param_groups[0]["lr"]
+
+    def state(self) -> dict[str, Tensor]:
+        """Return the state of the optimiser by name."""
+        states = self.optimizer.state_dict()["state"].items()
+        return {f"{i}/{key}": v for i, state in states for key, v in state.items()}
+
+    def load_state(self, tensors: Mapping[str, Tensor], learning_rate: float) -> None:
+        """Put the optimiser into a state that `state` returned."""
+        content = self.optimizer.state_dict()
+        for name, value in tensors.items():
+            index, key = name.split("/")
+            content["state"].setdefault(int(index), {})[key] = value
+        content["param_groups"][0]["lr"] = learning_rate
+        self.optimizer.load_state_dict(content)
 
     def update(self, rollout: TensorDict) -> dict[str, float]:
         """Improve the agent on a rollout, then take it into the normalisers.
@@ -203,7 +229,7 @@ class PPO:
             Metrics by name.
 
         Raises:
-            NonFiniteError: If a loss or gradient is not finite.
+            NonFiniteError: If a loss, gradient, weight or normaliser is not finite.
         """
         config = self.config
         add_advantages(rollout, config.gamma, config.gae_lambda)
@@ -220,19 +246,34 @@ class PPO:
         for batch in _minibatches(data, config.ppo_epochs, config.num_mini_batches):
             if config.desired_kl is not None:
                 sums["kl"] = sums.get("kl", 0.0) + self._adapt_learning_rate(batch)
-            for name, value in self._step(batch).items():
+            for name, value in self.step(batch).items():
                 sums[name] = sums.get(name, 0.0) + value
             count += 1
         for key, norm in self.agent.norms.items():
             assert isinstance(norm, RunningNorm)
             norm.update(data[key])
+            if not torch.isfinite(norm.mean + norm.var).all():
+                rows = ~torch.isfinite(data[key]).all(-1)
+                raise NonFiniteError(f"normaliser of {key!r}", data[rows])
         metrics = {name: float(value) / count for name, value in sums.items()}
         metrics["explained_variance"] = float(explained)
         metrics["learning_rate"] = self.learning_rate
         metrics["action_std"] = float(self.agent.head.log_std.detach().exp().mean())
         return metrics
 
-    def _step(self, batch: TensorDictBase) -> dict[str, Tensor]:
+    def step(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """Take one step of the optimiser on a minibatch.
+
+        Args:
+            batch: Rows of what `update` keeps of a rollout, ``[n]``.
+
+        Returns:
+            Metrics by name.
+
+        Raises:
+            NonFiniteError: If a loss or gradient, then the agent is as it was before,
+                or a weight after the step is not finite.
+        """
         losses = self.loss(batch)
         total = sum(v for k, v in losses.items() if k.startswith("loss_"))
         self.optimizer.zero_grad(set_to_none=True)
@@ -244,9 +285,13 @@ class PPO:
         if not torch.isfinite(actor_norm + critic_norm):
             raise NonFiniteError(
                 f"loss {float(total.detach())}, actor gradient norm "
-                f"{float(actor_norm)}, critic gradient norm {float(critic_norm)}"
+                f"{float(actor_norm)}, critic gradient norm {float(critic_norm)}",
+                batch,
             )
         self.optimizer.step()
+        weights = nn.utils.get_total_norm([*self._actor, *self._critic])
+        if not torch.isfinite(weights):
+            raise NonFiniteError(f"norm of the weights {float(weights)}", batch)
         self.agent.head.bound_std()
         return {
             "loss_actor": losses["loss_objective"].detach(),
@@ -291,6 +336,7 @@ def _minibatches(
     for _ in range(passes):
         order = torch.randperm(len(data)).to(data.device or "cpu")
         for index in order.chunk(parts):
-            batch = data[index]
-            assert isinstance(batch, TensorDictBase)
-            yield batch
+            # data[index] would take four times as long.
+            yield data.apply(
+                partial(torch.index_select, dim=0, index=index), batch_size=index.shape
+            )

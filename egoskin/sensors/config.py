@@ -141,6 +141,7 @@ class SensorConfig:
         seed: int = 0,
         row_offset: int = 0,
         out_key: str = "signal",
+        compile_kernels: bool = False,
     ) -> list[Transform]:
         """Return the transforms that write the signal (none for a blind robot).
 
@@ -152,6 +153,7 @@ class SensorConfig:
             seed: Seed of what real sensors draw.
             row_offset: Global index of the first row.
             out_key: Key of the signal.
+            compile_kernels: Whether to compile the sensors; results are the same.
         """
         if self.coverage == "none":
             return []
@@ -162,7 +164,10 @@ class SensorConfig:
         for number, (suffix, index) in enumerate(groups.items()):
             part, key = skin.select(index), f"distance{suffix}"
             detected.append(f"object_detected{suffix}")
-            transforms.append(self._sensor(robot, part, objects, (key, detected[-1])))
+            out_keys = (key, detected[-1])
+            transforms.append(
+                self._sensor(robot, part, objects, out_keys, compile_kernels)
+            )
             if self.signal == "localization":
                 continue
             if self.corruption != "none":
@@ -221,12 +226,14 @@ class SensorConfig:
         skin: Skin,
         objects: Sequence[Shape],
         out_keys: Sequence[str],
+        compile_kernels: bool,
     ) -> Transform:
         """Return the coverage of some sensors of one kind."""
         common: dict[str, Any] = {
             "body": robot.primitives if self.occlusion else (),
             "per_object": self.per_object and self.signal != "localization",
             "out_keys": out_keys,
+            "compile": compile_kernels,
         }
         args = (skin, robot.chain, objects, self.range)
         if isinstance(skin.coverage[0], Ray):

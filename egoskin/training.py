@@ -1,0 +1,273 @@
+"""Training: rollouts, updates, checkpoints, and how to go on from one.
+
+Contract: a run of 2n rollouts equals n and a resumed n, bit for bit, in everything a
+checkpoint holds and in the metrics but for times; and nothing that is not finite ever
+replaces a checkpoint.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from egoskin.agents.networks import Agent
+from egoskin.agents.ppo import PPO, NonFiniteError, collect
+from egoskin.checkpoint import part, prefixed, save_tensors
+from egoskin.cli import to_plain
+from egoskin.envs.rewards import TERMS
+from egoskin.make import load_env_state, make_env, save_env_state
+from egoskin.policies import (
+    PolicySpec,
+    agent_tensors,
+    load_agent_tensors,
+    save_policy,
+)
+from egoskin.runs import Run
+from egoskin.sensors import Skin
+from egoskin.survival import SurvivalCurve
+from egoskin.workers import WorkerPool
+
+# What the metrics of an episode are made of.
+METRIC_KEYS = (
+    "diverged",
+    "episode_step",
+    "fallen",
+    "hit",
+    "reward",
+    "reward_terms",
+    "self_contact",
+    "terminated",
+)
+
+
+class Trainer:
+    """Everything that a checkpoint holds, and how to go on from it.
+
+    Args:
+        run: The run to train, with its configuration.
+        env: What `make_env` returned for it.
+        skin: The run's skin.
+    """
+
+    def __init__(self, run: Run, env: WorkerPool, skin: Skin) -> None:
+        self.config, self.run, self.env = run.config, run, env
+        self.device = self.config.learner_device()
+        spec = env.observation_spec
+        keys = self.config.env.critic_keys
+        self.spec = PolicySpec(
+            env=self.config.env,
+            skin=skin,
+            network=self.config.ppo.network,
+            sizes={key: spec[key].shape[-1] for key in keys},
+            num_actions=env.action_spec.shape[-1],
+        )
+        torch.manual_seed(self.config.seed)
+        self.agent: Agent = self.spec.build_agent().to(self.device)
+        self.ppo = PPO(self.agent, self.config.ppo)
+        self.survival = SurvivalCurve(self.config.env.task.episode_steps)
+        self.frames = 0
+        self.wall_s = 0.0
+        self.root: TensorDictBase = TensorDict()
+
+    def start(self) -> None:
+        """Begin a new run: first observations, first policy, first checkpoint."""
+        self.root = self.env.reset()
+        self.keep_policy()
+        self.save()
+
+    def iterate(self) -> dict[str, float]:
+        """Collect a rollout, improve the agent on it; return the metrics.
+
+        Raises:
+            NonFiniteError: If the update is not finite; the text says how to replay it.
+            WorkerError: If a worker ends.
+        """
+        start = time.perf_counter()
+        rollout, self.root, infos = collect(
+            self.env,
+            self.agent,
+            self.root,
+            self.config.ppo.rollout_steps,
+            METRIC_KEYS,
+        )
+        collected = time.perf_counter()
+        try:
+            learned = self.ppo.update(rollout)
+        except NonFiniteError as error:
+            path = self.dump(error)
+            error.args = (f"{error}\nreplay it with: python scripts/replay.py {path}",)
+            raise
+        end = time.perf_counter()
+        self.frames += self.config.frames_per_batch
+        self.wall_s += end - start
+        return {
+            "frames": self.frames,
+            "time/wall_s": self.wall_s,
+            "time/steps_per_s": self.config.frames_per_batch / (end - start),
+            "time/collect_share": (collected - start) / (end - start),
+            **self._episode_metrics(TensorDict.maybe_dense_stack(infos)),
+            **{f"ppo/{name}": value for name, value in learned.items()},
+        }
+
+    def _episode_metrics(self, infos: TensorDictBase) -> dict[str, float]:
+        """What the environment said during a rollout, ``[T, N]``."""
+        self.survival.decay()
+        for info in infos:
+            self.survival.update(info["episode_step"][:, 0], info["terminated"][:, 0])
+        task = self.config.env.task
+        hz = task.physics.control_hz
+        ended = float(infos["terminated"].sum())
+        terms = infos["reward_terms"].mean(0).mean(0).tolist()
+
+        def share_of_ends(key: str) -> float:
+            return float(infos[key].sum()) / ended if ended else float("nan")
+
+        return {
+            "episode/survival_s": self.survival.mean() / hz,
+            "episode/success": self.survival.probability(
+                round(min(task.success_s, task.episode_length_s) * hz)
+            ),
+            "episode/ended_by_ball": share_of_ends("hit"),
+            "episode/ended_by_fall": share_of_ends("fallen"),
+            "episode/diverged": float(infos["diverged"].sum()),
+            "episode/self_contact": float(infos["self_contact"].float().mean()),
+            "reward/mean": float(infos["reward"].mean()),
+            "reward/negative_share": float((infos["reward"] < 0).float().mean()),
+            **{f"reward/{n}": v for n, v in zip(TERMS, terms, strict=True)},
+        }
+
+    def keep_policy(self) -> None:
+        """Keep the present policy for learning curves."""
+        save_policy(self.run.policy_path(self.frames), self.agent, self._spec_now())
+
+    def save(self) -> None:
+        """Write a checkpoint from which `load` continues bit for bit."""
+        random = {"random_state": torch.get_rng_state()}
+        if self.device.type == "cuda":
+            random["random_state_cuda"] = torch.cuda.get_rng_state(self.device)
+        self.run.save_checkpoint(
+            {
+                **self._learner_tensors(),
+                **prefixed("env", save_env_state(self.env, self.root)),
+                "survival/at_risk": self.survival.at_risk,
+                "survival/ended": self.survival.ended,
+                **random,
+            },
+            {
+                "policy": self._spec_now().header(),
+                "frames": self.frames,
+                "wall_s": self.wall_s,
+                "learning_rate": self.ppo.learning_rate,
+            },
+        )
+
+    def load(self) -> None:
+        """Continue from the run's checkpoint."""
+        tensors, header = self.run.load_checkpoint()
+        what = str(self.run.checkpoint_path)
+        load_agent_tensors(self.agent, part("agent", tensors), what)
+        self.ppo.load_state(part("optimizer", tensors), header["learning_rate"])
+        self.root = load_env_state(self.env, part("env", tensors))
+        self.survival.at_risk.copy_(tensors["survival/at_risk"])
+        self.survival.ended.copy_(tensors["survival/ended"])
+        self.frames, self.wall_s = header["frames"], header["wall_s"]
+        torch.set_rng_state(tensors["random_state"])
+        if self.device.type == "cuda":
+            torch.cuda.set_rng_state(tensors["random_state_cuda"], self.device)
+
+    def dump(self, error: NonFiniteError) -> Path:
+        """Write what `scripts/replay.py` needs to meet an error again; return where."""
+        path = self.run.dump_path(self.frames)
+        save_tensors(
+            path,
+            {**self._learner_tensors(), **prefixed("batch", error.batch)},
+            {
+                "policy": self._spec_now().header(),
+                "ppo": to_plain(self.config.ppo),
+                "learning_rate": self.ppo.learning_rate,
+                "error": str(error),
+            },
+        )
+        return path
+
+    def _learner_tensors(self) -> dict[str, Tensor]:
+        """Agent and optimiser."""
+        return {
+            **prefixed("agent", agent_tensors(self.agent)),
+            **prefixed("optimizer", self.ppo.state()),
+        }
+
+    def _spec_now(self) -> PolicySpec:
+        return dataclasses.replace(self.spec, frames=self.frames)
+
+
+@contextmanager
+def open_trainer(run: Run, num_threads: int = 1) -> Iterator[Trainer]:
+    """Yield the trainer of a run, at its start or its checkpoint; close all after.
+
+    Args:
+        run: A new run or one to go on with.
+        num_threads: Physics threads of each worker; results do not depend on it.
+    """
+    config = run.config
+    skin = Skin.load(run.skin_path)
+    env = make_env(
+        config.env,
+        skin,
+        num_envs=config.num_envs,
+        seed=config.seed,
+        num_workers=config.num_workers,
+        num_threads=num_threads,
+        compile_kernels=config.compile_kernels,
+    )
+    try:
+        trainer = Trainer(run, env, skin)
+        if run.is_new():
+            trainer.start()
+        else:
+            trainer.load()
+        run.write_config()
+        run.record_start()
+        run.start_metrics(trainer.frames)
+        yield trainer
+    finally:
+        run.close()
+        env.close()
+
+
+def train(
+    trainer: Trainer,
+    stop: Callable[[], bool] = lambda: False,
+    show: Callable[[dict[str, float]], None] = lambda metrics: None,
+) -> None:
+    """Iterate to the end or to a stop, with checkpoints, kept policies and metrics.
+
+    Args:
+        trainer: What is trained, to the end that its run plans.
+        stop: Whether to stop after the present rollout.
+        show: What to do with the metrics of each rollout.
+    """
+    config, run = trainer.config, trainer.run
+    saved_at = time.monotonic()
+    while trainer.frames < config.total_frames and not stop():
+        start = time.monotonic()
+        before = trainer.frames
+        metrics = trainer.iterate()
+        run.log(metrics)
+        show(metrics)
+        if before // config.snapshot_frames < trainer.frames // config.snapshot_frames:
+            trainer.keep_policy()
+        now = time.monotonic()
+        # The next rollout must fit in as well.
+        if now - saved_at + 1.5 * (now - start) > config.checkpoint_interval:
+            trainer.save()
+            saved_at = now
+    trainer.save()
+    trainer.keep_policy()
