@@ -158,7 +158,9 @@ def play_bank(
                 action = policy(flat)["action"]
             root["action"] = action.reshape(*root.batch_size, -1)
             data, root = env.step_and_maybe_reset(root)
-            after = data["next"].reshape(-1)
+            following = data["next"]
+            assert isinstance(following, TensorDictBase)
+            after = following.reshape(-1)
             steps[running] = step
             for key, value in balls.items():
                 value[running] = after[key][running]
