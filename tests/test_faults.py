@@ -554,7 +554,7 @@ def test_memory_stays_flat(start, tmp_path):
     minutes = float(os.environ.get("EGOSKIN_MEMORY_MINUTES", "3"))
     run = tmp_path / "run"
     training = start("--run-dir", run, "--total-frames", 10**9)
-    training.wait_for(lambda: len(rows(run)) > 5, 300)
+    training.wait_for(lambda: len(rows(run)) > 10, 300)
     warm_up = time.monotonic() + 60
     training.wait_for(lambda: time.monotonic() > warm_up, 300)
     samples = []
@@ -565,10 +565,10 @@ def test_memory_stays_flat(start, tmp_path):
         time.sleep(0.2)
     training.process.send_signal(signal.SIGTERM)
     assert training.end() == 0, training.text()
-    part = len(samples) // 5
+    part = len(samples) // 3
     resident, files, shared = zip(*samples, strict=True)
     # Within a rollout it rises and falls: compare the lowest of the first and the last
-    # fifth, which every rollout comes back to.
+    # third, which every rollout comes back to within some per cent.
     first, last = min(resident[:part]), min(resident[-part:])
     print(
         f"\n{minutes:g} min, {len(rows(run))} rollouts: resident {first / 1e3:.1f} -> "

@@ -51,7 +51,8 @@ def test_a_process_that_sleeps_spends_its_time(code):
         watch = watched(pid, 1.5)
     assert watch.hangs(0.8)
     assert not watch.hangs(2.0)
-    assert "now asleep" in watch.describe()
+    # One that polls may be caught awake.
+    assert code == POLL or "now asleep" in watch.describe()
 
 
 def test_a_stopped_process_spends_its_time():
