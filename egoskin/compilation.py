@@ -19,15 +19,10 @@ T = TypeVar("T")
 
 @functools.cache
 def can_compile() -> bool:
-    """Whether torch finds a C++ compiler; says so once if it does not."""
+    """Whether torch finds a C++ compiler."""
     try:
         cpp_builder.get_cpp_compiler()
     except exc.InvalidCxxCompiler:
-        warnings.warn(
-            "no C++ compiler was found (install g++): sensor kernels run uncompiled, "
-            "with the same results",
-            stacklevel=2,
-        )
         return False
     return True
 
@@ -89,6 +84,12 @@ def compiled(
         dynamic: Whether sizes change from call to call; None finds out.
     """
     if not can_compile():
+        # Python shows one warning from one place once.
+        warnings.warn(
+            "no C++ compiler was found (install g++): sensor kernels run uncompiled, "
+            "with the same results",
+            stacklevel=2,
+        )
         return function
     return torch.compile(_copy(function), dynamic=dynamic, fullgraph=True)
 

@@ -24,7 +24,6 @@ import os
 import platform
 import subprocess
 import sys
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -110,16 +109,11 @@ class TrainConfig:
     def check_machine(self) -> None:
         """Raise ValueError for what this machine lacks: the device, a C++ compiler."""
         self.learner_device()
-        if not self.compile_kernels:
-            return
-        with warnings.catch_warnings():
-            # It says that kernels will run uncompiled: not here.
-            warnings.simplefilter("ignore")
-            if not can_compile():
-                raise ValueError(
-                    "the run compiles its kernels (compile_kernels), but there is no "
-                    "C++ compiler here: install g++"
-                )
+        if self.compile_kernels and not can_compile():
+            raise ValueError(
+                "the run compiles its kernels (compile_kernels), but there is no "
+                "C++ compiler here: install g++"
+            )
 
     def learner_device(self) -> torch.device:
         """Return the device of the learner.

@@ -17,6 +17,8 @@ MODULES = sorted(
 ALLOWED = {
     "robots": set(),
     "compilation": set(),
+    "events": set(),
+    "watchdog": set(),
     "shapes": {"compilation"},
     "draws": set(),
     "kinematics": {"compilation"},
