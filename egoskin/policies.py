@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
+from torchrl.envs import EnvBase
 
 from egoskin.agents.networks import Agent, NetworkConfig
 from egoskin.checkpoint import load_tensors, part, prefixed, save_tensors
@@ -41,6 +42,27 @@ class PolicySpec:
     """Number of actions ``J``."""
     frames: int = 0
     """Environment steps it was trained for."""
+
+    @classmethod
+    def of(
+        cls, config: EnvConfig, skin: Skin, network: NetworkConfig, env: EnvBase
+    ) -> PolicySpec:
+        """Return the specification for an environment.
+
+        Args:
+            config: What the environment was made of.
+            skin: Its skin.
+            network: Size of the networks.
+            env: The environment.
+        """
+        spec = env.observation_spec
+        return cls(
+            env=config,
+            skin=skin,
+            network=network,
+            sizes={key: spec[key].shape[-1] for key in config.critic_keys},
+            num_actions=env.action_spec.shape[-1],
+        )
 
     def build_agent(self) -> Agent:
         """Return a fresh agent."""

@@ -59,15 +59,8 @@ class Trainer:
     def __init__(self, run: Run, env: WorkerPool, skin: Skin) -> None:
         self.config, self.run, self.env = run.config, run, env
         self.device = self.config.learner_device()
-        spec = env.observation_spec
-        keys = self.config.env.critic_keys
-        self.spec = PolicySpec(
-            env=self.config.env,
-            skin=skin,
-            network=self.config.ppo.network,
-            sizes={key: spec[key].shape[-1] for key in keys},
-            num_actions=env.action_spec.shape[-1],
-        )
+        config = self.config
+        self.spec = PolicySpec.of(config.env, skin, config.ppo.network, env)
         torch.manual_seed(self.config.seed)
         self.agent: Agent = self.spec.build_agent().to(self.device)
         self.ppo = PPO(self.agent, self.config.ppo)

@@ -182,15 +182,7 @@ class _Loop:
         """Train for a while, note a rollout to do again; return the memory it took."""
         config, env = self.config, self._pool
         torch.manual_seed(config.seed)
-        spec = PolicySpec(
-            env=config.env,
-            skin=self._skin,
-            network=config.ppo.network,
-            sizes={
-                k: env.observation_spec[k].shape[-1] for k in config.env.critic_keys
-            },
-            num_actions=env.action_spec.shape[-1],
-        )
+        spec = PolicySpec.of(config.env, self._skin, config.ppo.network, env)
         self._agent = spec.build_agent()
         self._ppo = PPO(self._agent, config.ppo)
         root = env.reset()
