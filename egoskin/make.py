@@ -23,6 +23,7 @@ from egoskin.observations import Privileged, Proprioception
 from egoskin.robots import ROBOTS, RobotConfig
 from egoskin.sensors import History, Skin
 from egoskin.sensors.config import SensorConfig, SkinConfig
+from egoskin.sensors.geometry import STATE_KEYS
 from egoskin.transform import StatefulTransform
 from egoskin.workers import WorkerPool, default_num_workers
 
@@ -95,6 +96,7 @@ def make_worker_env(
     hold: bool = False,
     keep_raw: bool = False,
     bare: bool = False,
+    sparse: bool = False,
     compile_kernels: bool = False,
 ) -> TransformedEnv:
     """Return the batched environment of one process, with its transforms.
@@ -110,6 +112,8 @@ def make_worker_env(
         keep_raw: Whether the raw state stays in the output.
         bare: Whether to leave out observations and sensors (to measure what they
             cost).
+        sparse: Whether to give the state that the sensors read, for the agent's own
+            sources, instead of the signal.
         compile_kernels: Whether to compile the sensors; results are the same.
     """
     robot = config.robot_config
@@ -131,7 +135,9 @@ def make_worker_env(
         transforms += [
             Proprioception(default, out_keys=[f"observation{suffix}"]),
             Privileged(config.privileged, len(robot.joints), balls),
-            *config.sensor.transforms(
+        ]
+        if not sparse:
+            transforms += config.sensor.transforms(
                 robot,
                 skin,
                 config.task.throws.balls,
@@ -140,8 +146,7 @@ def make_worker_env(
                 row_offset=row_offset,
                 out_key=f"signal{suffix}",
                 compile_kernels=compile_kernels,
-            ),
-        ]
+            )
         if suffix:
             new = [f"{key}{suffix}" for key in config.actor_keys]
             transforms.append(History(config.history, new, config.actor_keys))
@@ -149,7 +154,8 @@ def make_worker_env(
         kept = {*_NETWORK_KEYS, *(k for t in transforms for k in _state_keys(t))}
         written = dict.fromkeys(key for t in transforms for key in t.out_keys)
         between = [key for key in written if key not in kept]
-        transforms.append(ExcludeTransform(*_RAW_KEYS, *between))
+        unread = [key for key in _RAW_KEYS if not (sparse and key in STATE_KEYS)]
+        transforms.append(ExcludeTransform(*unread, *between))
     return TransformedEnv(env, Compose(transforms))
 
 
@@ -169,6 +175,7 @@ def make_env(
     num_threads: int = 1,
     hold: bool = False,
     bare: bool = False,
+    sparse: bool = False,
     compile_kernels: bool = False,
 ) -> WorkerPool:
     """Return a ParallelEnv of ``num_workers`` processes, ``[W, num_envs / W]`` rows.
@@ -183,6 +190,7 @@ def make_env(
         num_threads: Physics threads of each worker.
         hold: Whether the robots are held rigid in their default pose.
         bare: Whether to leave out observations and sensors.
+        sparse: Whether to give the state instead of the signal, see `make_worker_env`.
         compile_kernels: Whether to compile the sensors; results are the same.
 
     Raises:
@@ -202,6 +210,7 @@ def make_env(
                 num_threads=num_threads,
                 hold=hold,
                 bare=bare,
+                sparse=sparse,
                 compile_kernels=compile_kernels,
             )
             for i in range(workers)

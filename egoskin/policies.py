@@ -16,11 +16,12 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
-from egoskin.agents.networks import Agent, NetworkConfig
+from egoskin.agents.networks import Agent, NetworkConfig, input_keys
 from egoskin.checkpoint import load_tensors, part, prefixed, save_tensors
 from egoskin.cli import from_plain, to_plain
 from egoskin.make import EnvConfig
 from egoskin.sensors import Skin
+from egoskin.sparse import SparseSource
 
 CHECKPOINT_NAME = "checkpoint.safetensors"
 """Name of the latest checkpoint in a run folder."""
@@ -45,7 +46,12 @@ class PolicySpec:
 
     @classmethod
     def of(
-        cls, config: EnvConfig, skin: Skin, network: NetworkConfig, env: EnvBase
+        cls,
+        config: EnvConfig,
+        skin: Skin,
+        network: NetworkConfig,
+        env: EnvBase,
+        sources: Mapping[str, SparseSource],
     ) -> PolicySpec:
         """Return the specification for an environment.
 
@@ -54,24 +60,33 @@ class PolicySpec:
             skin: Its skin.
             network: Size of the networks.
             env: The environment.
+            sources: What computes the keys that it does not give.
         """
         spec = env.observation_spec
         return cls(
             env=config,
             skin=skin,
             network=network,
-            sizes={key: spec[key].shape[-1] for key in config.critic_keys},
+            sizes={
+                key: sources[key].size if key in sources else spec[key].shape[-1]
+                for key in config.critic_keys
+            },
             num_actions=env.action_spec.shape[-1],
         )
 
-    def build_agent(self) -> Agent:
-        """Return a fresh agent."""
+    def build_agent(self, sources: Mapping[str, SparseSource] | None = None) -> Agent:
+        """Return a fresh agent.
+
+        Args:
+            sources: What computes keys that its environment does not give.
+        """
         return Agent(
             self.sizes,
             self.env.actor_keys,
             self.env.critic_keys,
             self.num_actions,
             self.network,
+            sources,
         )
 
     def header(self) -> dict[str, Any]:
@@ -103,6 +118,25 @@ class PolicySpec:
             num_actions=header["num_actions"],
             frames=header["frames"],
         )
+
+
+def sparse_sources(
+    config: EnvConfig, skin: Skin, network: NetworkConfig, compile_kernels: bool = False
+) -> dict[str, SparseSource]:
+    """Return what computes the keys that are better learnt from as sparse rows.
+
+    Args:
+        config: What the environment is made of.
+        skin: The sensors.
+        network: What reads them: a normalised signal is not sparse.
+        compile_kernels: Whether to compile the sensors; results are the same.
+    """
+    if config.history > 1 or network.normalize == "all":
+        return {}
+    balls = config.task.throws.balls
+    robot = config.robot_config
+    rays = config.sensor.sparse_rays(robot, skin, balls, compile_kernels)
+    return {} if rays is None else {"signal": rays}
 
 
 def agent_tensors(agent: Agent) -> dict[str, Tensor]:
@@ -144,9 +178,9 @@ class Policy(nn.Module):
 
     def __init__(self, agent: Agent, spec: PolicySpec) -> None:
         super().__init__()
-        self._head = agent.head.requires_grad_(False)
+        self._agent = agent.requires_grad_(False)
         self.spec = spec
-        self.in_keys = [str(key) for key in agent.actor_keys]
+        self.in_keys = agent.actor_keys
         self.out_keys = ["action"]
 
     @property
@@ -170,7 +204,8 @@ class Policy(nn.Module):
             raise KeyError(
                 f"the policy reads {', '.join(self.in_keys)}; {missing[0]!r} is missing"
             )
-        loc, _ = self._head(*(tensordict[key] for key in self.in_keys))
+        inputs = self._agent.encode(tensordict.select(*self.in_keys))
+        loc, _ = self._agent.head(*(inputs[key] for key in input_keys(self.in_keys)))
         return tensordict.set("action", loc)
 
 

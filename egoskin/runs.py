@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import dataclasses
 import datetime
 import importlib.metadata
 import io
@@ -71,8 +72,9 @@ class TrainConfig:
     """Environment steps between the policies kept for learning curves."""
     checkpoint_interval: float = 60.0
     """A checkpoint is at most this old [s]."""
-    compile_kernels: bool = False
-    """Compile the sensors, for the same results; takes up to a minute at each start."""
+    compile_kernels: bool | None = None
+    """Compile the sensors, for the same results, in up to a minute at the first start;
+    None: ray sensors, whose time counts, where there is a C++ compiler."""
     resume: Path | None = None
     """Run folder to go on with; only --total-frames may be changed, to a later end."""
 
@@ -214,6 +216,9 @@ class Run:
                 f"{path} exists already; choose another --run-dir, or go on with it "
                 f"by --resume {path}"
             )
+        if config.compile_kernels is None:
+            pays = config.env.sensor.coverage == "ray" and can_compile()
+            config = dataclasses.replace(config, compile_kernels=pays)
         (path / "policies").mkdir(parents=True)
         run = cls(path, config)
         skin.save(run.skin_path)

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Thread
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -28,9 +29,11 @@ from egoskin.policies import (
     agent_tensors,
     load_agent_tensors,
     save_policy,
+    sparse_sources,
 )
 from egoskin.runs import Run
 from egoskin.sensors import Skin
+from egoskin.sparse import SparseSource
 from egoskin.survival import SurvivalCurve
 from egoskin.workers import WorkerPool
 
@@ -54,15 +57,22 @@ class Trainer:
         run: The run to train, with its configuration.
         env: What `make_env` returned for it.
         skin: The run's skin.
+        sources: What computes the keys that the environment does not give.
     """
 
-    def __init__(self, run: Run, env: WorkerPool, skin: Skin) -> None:
+    def __init__(
+        self,
+        run: Run,
+        env: WorkerPool,
+        skin: Skin,
+        sources: Mapping[str, SparseSource],
+    ) -> None:
         self.config, self.run, self.env = run.config, run, env
         self.device = self.config.learner_device()
         config = self.config
-        self.spec = PolicySpec.of(config.env, skin, config.ppo.network, env)
+        self.spec = PolicySpec.of(config.env, skin, config.ppo.network, env, sources)
         torch.manual_seed(self.config.seed)
-        self.agent: Agent = self.spec.build_agent().to(self.device)
+        self.agent: Agent = self.spec.build_agent(sources).to(self.device)
         self.ppo = PPO(self.agent, self.config.ppo)
         self.survival = SurvivalCurve(self.config.env.task.episode_steps)
         self.frames = 0
@@ -211,6 +221,8 @@ def open_trainer(run: Run, num_threads: int = 1) -> Iterator[Trainer]:
     """
     config = run.config
     skin = Skin.load(run.skin_path)
+    network, compile_kernels = config.ppo.network, bool(config.compile_kernels)
+    sources = sparse_sources(config.env, skin, network, compile_kernels)
     env = make_env(
         config.env,
         skin,
@@ -218,10 +230,14 @@ def open_trainer(run: Run, num_threads: int = 1) -> Iterator[Trainer]:
         seed=config.seed,
         num_workers=config.num_workers,
         num_threads=num_threads,
-        compile_kernels=config.compile_kernels,
+        sparse=bool(sources),
+        compile_kernels=compile_kernels,
     )
+    # Sources compile while the workers start.
+    for source in sources.values():
+        Thread(target=source.warm_up, args=(config.num_envs,), daemon=True).start()
     try:
-        trainer = Trainer(run, env, skin)
+        trainer = Trainer(run, env, skin, sources)
         if run.is_new():
             trainer.start()
         else:

@@ -39,8 +39,9 @@ from torchrl.envs import EnvBase, ParallelEnv, Transform, TransformedEnv
 from egoskin import watchdog
 from egoskin.watchdog import Watch
 
-# Shorter than a hundredth of any batched step, long enough to cost no CPU [s].
-_POLL = 2e-4
+# How long the parent sleeps between looks at its workers: at least this [s], and this
+# share of the time it has waited. It adds as much to a step, and costs no CPU.
+_POLL, _POLL_SHARE = 2e-4, 0.01
 # The reset and the first steps of a worker that compiles [commands], and how long it
 # may take for each: compilers of several workers share the cores [s].
 _COMPILE_COMMANDS, _COMPILE_LIMIT = 4, 600.0
@@ -278,7 +279,7 @@ class WorkerPool(ParallelEnv):
         if self._compile_commands:
             limit, self._compile_commands = _COMPILE_LIMIT, self._compile_commands - 1
         watches = {worker: Watch(self._workers[worker].pid) for worker in workers}
-        looked = time.monotonic()
+        begin = looked = time.monotonic()
         while watches := {i: w for i, w in watches.items() if not answered(i)}:
             now = time.monotonic()
             if now - looked > watchdog.INTERVAL:
@@ -289,7 +290,7 @@ class WorkerPool(ParallelEnv):
                     watch.look()
                     if watch.hangs(limit):
                         self._fail(worker, f"hung: {watch.describe()}")
-            time.sleep(_POLL)
+            time.sleep(min(max(_POLL, _POLL_SHARE * (now - begin)), watchdog.INTERVAL))
 
     @contextmanager
     def _death_explained(self) -> Iterator[None]:

@@ -53,8 +53,8 @@ def main(args: list[str]) -> None:
         f"run {run.path}: {config.num_envs} agents on {workers} workers, learner on "
         f"{config.device} with {torch.get_num_threads()} threads"
     )
-    if config.compile_kernels:
-        print("compiling the sensor kernels: the first rollout may take minutes")
+    if run.config.compile_kernels:
+        print("compiling the sensor kernels: a minute at the first start on a machine")
     stop = Stop()
     rollouts = math.ceil(config.total_frames / config.frames_per_batch)
     try:

@@ -49,9 +49,9 @@ def load(path: Path) -> tuple[PPO, TensorDict, dict[str, Any]]:
     load_agent_tensors(agent, part("agent", tensors), str(path))
     ppo = PPO(agent, from_plain(PPOConfig, header["ppo"], str(path)))
     ppo.load_state(part("optimizer", tensors), header["learning_rate"])
-    batch = part("batch", tensors)
+    batch = dict(part("batch", tensors))
     rows = len(next(iter(batch.values())))
-    return ppo, TensorDict(dict(batch), [rows]), header
+    return ppo, TensorDict(batch, [rows]).unflatten_keys("/"), header
 
 
 def forward(agent: Agent, batch: TensorDict) -> dict[str, Tensor]:
@@ -68,8 +68,7 @@ def forward(agent: Agent, batch: TensorDict) -> dict[str, Tensor]:
         if not list(module.children()):
             module.register_forward_hook(note(name))
     with torch.no_grad():
-        agent.head(*(batch[key] for key in agent.actor_keys))
-        agent.critic(batch.select(*agent.critic_keys))
+        agent.critic(agent.actor(batch.select("inputs")))
     return outputs
 
 
@@ -90,13 +89,13 @@ def main(args: list[str]) -> None:
     stages = {
         "agent": dict(agent.named_parameters()) | dict(agent.named_buffers()),
         "optimizer": ppo.state(),
-        "batch": dict(batch.items()),
+        "batch": dict(batch.flatten_keys("/").items()),
     }
     found = [f"{k} {text}" for k, v in stages.items() for text in not_finite(v)]
     found += not_finite(forward(agent, batch))
     error = None
     try:
-        ppo.step(batch)
+        ppo.step(batch, torch.arange(len(batch)))
     except NonFiniteError as again:
         error = again
     found += not_finite(

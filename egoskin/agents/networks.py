@@ -13,10 +13,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from tensordict import NestedKey
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import InteractionType, TensorDictModule
 from torch import Tensor, nn
 from torchrl.modules import IndependentNormal, ProbabilisticActor
+
+from egoskin.sparse import SparseRows, SparseSource
 
 # Keys whose values are a skin's signals; by default they enter as they are.
 _SIGNAL_KEYS = ("signal",)
@@ -96,22 +98,15 @@ class KeyedMLP(nn.Module):
 
     Args:
         sizes: Features of each input.
-        norms: Normaliser of each input, or None.
         hidden: Units of the hidden layers.
         out: Number of outputs.
         out_gain: Gain of the orthogonal initialisation of the last layer.
     """
 
     def __init__(
-        self,
-        sizes: Sequence[int],
-        norms: Sequence[RunningNorm | None],
-        hidden: Sequence[int],
-        out: int,
-        out_gain: float,
+        self, sizes: Sequence[int], hidden: Sequence[int], out: int, out_gain: float
     ) -> None:
         super().__init__()
-        self.norms = nn.ModuleList(n if n is not None else nn.Identity() for n in norms)
         # One orthogonal matrix over all inputs, as for their concatenation.
         joined = torch.empty(hidden[0], sum(sizes))
         nn.init.orthogonal_(joined, gain=2**0.5)
@@ -126,13 +121,20 @@ class KeyedMLP(nn.Module):
         layers.append(_orthogonal(hidden[-1], out, out_gain))
         self.tail = nn.Sequential(*layers)
 
-    def forward(self, *inputs: Tensor) -> Tensor:
+    def forward(self, *inputs: Tensor | SparseRows) -> Tensor:
         """Return the outputs, ``[*B, out]``, from one ``[*B, size]`` for each input."""
         first, *others = (
-            linear(norm(x))
-            for x, norm, linear in zip(inputs, self.norms, self.inputs, strict=True)
+            _apply(layer, x) for x, layer in zip(inputs, self.inputs, strict=True)
         )
         return self.tail(sum(others, start=first))
+
+
+def _apply(layer: nn.Module, x: Tensor | SparseRows) -> Tensor:
+    """Return what a linear layer makes of features, ``[*B, out]``."""
+    assert isinstance(layer, nn.Linear)
+    if isinstance(x, SparseRows):
+        return x.linear(layer.weight, layer.bias)
+    return layer(x)
 
 
 def _orthogonal(before: int, after: int, gain: float) -> nn.Linear:
@@ -201,10 +203,12 @@ class SharedStdNormal(IndependentNormal):
 
 
 class Agent(nn.Module):
-    """Actor, critic and their normalisers.
+    """Actor, critic and the normalisers of what they read.
 
-    The actor reads ``actor_keys`` and writes ``loc``, ``scale``, ``action``,
-    ``action_log_prob``; the critic reads ``critic_keys`` and writes ``state_value``.
+    `encode` makes ``("inputs", key)`` of each key that the networks read, once for
+    both of them and for all passes over a rollout. From the inputs of ``actor_keys``
+    the actor writes ``loc``, ``scale``, ``action``, ``action_log_prob``; from those of
+    ``critic_keys`` the critic writes ``state_value``.
 
     Args:
         sizes: Number of features of each key.
@@ -212,6 +216,7 @@ class Agent(nn.Module):
         critic_keys: What the critic reads.
         num_actions: ``J``.
         config: Size and initialisation.
+        sources: What computes keys that the environment does not give, as sparse rows.
     """
 
     def __init__(
@@ -221,21 +226,20 @@ class Agent(nn.Module):
         critic_keys: Sequence[str],
         num_actions: int,
         config: NetworkConfig,
+        sources: Mapping[str, SparseSource] | None = None,
     ) -> None:
         super().__init__()
-        self.actor_keys: list[NestedKey] = list(actor_keys)
-        self.critic_keys: list[NestedKey] = list(critic_keys)
+        self.sources = dict(sources or {})
+        self.actor_keys, self.critic_keys = list(actor_keys), list(critic_keys)
         normalized = [
             key
             for key in critic_keys
             if config.normalize == "all" or key not in _SIGNAL_KEYS
         ]
-        norms = {key: RunningNorm(sizes[key]) for key in normalized}
-        self.norms = nn.ModuleDict(norms)
+        self.norms = nn.ModuleDict({key: RunningNorm(sizes[key]) for key in normalized})
 
         def network(keys: Sequence[str], out: int, gain: float) -> KeyedMLP:
-            used = [norms.get(k) for k in keys]
-            return KeyedMLP([sizes[k] for k in keys], used, config.hidden, out, gain)
+            return KeyedMLP([sizes[k] for k in keys], config.hidden, out, gain)
 
         # A small last layer: the first actions stay near the default pose.
         self.head = GaussianHead(
@@ -246,7 +250,7 @@ class Agent(nn.Module):
         )
         self.actor = ProbabilisticActor(
             TensorDictModule(
-                self.head, in_keys=self.actor_keys, out_keys=["loc", "scale"]
+                self.head, in_keys=input_keys(actor_keys), out_keys=["loc", "scale"]
             ),
             in_keys=["loc", "scale"],
             out_keys=["action"],
@@ -260,6 +264,40 @@ class Agent(nn.Module):
         )
         self.critic = TensorDictModule(
             network(critic_keys, 1, 1.0),
-            in_keys=self.critic_keys,
+            in_keys=input_keys(critic_keys),
             out_keys=["state_value"],
         )
+
+    @property
+    def read_keys(self) -> list[str]:
+        """Keys of the environment's output that `encode` reads."""
+        return list(
+            dict.fromkeys(
+                read
+                for key in self.critic_keys
+                for read in (
+                    self.sources[key].in_keys if key in self.sources else [key]
+                )
+            )
+        )
+
+    def encode(self, tensordict: TensorDictBase) -> TensorDict:
+        """Return what the networks read, under ``("inputs", key)``.
+
+        Args:
+            tensordict: Holds ``read_keys``, or what the actor needs of them, ``[B]``.
+        """
+        inputs = TensorDict(batch_size=tensordict.batch_size, device=tensordict.device)
+        for key in self.critic_keys:
+            if key in self.sources:
+                inputs.set_non_tensor(key, self.sources[key](tensordict))
+                continue
+            value = tensordict.get(key, None)
+            if value is not None:
+                inputs[key] = self.norms[key](value) if key in self.norms else value
+        return TensorDict({"inputs": inputs}, tensordict.batch_size)
+
+
+def input_keys(keys: Sequence[str]) -> list[NestedKey]:
+    """Return the keys under which `Agent.encode` writes what the networks read."""
+    return [("inputs", key) for key in keys]

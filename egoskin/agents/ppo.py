@@ -6,23 +6,29 @@ the value of a time-out is taken from the terminal observation, before the reset
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import functools
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NonTensorData, TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
-from egoskin.agents.networks import Agent, NetworkConfig, RunningNorm
+from egoskin.agents.networks import Agent, NetworkConfig, RunningNorm, input_keys
+from egoskin.sparse import SparseRows
 
 # Adaptive learning rate (Unitree's and other humanoid codes): bounds and factor.
 _LR_BOUNDS, _LR_FACTOR = (1e-5, 1e-2), 1.5
 # The divergence is estimated on this many frames of each minibatch.
 _KL_FRAMES = 4096
+# More shares of a minibatch than this are smaller than what it costs to call PyTorch.
+_MAX_SHARES = 4
 
 
 class NonFiniteError(RuntimeError):
@@ -35,7 +41,11 @@ class NonFiniteError(RuntimeError):
 
     def __init__(self, text: str, batch: TensorDictBase) -> None:
         super().__init__(text)
-        self.batch: dict[str, Tensor] = dict(batch.items())
+        dense = (
+            (key, _sparse(value).dense() if isinstance(value, NonTensorData) else value)
+            for key, value in batch.flatten_keys("/").items()
+        )
+        self.batch: dict[str, Tensor] = dict(dense)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,35 +117,51 @@ def collect(
         info_keys: What else to keep of what the environment says, for metrics.
 
     Returns:
-        The rollout ``[T, N]`` with the agent's keys, ``action``, ``action_log_prob``,
-        ``loc``, ``scale``, ``state_value``, ``next_state_value``, ``reward``,
-        ``done`` and ``terminated``, on the agent's device; the tensordict to go on
-        from; and for each step the entries asked for.
+        The rollout ``[T, N]`` with the agent's ``inputs``, what it normalises, and
+        ``action``, ``action_log_prob``, ``loc``, ``scale``, ``state_value``,
+        ``next_state_value``, ``reward``, ``done``, ``terminated``, on its device; the
+        tensordict to go on from; and for each step the entries asked for.
     """
     device = agent.head.log_std.device
     frames, bootstraps, infos = [], [], []
-    inputs = agent.critic_keys
     for _ in range(num_steps):
-        frame = root.select(*inputs).reshape(-1).to(device)
+        read = _read(agent, root, device)
+        frame = agent.encode(read)
         agent.actor(frame)
         root["action"] = frame["action"].reshape(*root.batch_size, -1).to(root.device)
         step, root = env.step_and_maybe_reset(root)
         after = step["next"].reshape(-1)
         for key in ("reward", "done", "terminated"):
             frame[key] = after[key].to(device)
-        frames.append(frame)
+        # For the statistics.
+        frames.append(frame.update(read.select(*agent.norms)))
         bootstraps.append(_timeout_values(agent, after, device))
         infos.append(after.select(*info_keys))
-    rollout = TensorDict.maybe_dense_stack(frames)
-    assert isinstance(rollout, TensorDict)
-    last = root.select(*inputs).reshape(-1).to(device)
-    agent.critic(rollout)
-    following = agent.critic(last)["state_value"]
+    following = agent.critic(agent.encode(_read(agent, root, device)))["state_value"]
+    flat = agent.critic(_joined(frames))
+    rollout = flat.reshape(num_steps, -1)
     next_value = torch.cat((rollout["state_value"][1:], following[None]))
     for t, (rows, values) in enumerate(bootstraps):
         next_value[t, rows] = values
     rollout["next_state_value"] = next_value
     return rollout, root, infos
+
+
+def _read(agent: Agent, root: TensorDictBase, device: torch.device) -> TensorDictBase:
+    """Return what the agent reads, ``[N]``, on its device."""
+    return root.select(*agent.read_keys).reshape(-1).to(device)
+
+
+def _joined(frames: Sequence[TensorDict]) -> TensorDict:
+    """Return frames ``[N]`` one after the other, ``[T N]``."""
+    joined = TensorDict(batch_size=[sum(map(len, frames))], device=frames[0].device)
+    for key, value in frames[0].items(True):
+        parts: list[Any] = [frame[key] for frame in frames]
+        if isinstance(value, NonTensorData):
+            joined.set_non_tensor(key, SparseRows.cat(parts))
+        elif isinstance(value, Tensor):
+            joined[key] = torch.cat(parts)
+    return joined
 
 
 def _timeout_values(
@@ -145,7 +171,7 @@ def _timeout_values(
     ended = (after["done"] & ~after["terminated"])[:, 0].nonzero()[:, 0]
     if not len(ended):
         return ended.to(device), torch.zeros(0, 1, device=device)
-    terminal = after.select(*agent.critic_keys)[ended].to(device)
+    terminal = agent.encode(after.select(*agent.read_keys)[ended].to(device))
     return ended.to(device), agent.critic(terminal)["state_value"]
 
 
@@ -174,6 +200,10 @@ def add_advantages(rollout: TensorDict, gamma: float, gae_lambda: float) -> None
 class PPO:
     """The update: TorchRL's clipped loss, Adam, adaptive learning rate.
 
+    On a CPU each of a few threads takes its share of a minibatch: on networks this
+    small, PyTorch's own threads would wait for each other more than they work. The sum
+    of the gradients depends on the number of shares to rounding, and on nothing else.
+
     Args:
         agent: What is trained.
         config: How.
@@ -192,12 +222,20 @@ class PPO:
             log_explained_variance=False,
             loss_critic_type="l2",
             normalize_advantage=False,
+            # Threads share the networks: no parameter is swapped in and out.
+            functional=False,
         )
         self.loss.set_keys(sample_log_prob="action_log_prob")
         self._actor = [p for p in agent.actor.parameters() if p.requires_grad]
         self._critic = [p for p in agent.critic.parameters() if p.requires_grad]
         self.optimizer = torch.optim.Adam(
             [*self._actor, *self._critic], lr=config.learning_rate, eps=1e-5, fused=True
+        )
+        threads = torch.get_num_threads()
+        on_cpu = agent.head.log_std.device.type == "cpu"
+        self._shares = min(threads, _MAX_SHARES) if on_cpu else 1
+        self._pool = ThreadPoolExecutor(
+            self._shares, "learner", torch.set_num_threads, (threads // self._shares,)
         )
 
     @property
@@ -235,37 +273,35 @@ class PPO:
         add_advantages(rollout, config.gamma, config.gae_lambda)
         residual = rollout["value_target"] - rollout["state_value"]
         explained = 1 - residual.var() / rollout["value_target"].var().clamp(min=1e-12)
-        kept = [
-            *self.agent.critic_keys,
-            *("action", "action_log_prob", "loc", "scale"),
-            *("advantage", "value_target", "state_value"),
-        ]
-        data = rollout.select(*kept).reshape(-1)
+        data = rollout.reshape(-1)
+        kept = ["inputs", "action", "action_log_prob", "loc", "scale"]
+        batch = data.select(*kept, "advantage", "value_target", "state_value")
         sums: dict[str, Tensor] = {}
         count = 0
-        for batch in _minibatches(data, config.ppo_epochs, config.num_mini_batches):
-            if config.desired_kl is not None:
-                sums["kl"] = sums.get("kl", 0.0) + self._adapt_learning_rate(batch)
-            for name, value in self.step(batch).items():
-                sums[name] = sums.get(name, 0.0) + value
-            count += 1
+        for _ in range(config.ppo_epochs):
+            order = torch.randperm(len(batch)).to(batch.device or "cpu")
+            for index in order.chunk(config.num_mini_batches):
+                for name, value in self.step(batch, index).items():
+                    sums[name] = sums.get(name, 0.0) + value
+                count += 1
         for key, norm in self.agent.norms.items():
             assert isinstance(norm, RunningNorm)
             norm.update(data[key])
             if not torch.isfinite(norm.mean + norm.var).all():
-                rows = ~torch.isfinite(data[key]).all(-1)
-                raise NonFiniteError(f"normaliser of {key!r}", data[rows])
+                (bad,) = (~torch.isfinite(data[key]).all(-1)).nonzero(as_tuple=True)
+                raise NonFiniteError(f"normaliser of {key!r}", _rows(data, bad))
         metrics = {name: float(value) / count for name, value in sums.items()}
         metrics["explained_variance"] = float(explained)
         metrics["learning_rate"] = self.learning_rate
         metrics["action_std"] = float(self.agent.head.log_std.detach().exp().mean())
         return metrics
 
-    def step(self, batch: TensorDictBase) -> dict[str, Tensor]:
+    def step(self, data: TensorDictBase, index: Tensor) -> dict[str, Tensor]:
         """Take one step of the optimiser on a minibatch.
 
         Args:
-            batch: Rows of what `update` keeps of a rollout, ``[n]``.
+            data: What `update` keeps of a rollout, ``[n]``.
+            index: The rows that are the minibatch, ``[m]`` int64.
 
         Returns:
             Metrics by name.
@@ -274,42 +310,68 @@ class PPO:
             NonFiniteError: If a loss or gradient, then the agent is as it was before,
                 or a weight after the step is not finite.
         """
-        losses = self.loss(batch)
-        total = sum(v for k, v in losses.items() if k.startswith("loss_"))
-        self.optimizer.zero_grad(set_to_none=True)
-        total.backward()
+        shares = index.chunk(self._shares)
+        results = list(self._pool.map(partial(self._gradients, data), shares))
+        parameters = [*self._actor, *self._critic]
+        weights = [len(share) / len(index) for share in shares]
+
+        def mean(values: Iterable[Tensor]) -> Tensor:
+            return _total(w * v for w, v in zip(weights, values, strict=True))
+
+        metrics = {name: mean(r[1][name] for r in results) for name in results[0][1]}
+        for parameter, *parts in zip(parameters, *(r[0] for r in results), strict=True):
+            parameter.grad = mean(parts)
+        if self.config.desired_kl is not None:
+            self._adapt_learning_rate(metrics["kl"])
         limit = self.config.max_grad_norm
         actor_norm = nn.utils.clip_grad_norm_(self._actor, limit)
         critic_norm = nn.utils.clip_grad_norm_(self._critic, limit)
         # A loss that is not finite shows in a gradient norm that is not.
         if not torch.isfinite(actor_norm + critic_norm):
+            losses = (f"{k} {float(v)}" for k, v in metrics.items() if "loss" in k)
             raise NonFiniteError(
-                f"loss {float(total.detach())}, actor gradient norm "
-                f"{float(actor_norm)}, critic gradient norm {float(critic_norm)}",
-                batch,
+                f"{', '.join(losses)}, actor gradient norm {float(actor_norm)}, "
+                f"critic gradient norm {float(critic_norm)}",
+                _rows(data, index),
             )
         self.optimizer.step()
-        weights = nn.utils.get_total_norm([*self._actor, *self._critic])
-        if not torch.isfinite(weights):
-            raise NonFiniteError(f"norm of the weights {float(weights)}", batch)
+        norm = nn.utils.get_total_norm(parameters)
+        if not torch.isfinite(norm):
+            raise NonFiniteError(
+                f"norm of the weights {float(norm)}", _rows(data, index)
+            )
         self.agent.head.bound_std()
         return {
-            "loss_actor": losses["loss_objective"].detach(),
-            "loss_critic": losses["loss_critic"].detach(),
-            "entropy": losses["entropy"],
-            "clip_fraction": losses["clip_fraction"],
+            **metrics,
             "grad_norm_actor": actor_norm,
             "grad_norm_critic": critic_norm,
         }
 
+    def _gradients(
+        self, data: TensorDictBase, index: Tensor
+    ) -> tuple[Sequence[Tensor], dict[str, Tensor]]:
+        """Return gradients and metrics of the mean loss of some rows."""
+        batch = _rows(data.exclude("loc", "scale"), index)
+        losses = self.loss(batch)
+        total = _total(v for k, v in losses.items() if k.startswith("loss_"))
+        gradients = torch.autograd.grad(total, [*self._actor, *self._critic])
+        return gradients, {
+            "kl": self._divergence(data, index[: _KL_FRAMES // self._shares]),
+            "loss_actor": losses["loss_objective"].detach(),
+            "loss_critic": losses["loss_critic"].detach(),
+            "entropy": losses["entropy"],
+            "clip_fraction": losses["clip_fraction"],
+        }
+
     @torch.no_grad()
-    def _adapt_learning_rate(self, batch: TensorDictBase) -> Tensor:
-        """Divergence of the policy from the one that collected; adapts the rate."""
-        part = batch[:_KL_FRAMES]
-        assert isinstance(part, TensorDictBase)
-        old = part["loc"], part["scale"]
-        new = self.agent.head(*(part[key] for key in self.agent.actor_keys))
-        kl = gaussian_kl(*old, *new).mean()
+    def _divergence(self, data: TensorDictBase, index: Tensor) -> Tensor:
+        """Return that of the policy from the one that collected some rows."""
+        part = _rows(data.select("inputs", "loc", "scale"), index)
+        new = self.agent.head(*(part[key] for key in input_keys(self.agent.actor_keys)))
+        return gaussian_kl(part["loc"], part["scale"], *new).mean()
+
+    def _adapt_learning_rate(self, kl: Tensor) -> None:
+        """Adapt the learning rate to a divergence."""
         desired, (low, high) = self.config.desired_kl, _LR_BOUNDS
         assert desired is not None
         rate = self.learning_rate
@@ -319,7 +381,6 @@ class PPO:
             rate = min(rate * _LR_FACTOR, high)
         for group in self.optimizer.param_groups:
             group["lr"] = rate
-        return kl
 
 
 def gaussian_kl(loc0: Tensor, scale0: Tensor, loc1: Tensor, scale1: Tensor) -> Tensor:
@@ -329,14 +390,26 @@ def gaussian_kl(loc0: Tensor, scale0: Tensor, loc1: Tensor, scale1: Tensor) -> T
     return ((scale1 / scale0).log() + ratio - 0.5).sum(-1)
 
 
-def _minibatches(
-    data: TensorDictBase, passes: int, parts: int
-) -> Iterator[TensorDictBase]:
-    """Yield shuffled minibatches; draws from torch's global generator."""
-    for _ in range(passes):
-        order = torch.randperm(len(data)).to(data.device or "cpu")
-        for index in order.chunk(parts):
-            # data[index] would take four times as long.
-            yield data.apply(
-                partial(torch.index_select, dim=0, index=index), batch_size=index.shape
-            )
+def _total(values: Iterable[Tensor]) -> Tensor:
+    """Return the sum of tensors, from the first on."""
+    return functools.reduce(torch.add, values)
+
+
+def _sparse(value: NonTensorData) -> SparseRows:
+    """Return the sparse rows of an entry."""
+    rows = value.data
+    assert isinstance(rows, SparseRows)
+    return rows
+
+
+def _rows(data: TensorDictBase, index: Tensor) -> TensorDict:
+    """Return some rows, ``[m]``; data[index] would take four times as long."""
+    rows = TensorDict(batch_size=index.shape, device=data.device)
+    for key, value in data.items():
+        if isinstance(value, TensorDictBase):
+            rows[key] = _rows(value, index)
+        elif isinstance(value, NonTensorData):
+            rows.set_non_tensor(key, _sparse(value).select(index))
+        else:
+            rows[key] = value.index_select(0, index)
+    return rows

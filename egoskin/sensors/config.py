@@ -20,7 +20,7 @@ from egoskin.sensors.field import FieldSensor
 from egoskin.sensors.history import HoldLast
 from egoskin.sensors.placement import place_sensors
 from egoskin.sensors.presets import PRESETS
-from egoskin.sensors.ray import RaySensor
+from egoskin.sensors.ray import RaySensor, SparseRays
 from egoskin.sensors.signals import Binary, Localization, Proximity
 from egoskin.sensors.skin import Skin
 from egoskin.shapes import Shape
@@ -193,6 +193,36 @@ class SensorConfig:
             transforms.append(CatTensors(signals, out_key, sort=False, del_keys=False))
         return transforms
 
+    def sparse_rays(
+        self,
+        robot: RobotConfig,
+        skin: Skin,
+        objects: Sequence[Shape],
+        compile_kernels: bool = False,
+    ) -> SparseRays | None:
+        """Return what gives the signal as sparse rows, or None if it is not sparse.
+
+        Sparse are the beams of ideal rays of one grid and one range.
+
+        Args:
+            robot: The robot.
+            skin: The sensors.
+            objects: Shapes of what is sensed.
+            compile_kernels: Whether to compile the sensors; results are the same.
+        """
+        skin = self.filled(skin)
+        dense = self.signal == "localization" or self.corruption != "none"
+        dense |= self.reduce != "none" or self.per_object or self.validity
+        mixed = len(set(skin.range.tolist())) > 1 or len(self._groups(skin)) > 1
+        if self.coverage == "none" or dense or mixed:
+            return None
+        keys = ("distance", "object_detected")
+        sensor = self._sensor(robot, skin, objects, keys, compile_kernels)
+        reading = self._signal(skin.select([0]), "distance", "signal")
+        if not isinstance(sensor, RaySensor):
+            return None
+        return SparseRays(sensor, reading)
+
     def _groups(self, skin: Skin) -> dict[str, list[int]]:
         """Return the sensors of each kind, by the suffix of their keys.
 
@@ -240,7 +270,7 @@ class SensorConfig:
             return RaySensor(*args, reduce=self.reduce, **common)
         return FieldSensor(*args, **common)
 
-    def _signal(self, skin: Skin, in_key: str, out_key: str) -> Transform:
+    def _signal(self, skin: Skin, in_key: str, out_key: str) -> Proximity | Binary:
         """Return the signal of some sensors' readings."""
         keys: dict[str, Any] = {"in_keys": [in_key], "out_keys": [out_key]}
         if self.signal == "binary":

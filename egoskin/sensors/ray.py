@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Literal
 
 import numpy as np
 import pytorch_kinematics as pk
 import torch
-from tensordict import NestedKey
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from egoskin.compilation import compiled
@@ -22,8 +22,10 @@ from egoskin.sensors.geometry import (
     checked,
     product,
 )
+from egoskin.sensors.signals import Binary, Proximity
 from egoskin.sensors.skin import Skin
 from egoskin.shapes import Shape, first_hit
+from egoskin.sparse import SparseRows
 
 # Pairs of sensor and agent are culled with this margin for rounding [m].
 _SLACK = 1e-4
@@ -224,26 +226,112 @@ class RaySensor(ProximitySensor):
         """Write the readings of some rows, and return the least of each object."""
         if rows is None:
             out.fill_(torch.inf)
-        margins, views = self._margin_kernel(scene)
-        least = torch.full_like(margins[..., 0], torch.inf)
-        for i, (view, shape) in enumerate(zip(views, self.objects, strict=True)):
+        least = scene.active.new_full(scene.active.shape, torch.inf, dtype=out.dtype)
+        for i, row, sensor, reading, nearest in self._pairs(scene):
             target = out[i] if self.per_object else out
             # A view, or an error: a copy would lose what is written.
             flat = target.view(-1, *target.shape[2:])
+            place = (row if rows is None else rows[row]) * self.num_sensors + sensor
+            if i and not self.per_object:
+                reading = torch.minimum(_take(flat, place), reading)
+            _put(flat, place, reading)
+            least[i].scatter_reduce_(0, row, nearest, "amin")
+        return least
+
+    def _pairs(
+        self, scene: Scene
+    ) -> Iterator[tuple[int, Tensor, Tensor, Tensor, Tensor]]:
+        """Yield object, rows, sensors, readings and their least, of what may be hit."""
+        margins, views = self._margin_kernel(scene)
+        for i, (view, shape) in enumerate(zip(views, self.objects, strict=True)):
             # Whatever is not 0 may be hit, NaN too.
             pairs = _nonzero(margins[i])
             # Nothing wanted would still be a part, and compiled for its own sake.
             for part in pairs.split(self._chunk) if len(pairs) else ():
                 row, sensor = part // self.num_sensors, part % self.num_sensors
-                reading, nearest = self._kernel(scene, view, sensor, row, shape)
-                place = part
-                if rows is not None:
-                    place = rows[row] * self.num_sensors + sensor
-                if i and not self.per_object:
-                    reading = torch.minimum(_take(flat, place), reading)
-                _put(flat, place, reading)
-                least[i].scatter_reduce_(0, row, nearest, "amin")
-        return least
+                yield i, row, sensor, *self._kernel(scene, view, sensor, row, shape)
+
+    def warm_up(self, rows: int) -> None:
+        """Compile the kernels for a number of rows, which their first use would do."""
+        if not self._compile:
+            return
+        pose = torch.eye(7)[3].expand(rows, 7)
+        objects = pose[:, None].expand(-1, len(self.objects), -1)
+        joints = torch.zeros(rows, self._kinematics.num_joints)
+        # Every sensor is inside of the objects, or near: there are pairs to compute.
+        self.hits(
+            pose, joints, objects, torch.ones(objects.shape[:2], dtype=torch.bool)
+        )
+
+    def hits(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what is hit, without the grid: a thousandth of its numbers.
+
+        Args:
+            inputs: Base pose, joint positions, object poses, active flags.
+
+        Returns:
+            Place in the flattened readings ``[B, S, K]`` of each beam that hits
+            anything, ascending ``[n]`` int64, and its reading [m], ``[n]``.
+        """
+        rows = None if self._compile else self._rows_in_reach(*inputs)
+        places, readings = [torch.empty(0, dtype=torch.int64)], [inputs[0].new_empty(0)]
+        if rows is not None and not len(rows):
+            return places[0], readings[0]
+        scene = self._prepare(*(x if rows is None else x[rows] for x in inputs))
+        for _, row, sensor, reading, _ in self._pairs(scene):
+            place = (row if rows is None else rows[row]) * self.num_sensors + sensor
+            # NaN is no miss.
+            hit = _nonzero(reading != torch.inf)
+            beam = hit % self._num_beams
+            places.append(place[hit // self._num_beams] * self._num_beams + beam)
+            readings.append(reading.flatten()[hit])
+        place, reading = torch.cat(places).numpy(), torch.cat(readings).numpy()
+        # Those of each object are in order already, which a stable sort uses.
+        order = np.argsort(place, kind="stable")
+        place = place[order]
+        first = np.flatnonzero(np.diff(place, prepend=-1))
+        # Of a beam that hits two objects the nearer counts; NaN stays NaN.
+        least = np.minimum.reduceat(reading[order], first) if len(first) else reading
+        return torch.from_numpy(place[first]), torch.from_numpy(least)
+
+
+class SparseRays:
+    """The signal of full ray grids as `egoskin.sparse.SparseRows`, ``[B, S K]``.
+
+    The same numbers as those of the transforms, of the beams that hit anything; for
+    agents that learn from thousands of beams.
+
+    Args:
+        sensor: Sensors with all their beams, objects not told apart.
+        reading: What makes the signal of a distance, the same for every sensor.
+    """
+
+    def __init__(self, sensor: RaySensor, reading: Proximity | Binary) -> None:
+        self._sensor, self._reading = sensor, reading
+        self.size = sensor.readings.numel()
+        self.in_keys = [str(key) for key in sensor.in_keys]
+
+    @torch.no_grad()
+    def warm_up(self, rows: int) -> None:
+        """Compile the kernels for a number of rows, if they are to be compiled."""
+        self._sensor.warm_up(rows)
+
+    @torch.no_grad()
+    def __call__(self, tensordict: TensorDictBase) -> SparseRows:
+        """Return the signal of each row ``[B]``, on the device of the tensordict."""
+        given = [tensordict.get(key) for key in self.in_keys]
+        state = [x.cpu() for x in given]
+        place, distance = self._sensor.hits(*state)
+        nothing = self._reading.signal(distance.new_full((1, 1), torch.inf))
+        rows = len(state[0])
+        counts = torch.bincount(place // self.size, minlength=rows)
+        return SparseRows(
+            offsets=torch.cat((counts.new_zeros(1), counts.cumsum(0))),
+            column=place % self.size,
+            value=self._reading.signal(distance[None])[0],
+            size=self.size,
+            default=float(nothing),
+        ).to(given[0].device)
 
 
 def _nonzero(x: Tensor) -> Tensor:

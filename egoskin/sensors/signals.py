@@ -7,6 +7,7 @@ infinity means that nothing is in range; one of NaN (bad input) gives a signal o
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Literal
 
@@ -45,13 +46,14 @@ class _Reading(RowTransform):
     def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Return the signal, ``[B, S ...]`` flattened."""
         distance = inputs[0].flatten(1)
-        signal = self._signal(distance)
+        signal = self.signal(distance)
         if self.validity:
             signal = torch.cat((signal, found(distance)), -1)
         return (signal,)
 
-    def _signal(self, distance: Tensor) -> Tensor:
-        raise NotImplementedError
+    @abstractmethod
+    def signal(self, distance: Tensor) -> Tensor:
+        """Return the signal of measurements [m], ``[B, n]`` each."""
 
     def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
         """Return the spec of the signal."""
@@ -104,7 +106,8 @@ class Proximity(_Reading):
         self._unlimited = bool(scale.isinf().any())
         self.closeness = closeness
 
-    def _signal(self, distance: Tensor) -> Tensor:
+    def signal(self, distance: Tensor) -> Tensor:
+        """Return the signal of measurements [m], ``[B, n]`` each."""
         scale = self._scale.to(distance.dtype)
         if len(scale) > 1:
             if distance.shape[1] % len(scale):
@@ -139,7 +142,8 @@ class Binary(_Reading):
     ) -> None:
         super().__init__(False, in_keys, out_keys)
 
-    def _signal(self, distance: Tensor) -> Tensor:
+    def signal(self, distance: Tensor) -> Tensor:
+        """Return the signal of measurements [m], ``[B, n]`` each."""
         return found(distance)
 
 

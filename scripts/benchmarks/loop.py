@@ -31,7 +31,7 @@ from egoskin.make import (
     make_env,
     save_env_state,
 )
-from egoskin.policies import PolicySpec
+from egoskin.policies import PolicySpec, sparse_sources
 from egoskin.workers import WorkerPool
 
 
@@ -141,6 +141,7 @@ class _Loop:
         self.config, self._coverage = config, coverage
         self._skin = config.env.skin.build(config.env.robot_config)
         self._workers = check_num_workers(config.num_envs, config.num_workers)
+        self._sources = sparse_sources(config.env, self._skin, config.ppo.network)
         self._steps = config.ppo.rollout_steps
 
     def rows(self) -> list[Row]:
@@ -176,14 +177,16 @@ class _Loop:
             num_workers=self._workers,
             seed=config.seed,
             bare=bare,
+            sparse=bool(self._sources),
         )
 
     def _train_and_record(self) -> Row:
         """Train for a while, note a rollout to do again; return the memory it took."""
         config, env = self.config, self._pool
         torch.manual_seed(config.seed)
-        spec = PolicySpec.of(config.env, self._skin, config.ppo.network, env)
-        self._agent = spec.build_agent()
+        network, sources = config.ppo.network, self._sources
+        spec = PolicySpec.of(config.env, self._skin, network, env, sources)
+        self._agent = spec.build_agent(sources)
         self._ppo = PPO(self._agent, config.ppo)
         root = env.reset()
         with PeakMemory() as memory:
