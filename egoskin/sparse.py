@@ -137,8 +137,8 @@ class SparseSource(Protocol):
         """Return the rows of a tensordict, ``[B]``."""
         ...
 
-    def warm_up(self, rows: int) -> None:
-        """Do what the first call with this many rows would do besides."""
+    def warm_up(self, batch: int) -> None:
+        """Do what the first call, of this many rows, would do besides."""
         ...
 
 

@@ -369,7 +369,7 @@ def test_an_infinite_observation_is_met_in_the_normaliser():
     rollout = TensorDict({"observation": torch.randn(4, 8, 3)}, [4, 8])
     rollout["observation"][1, 2, 0] = float("inf")
     with torch.no_grad():
-        agent.critic(agent.actor(rollout))
+        rollout.update(agent.critic(agent.actor(agent.encode(rollout))))
     rollout["reward"] = rollout["next_state_value"] = torch.zeros(4, 8, 1)
     rollout["done"] = rollout["terminated"] = torch.zeros(4, 8, 1, dtype=torch.bool)
     with pytest.raises(NonFiniteError, match="normaliser of 'observation'") as error:

@@ -18,6 +18,7 @@ ALLOWED = {
     "robots": set(),
     "compilation": set(),
     "events": set(),
+    "sparse": set(),
     "watchdog": set(),
     "shapes": {"compilation"},
     "draws": set(),
@@ -34,9 +35,10 @@ ALLOWED = {
         "kinematics",
         "surface",
         "transform",
+        "sparse",
         "sensors",
     },
-    "agents": {"agents"},
+    "agents": {"sparse", "agents"},
 }
 # The simulator, and what draws pictures of it.
 MUJOCO = {"robots", "shapes", "envs.physics", "rendering", "sensors.mesh_surface"}

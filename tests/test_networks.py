@@ -34,7 +34,7 @@ def make_batch(n: int = 64) -> TensorDict:
 
 def test_separate_inputs_equal_one_layer_of_their_concatenation():
     torch.manual_seed(0)
-    net = KeyedMLP([4, 3], [None, None], [8, 8], 2, 1.0)
+    net = KeyedMLP([4, 3], [8, 8], 2, 1.0)
     x, y = torch.randn(5, 4), torch.randn(5, 3)
     joined = torch.nn.Linear(7, 8)
     with torch.no_grad():
@@ -65,9 +65,19 @@ def test_running_norm_equals_the_statistics_of_all_data():
 def test_a_forward_pass_leaves_the_normaliser_as_it_is():
     agent, batch = make_agent(), make_batch()
     before = agent.norms["observation"].mean.clone()
-    agent.actor(batch)
-    agent.critic(batch)
+    agent.critic(agent.actor(agent.encode(batch)))
     assert torch.equal(agent.norms["observation"].mean, before)
+
+
+def test_networks_read_normalised_inputs_and_signals_as_they_are():
+    agent, batch = make_agent(), make_batch()
+    agent.norms["observation"].update(5 + 3 * batch["observation"])
+    inputs = agent.encode(batch)["inputs"]
+    assert set(inputs.keys()) == set(CRITIC)
+    expected = agent.norms["observation"](batch["observation"])
+    assert torch.equal(inputs["observation"], expected)
+    assert not torch.equal(inputs["observation"], batch["observation"])
+    assert torch.equal(inputs["signal"], batch["signal"])
 
 
 def test_signals_enter_unnormalised_unless_asked():
@@ -79,17 +89,16 @@ def test_the_actor_does_not_see_what_only_the_critic_is_told():
     agent, batch = make_agent(), make_batch()
     changed = batch.clone()
     changed["privileged_observation"] += 1.0
-    values = [agent.critic(b.clone())["state_value"] for b in (batch, changed)]
-    means = [agent.head(*(b[k] for k in ACTOR))[0] for b in (batch, changed)]
-    assert torch.equal(*means)
-    assert not torch.equal(*values)
+    one, other = (agent.critic(agent.actor(agent.encode(b))) for b in (batch, changed))
+    assert torch.equal(one["loc"], other["loc"])
+    assert not torch.equal(one["state_value"], other["state_value"])
 
 
 def test_the_actor_samples_with_its_standard_deviation():
     # TorchRL's default would be the mean: every action equal to loc.
     agent = make_agent(init_std=0.5)
     with torch.no_grad():
-        out = agent.actor(make_batch(20000))
+        out = agent.actor(agent.encode(make_batch(20000)))
     noise = (out["action"] - out["loc"]) / out["scale"]
     assert noise.std() == pytest.approx(1.0, abs=0.02)
     normal = torch.distributions.Normal(out["loc"], out["scale"])

@@ -65,6 +65,7 @@ def counting_agent() -> Agent:
     agent = Agent(
         {"observation": 1}, ["observation"], ["observation"], 1, NetworkConfig()
     )
+    agent.norms.clear()
     critic = torch.nn.Linear(1, 1)
     with torch.no_grad():
         critic.weight.fill_(10.0)
@@ -132,8 +133,7 @@ def bandit_rollout(agent: Agent) -> TensorDict:
     """One-step episodes whose reward is highest at the action (1, 1)."""
     rollout = TensorDict({"observation": torch.randn(16, 256, 3)}, [16, 256])
     with torch.no_grad():
-        agent.actor(rollout)
-        agent.critic(rollout)
+        rollout.update(agent.critic(agent.actor(agent.encode(rollout))))
     miss = (rollout["action"] - 1).square().sum(-1, keepdim=True)
     rollout["reward"] = -miss
     rollout["next_state_value"] = torch.zeros(16, 256, 1)
@@ -189,6 +189,25 @@ def test_a_loss_that_is_not_finite_stops_before_the_weights_change():
         ppo.update(rollout)
     for key, value in agent.state_dict().items():
         assert torch.equal(value, before[key]), key
+
+
+@pytest.mark.parametrize("threads", [2, 3])
+def test_shares_of_a_minibatch_add_up_to_the_whole(threads: int):
+    results = []
+    for n in (1, threads):
+        torch.set_num_threads(n)
+        try:
+            agent = bandit_agent()
+            ppo = PPO(agent, PPOConfig(ppo_epochs=1))
+            metrics = ppo.update(bandit_rollout(agent))
+        finally:
+            torch.set_num_threads(2)
+        results.append((metrics, agent.head.body.tail[3].weight.detach()))
+    (whole, expected), (shared, weight) = results
+    assert ppo.shares == threads
+    torch.testing.assert_close(weight, expected)
+    assert shared["loss_critic"] == pytest.approx(whole["loss_critic"], rel=1e-5)
+    assert shared["grad_norm_actor"] == pytest.approx(whole["grad_norm_actor"], 1e-4)
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,8 @@ import torch
 from tensordict import NonTensorData, TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
+from torchrl.envs.utils import set_exploration_type
+from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
@@ -233,9 +235,9 @@ class PPO:
         )
         threads = torch.get_num_threads()
         on_cpu = agent.head.log_std.device.type == "cpu"
-        self._shares = min(threads, _MAX_SHARES) if on_cpu else 1
+        self.shares = min(threads, _MAX_SHARES) if on_cpu else 1
         self._pool = ThreadPoolExecutor(
-            self._shares, "learner", torch.set_num_threads, (threads // self._shares,)
+            self.shares, "learner", torch.set_num_threads, (threads // self.shares,)
         )
 
     @property
@@ -310,8 +312,12 @@ class PPO:
             NonFiniteError: If a loss or gradient, then the agent is as it was before,
                 or a weight after the step is not finite.
         """
-        shares = index.chunk(self._shares)
-        results = list(self._pool.map(partial(self._gradients, data), shares))
+        shares = index.chunk(self.shares)
+        # The loss sets these global modes while it runs, and then what it met before:
+        # threads that overlap would leave the next rollout without exploration.
+        mode = set_exploration_type(self.loss.deterministic_sampling_mode)
+        with mode, set_recurrent_mode(True):
+            results = list(self._pool.map(partial(self._gradients, data), shares))
         parameters = [*self._actor, *self._critic]
         weights = [len(share) / len(index) for share in shares]
 
@@ -355,13 +361,16 @@ class PPO:
         losses = self.loss(batch)
         total = _total(v for k, v in losses.items() if k.startswith("loss_"))
         gradients = torch.autograd.grad(total, [*self._actor, *self._critic])
-        return gradients, {
-            "kl": self._divergence(data, index[: _KL_FRAMES // self._shares]),
+        metrics = {
             "loss_actor": losses["loss_objective"].detach(),
             "loss_critic": losses["loss_critic"].detach(),
             "entropy": losses["entropy"],
             "clip_fraction": losses["clip_fraction"],
         }
+        if self.config.desired_kl is not None:
+            part = index[: _KL_FRAMES // self.shares]
+            metrics["kl"] = self._divergence(data, part)
+        return gradients, metrics
 
     @torch.no_grad()
     def _divergence(self, data: TensorDictBase, index: Tensor) -> Tensor:

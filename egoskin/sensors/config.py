@@ -216,12 +216,19 @@ class SensorConfig:
         mixed = len(set(skin.range.tolist())) > 1 or len(self._groups(skin)) > 1
         if self.coverage == "none" or dense or mixed:
             return None
-        keys = ("distance", "object_detected")
-        sensor = self._sensor(robot, skin, objects, keys, compile_kernels)
-        reading = self._signal(skin.select([0]), "distance", "signal")
-        if not isinstance(sensor, RaySensor):
+        if not isinstance(skin.coverage[0], Ray):
             return None
-        return SparseRays(sensor, reading)
+
+        def sensor(compile_kernels: bool) -> RaySensor:
+            keys = ("distance", "object_detected")
+            made = self._sensor(robot, skin, objects, keys, compile_kernels)
+            assert isinstance(made, RaySensor)
+            return made
+
+        plain = sensor(False)
+        compiled = sensor(True) if compile_kernels else plain
+        reading = self._signal(skin.select([0]), "distance", "signal")
+        return SparseRays(compiled, plain, reading)
 
     def _groups(self, skin: Skin) -> dict[str, list[int]]:
         """Return the sensors of each kind, by the suffix of their keys.

@@ -184,6 +184,11 @@ class ProximitySensor(RowTransform):
         reach += np.linalg.norm(skin.position, axis=-1)
         self._farthest = float((reach + skin.range * slant).max()) + _SLACK
 
+    @property
+    def num_joints(self) -> int:
+        """Number of joint positions it reads, ``J``."""
+        return self._kinematics.num_joints
+
     def scene(
         self, base_pose: Tensor, joint_pos: Tensor, object_pose: Tensor, active: Tensor
     ) -> Scene:

@@ -251,18 +251,6 @@ class RaySensor(ProximitySensor):
                 row, sensor = part // self.num_sensors, part % self.num_sensors
                 yield i, row, sensor, *self._kernel(scene, view, sensor, row, shape)
 
-    def warm_up(self, rows: int) -> None:
-        """Compile the kernels for a number of rows, which their first use would do."""
-        if not self._compile:
-            return
-        pose = torch.eye(7)[3].expand(rows, 7)
-        objects = pose[:, None].expand(-1, len(self.objects), -1)
-        joints = torch.zeros(rows, self._kinematics.num_joints)
-        # Every sensor is inside of the objects, or near: there are pairs to compute.
-        self.hits(
-            pose, joints, objects, torch.ones(objects.shape[:2], dtype=torch.bool)
-        )
-
     def hits(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Return what is hit, without the grid: a thousandth of its numbers.
 
@@ -302,29 +290,43 @@ class SparseRays:
     agents that learn from thousands of beams.
 
     Args:
-        sensor: Sensors with all their beams, objects not told apart.
+        sensor: Sensors with all their beams, objects not told apart; compiled or not.
+        plain: The same uncompiled, for batches of another size than the first.
         reading: What makes the signal of a distance, the same for every sensor.
     """
 
-    def __init__(self, sensor: RaySensor, reading: Proximity | Binary) -> None:
-        self._sensor, self._reading = sensor, reading
+    def __init__(
+        self, sensor: RaySensor, plain: RaySensor, reading: Proximity | Binary
+    ) -> None:
+        self._sensor, self._plain, self._reading = sensor, plain, reading
+        self._batch: int | None = None
         self.size = sensor.readings.numel()
         self.in_keys = [str(key) for key in sensor.in_keys]
 
     @torch.no_grad()
-    def warm_up(self, rows: int) -> None:
-        """Compile the kernels for a number of rows, if they are to be compiled."""
-        self._sensor.warm_up(rows)
+    def warm_up(self, batch: int) -> None:
+        """Compile for batches of a size, as the first call would do."""
+        if self._sensor is not self._plain:
+            # In the middle of the objects: there are pairs to compute.
+            pose = torch.eye(7)[3].expand(batch, 7)
+            objects = pose[:, None].expand(-1, len(self._sensor.objects), -1)
+            active = torch.ones(objects.shape[:2], dtype=torch.bool)
+            joints = torch.zeros(batch, self._sensor.num_joints)
+            self._sensor.hits(pose, joints, objects, active)
+        self._batch = batch
 
     @torch.no_grad()
     def __call__(self, tensordict: TensorDictBase) -> SparseRows:
         """Return the signal of each row ``[B]``, on the device of the tensordict."""
         given = [tensordict.get(key) for key in self.in_keys]
         state = [x.cpu() for x in given]
-        place, distance = self._sensor.hits(*state)
+        batch = len(state[0])
+        if self._batch is None:
+            self._batch = batch
+        sensor = self._sensor if batch == self._batch else self._plain
+        place, distance = sensor.hits(*state)
         nothing = self._reading.signal(distance.new_full((1, 1), torch.inf))
-        rows = len(state[0])
-        counts = torch.bincount(place // self.size, minlength=rows)
+        counts = torch.bincount(place // self.size, minlength=batch)
         return SparseRows(
             offsets=torch.cat((counts.new_zeros(1), counts.cumsum(0))),
             column=place % self.size,

@@ -1,0 +1,216 @@
+"""Sparse rows: a layer with the dense one's results, and rays without their grid."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from tensordict import TensorDict
+
+from egoskin.agents.networks import Agent, NetworkConfig
+from egoskin.agents.ppo import PPO, PPOConfig, collect
+from egoskin.make import EnvConfig, make_env
+from egoskin.policies import (
+    PolicySpec,
+    agent_tensors,
+    load_policy,
+    save_policy,
+    sparse_sources,
+)
+from egoskin.robots import H1_2
+from egoskin.sensors import Ray, RaySensor, place_sensors
+from egoskin.sensors.config import SensorConfig
+from egoskin.shapes import Sphere
+from egoskin.sparse import SparseRows
+
+SKIN = place_sensors(H1_2, 16, seed=0)
+RAYS = SensorConfig(coverage="ray")
+KEYS = ("base_pose", "joint_pos", "object_pose", "object_active")
+
+
+def rows_of(matrix: torch.Tensor, default: float) -> SparseRows:
+    row, column = (matrix != default).nonzero(as_tuple=True)
+    counts = torch.bincount(row, minlength=len(matrix))
+    return SparseRows(
+        offsets=torch.cat((counts.new_zeros(1), counts.cumsum(0))),
+        column=column,
+        value=matrix[row, column],
+        size=matrix.shape[1],
+        default=default,
+    )
+
+
+def draw(seed: int, rows: int, columns: int, default: float) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    matrix = torch.rand(rows, columns, generator=generator)
+    matrix[torch.rand(rows, columns, generator=generator) < 0.9] = default
+    return matrix
+
+
+@given(
+    st.integers(0, 2**32 - 1),
+    st.integers(1, 40),
+    st.integers(1, 70),
+    st.sampled_from([0.0, 1.0]),
+)
+def test_a_layer_of_sparse_rows_is_that_of_the_matrix(seed, rows, columns, default):
+    matrix = draw(seed, rows, columns, default)
+    sparse = rows_of(matrix, default)
+    assert torch.equal(sparse.dense(), matrix)
+    torch.manual_seed(seed)
+    layer = torch.nn.Linear(columns, 5)
+    there = torch.randn(rows, 5)
+    expected = layer(matrix)
+    wanted = torch.autograd.grad(expected, [layer.weight, layer.bias], there)
+    result = sparse.linear(layer.weight, layer.bias)
+    torch.testing.assert_close(result, expected, rtol=1e-4, atol=1e-5)
+    grads = torch.autograd.grad(result, [layer.weight, layer.bias], there)
+    torch.testing.assert_close(grads, wanted, rtol=1e-4, atol=1e-4)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 30), st.integers(0, 50))
+def test_rows_are_selected_and_joined_like_those_of_the_matrix(seed, rows, wanted):
+    matrix = draw(seed, rows, 20, 1.0)
+    index = torch.randint(rows, (wanted,))
+    sparse = rows_of(matrix, 1.0)
+    assert torch.equal(sparse.select(index).dense(), matrix[index])
+    joined = SparseRows.cat([sparse, sparse.select(index)])
+    assert torch.equal(joined.dense(), torch.cat((matrix, matrix[index])))
+    assert len(joined) == rows + wanted
+
+
+# --- rays -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("ray", [Ray(), Ray(sub_beams=2), Ray(measure="depth")])
+def test_hits_are_the_readings_of_the_grid(random_state, ray):
+    state = random_state(300, seed=1, objects=3)
+    # Two objects on one another, and a row of NaN.
+    state["object_pose"][:50, 1] = state["object_pose"][:50, 0]
+    state["joint_pos"][7, 3] = float("nan")
+    objects = (Sphere(radius=0.25), Sphere(radius=0.2), Sphere(radius=0.1))
+    sensor = RaySensor(SKIN, H1_2.chain, objects, 1.5, ray)
+    inputs = [state[key] for key in KEYS]
+    place, distance = sensor.hits(*inputs)
+    grid = sensor.compute(*inputs)[0].flatten()
+    assert torch.equal(place, (grid != torch.inf).nonzero()[:, 0])
+    torch.testing.assert_close(distance, grid[place], rtol=0, atol=0, equal_nan=True)
+    assert distance.isnan().any()
+    assert len(place) > 1000
+
+
+@pytest.mark.parametrize("signal", ["proximity", "closeness", "binary"])
+def test_the_sparse_signal_is_that_of_the_transforms(random_state, signal):
+    config = replace(RAYS, signal=signal)
+    objects = (Sphere(radius=0.25),) * 3
+    rays = config.sparse_rays(H1_2, SKIN, objects)
+    state = random_state(200, seed=2, objects=3)
+    dense = state.clone()
+    for transform in config.transforms(H1_2, SKIN, objects, dt=1 / 60):
+        transform(dense)
+    assert torch.equal(rays(state).dense(), dense["signal"])
+    # A batch of another size than the first.
+    assert torch.equal(rays(state[:9]).dense(), dense["signal"][:9])
+
+
+def test_nothing_in_reach_is_no_hit(random_state):
+    rays = RAYS.sparse_rays(H1_2, SKIN, (Sphere(radius=0.25),))
+    state = random_state(20, seed=0, objects=1)
+    state["object_active"][:] = False
+    assert torch.equal(rays(state).dense(), torch.ones(20, 16 * 64))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"coverage": "field"},
+        {"coverage": "none"},
+        {"signal": "localization"},
+        {"reduce": "min"},
+        {"corruption": "time_of_flight"},
+        {"per_object": True},
+        {"validity": True},
+    ],
+)
+def test_whatever_is_not_sparse_is_left_to_the_transforms(change):
+    config = EnvConfig(sensor=replace(RAYS, **change))
+    assert sparse_sources(config, SKIN, NetworkConfig()) == {}
+
+
+def test_histories_normalised_signals_and_mixed_skins_are_left_as_well():
+    config = EnvConfig(sensor=RAYS)
+    assert set(sparse_sources(config, SKIN, NetworkConfig())) == {"signal"}
+    assert not sparse_sources(replace(config, history=2), SKIN, NetworkConfig())
+    assert not sparse_sources(config, SKIN, NetworkConfig(normalize="all"))
+    coverage = (Ray(), Ray(grid=(4, 4)), *SKIN.coverage[2:])
+    assert not sparse_sources(config, replace(SKIN, coverage=coverage), NetworkConfig())
+
+
+# --- agents -----------------------------------------------------------------------
+
+
+def rollout_of(sparse: bool) -> tuple[Agent, TensorDict, PolicySpec]:
+    """An untrained agent and what it collects while the first balls arrive."""
+    config = EnvConfig(sensor=RAYS)
+    sources = sparse_sources(config, SKIN, NetworkConfig()) if sparse else {}
+    env = make_env(
+        config, SKIN, num_envs=32, num_workers=1, seed=0, sparse=bool(sources)
+    )
+    try:
+        torch.manual_seed(0)
+        spec = PolicySpec.of(config, SKIN, NetworkConfig(), env, sources)
+        agent = spec.build_agent(sources)
+        root = env.reset()
+        for _ in range(3):
+            rollout, root, _ = collect(env, agent, root, 16)
+    finally:
+        env.close()
+    return agent, rollout, spec
+
+
+def test_an_agent_collects_the_same_from_hits_as_from_the_grid():
+    agent, rollout, _ = rollout_of(True)
+    dense_agent, dense, _ = rollout_of(False)
+    tensors, dense_tensors = agent_tensors(agent), agent_tensors(dense_agent)
+    assert tensors.keys() == dense_tensors.keys()
+    assert all(torch.equal(tensors[key], dense_tensors[key]) for key in tensors)
+    rows, matrix = rollout["inputs", "signal"], dense["inputs", "signal"]
+    assert isinstance(rows, SparseRows)
+    assert len(rows.value) > 100
+    # Actions differ to rounding, and so does what follows of them.
+    same = (rows.dense().reshape_as(matrix) - matrix).abs() < 1e-3
+    assert same.float().mean() > 0.999
+    for key in ("loc", "state_value", "next_state_value"):
+        torch.testing.assert_close(rollout[key], dense[key], atol=1e-2, rtol=1e-3)
+
+
+def test_an_update_from_hits_is_that_from_the_grid(tmp_path):
+    agent, rollout, spec = rollout_of(True)
+    rows = rollout["inputs", "signal"]
+    dense = rollout.clone()
+    del dense["inputs", "signal"]
+    dense["inputs", "signal"] = rows.dense().reshape(16, 32, -1)
+    results = []
+    for data in (rollout, dense):
+        torch.manual_seed(0)
+        learner = copy.deepcopy(agent)
+        config = PPOConfig(ppo_epochs=1, num_mini_batches=1, desired_kl=None)
+        metrics = PPO(learner, config).update(data)
+        results.append((metrics, {k: p.grad for k, p in learner.named_parameters()}))
+    (metrics, gradients), (expected, wanted) = results
+    assert metrics == pytest.approx(expected, rel=1e-3, abs=1e-6)
+    assert metrics["grad_norm_actor"] > 0
+    for key, value in gradients.items():
+        torch.testing.assert_close(value, wanted[key], atol=1e-5, rtol=1e-3)
+    # A policy that learnt from hits is one of the grid.
+    path = tmp_path / "policy.safetensors"
+    save_policy(path, agent, spec)
+    flat = dense.reshape(-1)
+    flat["signal"] = flat["inputs", "signal"]
+    given = flat["loc"]
+    loc = load_policy(path)(flat.select("observation", "signal"))["action"]
+    torch.testing.assert_close(loc, given, atol=1e-5, rtol=1e-4)
