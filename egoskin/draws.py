@@ -118,14 +118,12 @@ def uniform(
     Raises:
         ValueError: If the seed is not a 32-bit unsigned integer.
     """
-    bits = torch.cat(
-        [
-            random_words(
-                seed, stream, row, episode, counter, torch.full_like(row, block)
-            )
-            for block in range(-(-size // 4))
-        ]
-    )[:size].movedim(0, -1)
+    shape = (-(-size // 4), *row.shape)
+    block = torch.arange(shape[0], device=row.device).reshape(-1, *[1] * row.ndim)
+    what = (x.expand(shape) for x in (row, episode, counter, block))
+    # [4, blocks, *B]: the numbers of one element are four words of each block.
+    words = random_words(seed, stream, *what).transpose(0, 1).flatten(0, 1)
+    bits = words[:size].movedim(0, -1)
     return (bits >> 8).to(torch.float32) * 2.0**-24
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple
 
 import pytorch_kinematics as pk
 import torch
@@ -194,6 +194,8 @@ class LinkKinematics:
             for s in self._steps
         ]
 
+        self._turns = _turns(self._steps, len(self._joints))
+
     def reach(self) -> list[float]:
         """Return how far each link's origin can be from the base [m], at most.
 
@@ -254,20 +256,6 @@ class LinkKinematics:
         """
         return self._evaluate(_constant(None), sin, cos, joints)
 
-    def _stacked_frames(self, joint_pos: Tensor) -> list[tuple[list[Tensor], Tensor]]:
-        """Return each link's axes and position, ``[3, B]`` or, constant, ``[3, 1]``.
-
-        Those of `link_frames` to rounding (of constants), with the three coordinates
-        in one tensor: a third of the calls, and calls are what few rows cost.
-        """
-        unit = torch.eye(3, dtype=joint_pos.dtype, device=joint_pos.device)[:, :, None]
-        root: Frame = [list(unit.unbind(1))], [torch.zeros_like(unit[:, 0])]
-        joints = self._used(joint_pos)
-        # A few calls instead of the many of `sincos`.
-        frames = self._evaluate(root, joints.sin(), joints.cos(), joints)
-        # All are tensors, because the root's are.
-        return cast(Any, [(axes, position) for (axes,), (position,) in frames])
-
     def _evaluate(
         self, root: Frame, sin: Tensor, cos: Tensor, joints: Tensor
     ) -> list[Frame]:
@@ -285,34 +273,6 @@ class LinkKinematics:
             frames.append((rotation, position))
         return [frames[slot] for slot in self._slots]
 
-    def points_b(
-        self, joint_pos: Tensor, offsets: Sequence[Sequence[Sequence[float]]]
-    ) -> Tensor:
-        """Return points fixed on the links, in the base frame.
-
-        Args:
-            joint_pos: Joint positions, ``[B, J]``.
-            offsets: For each link the points in its frame [m], n_l x 3.
-
-        Returns:
-            Positions [m], ``[3, S, B]`` with S = sum of n_l, link by link: the batch
-            is last, as the kernels want it.
-        """
-        parts = []
-        batch = joint_pos.shape[0]
-        for (axes, position), local in zip(
-            self._stacked_frames(joint_pos), offsets, strict=True
-        ):
-            if len(local) == 0:
-                continue
-            columns = torch.as_tensor(
-                local, dtype=joint_pos.dtype, device=joint_pos.device
-            ).t()[:, :, None]
-            total = _dot([axis[:, None] for axis in axes], list(columns))
-            total = total + position[:, None]
-            parts.append(total.expand(3, len(local), batch))
-        return torch.cat(parts, 1)
-
     def poses_b(self, joint_pos: Tensor) -> tuple[Tensor, Tensor]:
         """Return link positions ``[B, L, 3]`` [m] and rotations ``[B, L, 3, 3]``.
 
@@ -322,12 +282,89 @@ class LinkKinematics:
         Returns:
             Position and rotation matrix of each link in the base frame.
         """
-        size = (3, joint_pos.shape[0])
-        frames = self._stacked_frames(joint_pos)
-        position = torch.stack([p.expand(size).t() for _, p in frames], 1)
-        # Axes are columns: [3 columns, 3, B] -> [B, 3, 3 columns].
-        rotation = [torch.stack([a.expand(size) for a in axes]) for axes, _ in frames]
-        return position, torch.stack(rotation).permute(3, 0, 2, 1)
+        rotation, position = self._stacked_frames(joint_pos)
+        return position.movedim(-1, 0), rotation.movedim(-1, 0)
+
+    def _stacked_frames(self, joint_pos: Tensor) -> tuple[Tensor, Tensor]:
+        """Return rotations ``[L, 3, 3, B]`` and positions ``[L, 3, B]`` of the links.
+
+        Those of `link_frames` to rounding, all frames of one depth in one go: a tenth
+        of the calls, and calls are what few rows cost.
+        """
+        used = self._used(joint_pos)
+        # What does not turn turns by 0.
+        joints = torch.cat((used, joint_pos.new_zeros(1, len(joint_pos))))
+        joints = joints[self._turns.joint][:, None]
+        constant, by_cos, by_sin, offset, slide = (
+            x.to(joint_pos) for x in self._turns.matrices
+        )
+        turn = joints[:, None]
+        relative = constant + by_cos * turn.cos() + by_sin * turn.sin()
+        shift = offset + slide * joints
+        rotation = relative.new_zeros(len(self._steps) + 1, 3, 3, len(joint_pos))
+        rotation[0] = torch.eye(3)[:, :, None]
+        position = rotation.new_zeros(rotation[:, 0].shape)
+        for steps, parents in self._turns.levels:
+            r, p = rotation[parents], position[parents]
+            q = relative[steps]
+            rotation[steps + 1] = (
+                r[:, :, :1] * q[:, :1]
+                + r[:, :, 1:2] * q[:, 1:2]
+                + r[:, :, 2:] * q[:, 2:]
+            )
+            position[steps + 1] = _moved(r, p, shift[steps])
+        return rotation[self._slots], position[self._slots]
+
+
+def _moved(rotation: Tensor, position: Tensor, point: Tensor) -> Tensor:
+    """Return R x + p, ``[n, 3, B]``, summed in one order whatever the batch."""
+    x, y, z = (rotation[:, :, i] * point[:, i : i + 1] for i in range(3))
+    return position + ((x + y) + z)
+
+
+class _Turns(NamedTuple):
+    """The steps as tensors; R = constant + by_cos cos q + by_sin sin q."""
+
+    joint: Tensor
+    """Joint of each step, or the number of joints for none, ``[n]``."""
+    matrices: tuple[Tensor, ...]
+    """Those three ``[n, 3, 3, 1]``; then offset, and way of a slide, ``[n, 3, 1]``."""
+    levels: list[tuple[Tensor, Tensor]]
+    """Steps of each depth and the slots of their parents, from the root on."""
+
+
+def _turns(steps: Sequence[_Step], num_joints: int) -> _Turns:
+    """Return steps as tensors."""
+    one, level = torch.eye(3, dtype=torch.float64), [0]
+    parts: list[list[Tensor]] = [[], [], [], [], []]
+    for step in steps:
+        level.append(level[step.parent] + 1)
+        axis = torch.tensor(step.axis, dtype=torch.float64)
+        offset, shift = (torch.tensor(x, dtype=torch.float64) for x in step.offset)
+        revolute = step.joint_type == "revolute"
+        # Rodrigues: a a^T + (1 - a a^T) cos q + [a]x sin q, after the fixed offset.
+        along = torch.outer(axis, axis) if revolute else one
+        skew = torch.linalg.cross(axis.expand(3, 3), one).t() * float(revolute)
+        sliding = offset @ axis * float(step.joint_type == "prismatic")
+        terms = (offset @ along, offset @ (one - along), offset @ skew, shift, sliding)
+        for part, term in zip(parts, terms, strict=True):
+            part.append(term[..., None])
+    shapes = [(3, 3)] * 3 + [(3,)] * 2
+    depths = range(1, max(level) + 1)
+    numbers = [[i for i, d in enumerate(level[1:]) if d == depth] for depth in depths]
+    return _Turns(
+        torch.tensor(
+            [s.joint if s.joint >= 0 else num_joints for s in steps], dtype=torch.int64
+        ),
+        tuple(
+            torch.stack(part) if part else one.new_zeros(0, *shape, 1)
+            for part, shape in zip(parts, shapes, strict=True)
+        ),
+        [
+            (torch.tensor(level), torch.tensor([steps[i].parent for i in level]))
+            for level in numbers
+        ],
+    )
 
 
 def quat_to_matrix(quat: Tensor) -> Tensor:

@@ -79,25 +79,6 @@ def test_pruning_changes_no_bit(every_link, random_joint_pos, links):
     assert torch.equal(some_rotation, rotation[:, index])
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_points_are_those_of_the_link_frames(random_joint_pos, dtype):
-    links = ("torso_link", "pelvis", "left_elbow_link", "right_ankle_roll_link")
-    rng = np.random.default_rng(0)
-    offsets = [rng.normal(size=(n, 3)).tolist() for n in (3, 2, 0, 1)]
-    joint_pos = random_joint_pos(50, 2, dtype)
-    points = LinkKinematics(H1_2.chain, links).points_b(joint_pos, offsets)
-    assert points.shape == (3, 6, 50)
-    assert points.dtype == dtype
-    position, rotation = mujoco_poses(joint_pos)
-    expected = []
-    for name, local in zip(links, offsets, strict=True):
-        i = H1_2.links.index(name)
-        expected += [rotation[:, i] @ point + position[:, i] for point in local]
-    # Points lie up to 3 m from their link's origin, so rounding weighs more.
-    atol = 5 * TOLERANCE
-    np.testing.assert_allclose(points.permute(1, 2, 0), expected, 0, atol)
-
-
 @given(st.lists(st.integers(0, 63), min_size=1, max_size=40))
 def test_a_padded_subset_is_bit_identical_to_the_whole(every_link, rows):
     generator = torch.Generator().manual_seed(0)
