@@ -19,7 +19,7 @@ from torchrl.envs import (
 
 from egoskin.checkpoint import part, prefixed
 from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
-from egoskin.observations import Privileged, Proprioception
+from egoskin.observations import Oracle, Privileged, Proprioception
 from egoskin.robots import ROBOTS, RobotConfig
 from egoskin.sensors import History, Skin
 from egoskin.sensors.config import SensorConfig, SkinConfig
@@ -142,6 +142,8 @@ def make_worker_env(
                 compile_kernels=compile_kernels,
             ),
         ]
+        if config.sensor.coverage == "oracle":
+            transforms.append(Oracle(out_keys=[f"signal{suffix}"]))
         if suffix:
             new = [f"{key}{suffix}" for key in config.actor_keys]
             transforms.append(History(config.history, new, config.actor_keys))

@@ -148,6 +148,8 @@ def test_a_policy_file_runs_on_a_tensordict_without_any_environment(trained: Pat
 
 CELLS = [
     ["--sensor.coverage", "none"],
+    ["--sensor.coverage", "oracle"],
+    ["--sensor.coverage", "oracle", "--history", "2"],
     *(
         ["--sensor.coverage", coverage, "--sensor.signal", signal, *reduced]
         for signal in ("localization", "proximity", "closeness", "binary")
