@@ -39,6 +39,10 @@ _RAW_KEYS = (
     "tactile",
     "displacement_w",
     "previous_action",
+    "power",
+    "torque_saturation",
+    "object_hit",
+    "object_arrived",
 )
 # What the networks read of the transforms' results; the others stay as well.
 _NETWORK_KEYS = ("observation", "privileged_observation", "signal")

@@ -128,6 +128,36 @@ def test_an_evaluation_has_the_figures_promised(trained: Path, tmp_path: Path):
     assert result["success"]["mean"] + ends == pytest.approx(1.0)
 
 
+def test_an_evaluation_says_what_the_policy_does_and_at_another_physics_rate(
+    trained: Path, tmp_path: Path
+):
+    done = run(
+        "evaluate.py",
+        *(trained, "--episodes", "16", "--json", tmp_path / "out.json"),
+        *("--behaviour", "--check-substeps", "8"),
+    )
+    assert done.returncode == 0, done.stderr
+    assert "physics at 120 Hz" in done.stdout
+    assert "physics at 480 Hz" in done.stdout
+    assert "success lost by the other physics rate" in done.stdout
+    assert "speed at arrival" in done.stdout
+    assert "mechanical power" in done.stdout
+    result = json.loads((tmp_path / "out.json").read_text())
+    assert result["check_substeps"] == 8
+    assert result["checked"]["episodes"] == 16
+    # Another rate is another course of events.
+    assert result["checked"]["survival_time"] != result["survival_time"]
+    groups = result["behaviour"]["throws"]["direction"]
+    assert [g["name"] for g in groups] == ["front", "left", "back", "right"]
+    assert sum(g["episodes"] for g in groups) == 16
+
+
+def test_physics_steps_that_are_none_are_refused(trained: Path):
+    done = run("evaluate.py", trained, "--check-substeps", "0")
+    assert done.returncode == 2
+    assert "check_substeps must be at least 1, got 0" in done.stderr
+
+
 def test_a_policy_file_runs_on_a_tensordict_without_any_environment(trained: Path):
     policy = egoskin.load_policy(trained / "policies" / f"{4 * BATCH:012d}.safetensors")
     assert policy.in_keys == ["observation", "signal"]
