@@ -182,7 +182,8 @@ class Watcher:
         going = running & ~ended
         for age in _AGES:
             if self._step == round(age * self._hz):
-                self._way[age] = after["displacement_w"][going].norm(dim=-1)
+                way = after["displacement_w"][going]
+                self._way[age] = way.square().sum(-1).sqrt()
         self._see_balls(after, running)
         # A blow, a fall or a failed simulation is not how the policy moves.
         self._see_motion(before[going], after[going])

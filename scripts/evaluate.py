@@ -1,6 +1,7 @@
 """Evaluate a policy on a fixed bank of throws.
 
 python scripts/evaluate.py runs/NAME
+python scripts/evaluate.py oracle
 python scripts/evaluate.py runs/NAME/policies/000005046272.safetensors --json out.json
 python scripts/evaluate.py runs/NAME --behaviour --check-substeps 8
 """
@@ -29,7 +30,8 @@ class EvaluateConfig:
     """Play a bank of throws with the mean action of a trained policy."""
 
     policy: Annotated[Path, tyro.conf.Positional]
-    """Run folder (its latest checkpoint), checkpoint or policy file."""
+    """Run folder (its latest checkpoint), checkpoint, policy file, or the name of a
+    policy that comes with the package."""
     bank_seed: int = 0
     """Seed of the bank of throws."""
     episodes: int = 1024
@@ -154,14 +156,15 @@ def main(args: list[str]) -> None:
         "num_workers": config.num_workers,
         "on_step": show,
     }
-    behaviour, finer = None, None
+    behaviour = None
     if config.behaviour:
         result, behaviour = behave(policy, env_config, policy.skin, **bank)
     else:
         result = evaluate(policy, env_config, policy.skin, **bank)
+    checked_config, checked = env_config, None
     if config.check_substeps is not None:
-        finer_config = with_substeps(env_config, config.check_substeps)
-        finer = evaluate(policy, finer_config, policy.skin, **bank)
+        checked_config = with_substeps(env_config, config.check_substeps)
+        checked = evaluate(policy, checked_config, policy.skin, **bank)
     if sys.stderr.isatty():
         print("\r\x1b[K", end="", file=sys.stderr)
     title = (
@@ -173,12 +176,12 @@ def main(args: list[str]) -> None:
     if behaviour is not None:
         print(behaviour_table(behaviour))
         content["behaviour"] = dataclasses.asdict(behaviour)
-    if config.check_substeps is not None and finer is not None:
-        print("\n" + table(finer, title + physics_rate(finer_config)))
-        lost = 100 * (result.success.mean - finer.success.mean)
+    if checked is not None:
+        print("\n" + table(checked, title + physics_rate(checked_config)))
+        lost = 100 * (result.success.mean - checked.success.mean)
         print(f"  success lost by the other physics rate: {lost:.2f} points")
         content["check_substeps"] = config.check_substeps
-        content["checked"] = dataclasses.asdict(finer)
+        content["checked"] = dataclasses.asdict(checked)
     if config.json is not None:
         config.json.write_text(json.dumps(content, indent=2) + "\n")
 
