@@ -14,7 +14,8 @@ train: $(VENV)/run
 
 demo: $(VENV)/run
 	$(BIN)/python scripts/evaluate.py $(POLICY) --episodes 256
-	$(BIN)/python scripts/render.py $(POLICY) --episode $(EPISODE) --out demo.mp4
+	$(BIN)/python scripts/render.py $(POLICY) --episode $(EPISODE) --out demo.mp4 \
+		--fps 20 --size 640 360
 
 test: $(VENV)/dev
 	$(BIN)/python -m pytest -m "not slow" $(ARGS)
