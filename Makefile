@@ -3,11 +3,19 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 ARGS ?=
+# The policy of `make demo`, and an episode of its bank to film.
+POLICY ?= oracle
+EPISODE ?= 199
 
-.PHONY: train test test-slow test-memory verify check bench clean
+.PHONY: train demo test test-slow test-memory verify check bench clean
 
 train: $(VENV)/run
 	$(BIN)/python scripts/ppo.py $(ARGS)
+
+demo: $(VENV)/run
+	$(BIN)/python scripts/evaluate.py $(POLICY) --episodes 256
+	$(BIN)/python scripts/render.py $(POLICY) --episode $(EPISODE) --out demo.mp4 \
+		--fps 20 --size 640 360
 
 test: $(VENV)/dev
 	$(BIN)/python -m pytest -m "not slow" $(ARGS)

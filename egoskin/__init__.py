@@ -32,6 +32,7 @@ from `egoskin.sensors.tactile`, in tasks of your own
 from `egoskin.observations`
 ``observation``             ``[*B, 6+2J]`` proprioception               actor, critic
 ``privileged_observation``  ``[*B, P]``   told in training only         critic
+``signal``                  ``[*B, 7 O]`` an oracle's: the truth        actor, critic
 from `egoskin.agents.networks.Agent`
 ``action``                  ``[*B, J]``   see DodgeballEnv              env
 ``action_log_prob``         ``[*B]``      of the action                 PPO

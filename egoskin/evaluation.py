@@ -20,8 +20,12 @@ from torch import Tensor, nn
 
 from egoskin.envs.dodgeball import DodgeballConfig
 from egoskin.envs.throws import ThrowConfig
-from egoskin.make import EnvConfig, make_env
+from egoskin.make import EnvConfig, check_num_workers, make_env, make_worker_env
 from egoskin.sensors import Skin
+
+Watch = Callable[[TensorDictBase, TensorDictBase, Tensor], None]
+"""Called after each step with the state before it and the action, the state after it
+(``[N]`` rows, raw keys kept) and the rows whose episode it belongs to, ``[N]`` bool."""
 
 # Survival time is restricted to this [s].
 _LONGEST = 10.0
@@ -122,6 +126,7 @@ def play_bank(
     num_workers: int | None = None,
     hold: bool = False,
     on_step: Callable[[int, int], None] | None = None,
+    watch: Watch | None = None,
 ) -> Episodes:
     """Return how the episodes of a bank end.
 
@@ -134,15 +139,17 @@ def play_bank(
         num_workers: Processes; the result does not depend on it.
         hold: Whether the robot is held rigid in its default pose.
         on_step: Called with (steps done, episodes still running).
+        watch: Sees every step; the bank is then played in this process, with threads
+            instead of workers, and comes to the same.
     """
-    env = make_env(
-        config,
-        skin,
-        num_envs=episodes,
-        seed=bank_seed,
-        num_workers=num_workers,
-        hold=hold,
-    )
+    shared: dict[str, Any] = {"num_envs": episodes, "seed": bank_seed, "hold": hold}
+    if watch is None:
+        env = make_env(config, skin, num_workers=num_workers, **shared)
+    else:
+        threads = check_num_workers(episodes, num_workers)
+        env = make_worker_env(
+            config, skin, num_threads=threads, keep_raw=True, **shared
+        )
     steps = torch.zeros(episodes, dtype=torch.int64)
     running = torch.ones(episodes, dtype=torch.bool)
     ends = {k: torch.zeros(episodes, dtype=torch.bool) for k in ("hit", "fallen")}
@@ -161,6 +168,8 @@ def play_bank(
             following = data["next"]
             assert isinstance(following, TensorDictBase)
             after = following.reshape(-1)
+            if watch is not None:
+                watch(data.exclude("next").reshape(-1), after, running)
             steps[running] = step
             for key, value in balls.items():
                 value[running] = after[key][running]
@@ -233,6 +242,7 @@ def evaluate(
     episodes: int,
     num_workers: int | None = None,
     on_step: Callable[[int, int], None] | None = None,
+    watch: Watch | None = None,
 ) -> Evaluation:
     """Return how a policy fares on a bank of throws, beside the rigid robot.
 
@@ -244,6 +254,7 @@ def evaluate(
         episodes: Size of the bank.
         num_workers: Processes; the result does not depend on it.
         on_step: Called with (steps done, episodes still running).
+        watch: Sees every step of the policy's episodes, see `play_bank`.
     """
 
     def play(who: Any, hold: bool) -> Episodes:
@@ -256,6 +267,7 @@ def evaluate(
             num_workers=num_workers,
             hold=hold,
             on_step=None if hold else on_step,
+            watch=None if hold else watch,
         )
 
     return summarize(play(policy, False), play(None, True), config.task)

@@ -19,7 +19,7 @@ from torchrl.envs import (
 
 from egoskin.checkpoint import part, prefixed
 from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
-from egoskin.observations import Privileged, Proprioception
+from egoskin.observations import Oracle, Privileged, Proprioception
 from egoskin.robots import ROBOTS, RobotConfig
 from egoskin.sensors import History, Skin
 from egoskin.sensors.config import SensorConfig, SkinConfig
@@ -40,6 +40,10 @@ _RAW_KEYS = (
     "tactile",
     "displacement_w",
     "previous_action",
+    "power",
+    "torque_saturation",
+    "object_hit",
+    "object_arrived",
 )
 # What the networks read of the transforms' results; the others stay as well.
 _NETWORK_KEYS = ("observation", "privileged_observation", "signal")
@@ -147,6 +151,8 @@ def make_worker_env(
                 out_key=f"signal{suffix}",
                 compile_kernels=compile_kernels,
             )
+        if config.sensor.coverage == "oracle":
+            transforms.append(Oracle(out_keys=[f"signal{suffix}"]))
         if suffix:
             new = [f"{key}{suffix}" for key in config.actor_keys]
             transforms.append(History(config.history, new, config.actor_keys))

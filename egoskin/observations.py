@@ -1,4 +1,4 @@
-"""What the actor feels of its own body, and what the critic alone is told."""
+"""What the actor feels of its own body, what the critic or an oracle is told."""
 
 from __future__ import annotations
 
@@ -57,15 +57,77 @@ class Proprioception(RowTransform):
         return (Unbounded(shape=torch.Size((*spec.shape, size)), dtype=dtype),)
 
 
+def object_states_b(
+    base_pose: Tensor,
+    base_lin_vel_w: Tensor,
+    object_pose: Tensor,
+    object_lin_vel_w: Tensor,
+    object_active: Tensor,
+) -> Tensor:
+    """Return what there is to know of the objects, seen from the base.
+
+    Args:
+        base_pose: Base pose in the world, ``[B, 7]``.
+        base_lin_vel_w: Base velocity [m/s], ``[B, 3]``.
+        object_pose: Poses in the world, ``[B, O, 7]``.
+        object_lin_vel_w: Velocities [m/s], ``[B, O, 3]``.
+        object_active: Whether each is in play, ``[B, O]`` bool.
+
+    Returns:
+        ``[B, 7 O]``, for each object: position relative to the base [m] 3, velocity
+        relative to the base's origin [m/s] 3, both along the base's axes, and active
+        flag; zero where inactive.
+    """
+    flag = object_active[..., None].to(object_pose.dtype)
+    turn = base_pose[:, None, 3:].expand(-1, object_pose.shape[1], -1)
+    position = rotate_inverse(turn, object_pose[..., :3] - base_pose[:, None, :3])
+    speed = rotate_inverse(turn, object_lin_vel_w - base_lin_vel_w[:, None])
+    return torch.cat((position * flag, speed * flag, flag), -1).flatten(1)
+
+
+class Oracle(RowTransform):
+    """What every ball does: a diagnostic of the task, no sensor can give it.
+
+    Reads ``base_pose``, ``base_lin_vel_w``, ``object_pose``, ``object_lin_vel_w`` and
+    ``object_active``; writes ``signal [*B, 7 O]``, see `object_states_b`.
+
+    Args:
+        in_keys: Keys of the inputs, in the order above.
+        out_keys: Key of the signal.
+    """
+
+    def __init__(
+        self,
+        in_keys: Sequence[NestedKey] = (
+            "base_pose",
+            "base_lin_vel_w",
+            "object_pose",
+            "object_lin_vel_w",
+            "object_active",
+        ),
+        out_keys: Sequence[NestedKey] = ("signal",),
+    ) -> None:
+        super().__init__(in_keys, out_keys)
+
+    def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """Return the signal, ``[B, 7 O]``."""
+        return (object_states_b(*inputs),)
+
+    def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
+        """Return the spec of the signal."""
+        objects = spec[self.in_keys[4]].shape[-1]
+        shape = torch.Size((*spec.shape, 7 * objects))
+        return (Unbounded(shape=shape, dtype=spec[self.in_keys[0]].dtype),)
+
+
 class Privileged(RowTransform):
     """What the critic is told in training; the same for every skin.
 
     Reads ``base_pose``, ``base_lin_vel_w`` and, unless told of the velocity alone,
     ``displacement_w``, ``previous_action``, ``object_pose``, ``object_lin_vel_w`` and
     ``object_active``. Writes ``privileged_observation``: base velocity [m/s] 3; then
-    displacement from the start [m] 3, previous action J, and for each object position
-    relative to the base [m] 3, velocity relative to the base [m/s] 3 and active flag,
-    zero where inactive. Vectors are in the base frame.
+    displacement from the start [m] 3, previous action J, and the objects' states
+    (`object_states_b`) 7 O. Vectors are in the base frame.
 
     Args:
         content: "objects" for everything above, "velocity" for the paper's critic.
@@ -113,12 +175,8 @@ class Privileged(RowTransform):
             displacement_w, previous_action, pose, velocity, active = rest
             planar = torch.nn.functional.pad(displacement_w, (0, 1))
             parts += [rotate_inverse(quat, planar), previous_action]
-            flag = active[..., None].to(pose.dtype)
-            turn = quat[:, None].expand(-1, pose.shape[1], -1)
-            position = rotate_inverse(turn, pose[..., :3] - base_pose[:, None, :3])
-            speed = rotate_inverse(turn, velocity - base_lin_vel_w[:, None])
             parts.append(
-                torch.cat((position * flag, speed * flag, flag), -1).flatten(1)
+                object_states_b(base_pose, base_lin_vel_w, pose, velocity, active)
             )
         return (torch.cat(parts, -1),)
 

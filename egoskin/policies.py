@@ -1,7 +1,7 @@
 """Trained policies as self-contained files, for people who never train.
 
 A policy file holds weights, normaliser, skin, sensor and task. A checkpoint of a run
-holds the same and more, and is read alike.
+holds the same and more, and is read alike. Some policies come with the package.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from egoskin.sparse import SparseSource
 
 CHECKPOINT_NAME = "checkpoint.safetensors"
 """Name of the latest checkpoint in a run folder."""
+_SHIPPED = Path(__file__).parent / "assets" / "policies"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -209,11 +210,17 @@ class Policy(nn.Module):
         return tensordict.set("action", loc)
 
 
+def shipped_policies() -> list[str]:
+    """Return the names of the policies that come with the package."""
+    return sorted(path.stem for path in _SHIPPED.glob("*.safetensors"))
+
+
 def load_policy(path: str | Path) -> Policy:
-    """Return the policy of a policy file, a checkpoint or a run folder.
+    """Return the policy of a policy file, a checkpoint, a run folder or a name.
 
     Args:
-        path: The file, or a run folder (its latest checkpoint).
+        path: The file, or a run folder (its latest checkpoint); or, where there is no
+            such file, one of `shipped_policies`.
 
     Returns:
         A module that reads `Policy.in_keys` of a TensorDict and writes the mean
@@ -223,6 +230,14 @@ def load_policy(path: str | Path) -> Policy:
         ValueError: If there is no policy; the text says why.
     """
     path = Path(path)
+    if not path.exists():
+        names = shipped_policies()
+        if str(path) not in names:
+            raise ValueError(
+                f"no policy {path}: neither a file, nor a folder, nor one that comes "
+                f"with the package ({', '.join(names)})"
+            )
+        path = _SHIPPED / f"{path}.safetensors"
     if path.is_dir():
         if not (path / CHECKPOINT_NAME).is_file():
             raise ValueError(f"{path} is no run folder: it has no {CHECKPOINT_NAME}")

@@ -124,7 +124,7 @@ def render_episode(
     sensor = config.sensor
     painter = Painter(
         config.robot_config,
-        None if sensor.coverage == "none" else sensor.filled(skin),
+        sensor.filled(skin) if sensor.uses_skin else None,
         config.task.throws.balls,
         size=size,
         camera=camera,

@@ -205,10 +205,7 @@ class Run:
         skin = config.env.skin.build(config.env.robot_config)
         path = config.run_dir
         if path is None:
-            sensor = config.env.sensor
-            kind = "blind"
-            if sensor.coverage != "none":
-                kind = f"{sensor.coverage}-{sensor.signal}-{sensor.range:g}m"
+            kind = config.env.sensor.label()
             stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
             path = Path("runs") / f"{stamp}-{kind}-seed{config.seed}"
         if path.exists() and (not path.is_dir() or any(path.iterdir())):

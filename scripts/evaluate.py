@@ -1,7 +1,9 @@
 """Evaluate a policy on a fixed bank of throws.
 
 python scripts/evaluate.py runs/NAME
+python scripts/evaluate.py oracle
 python scripts/evaluate.py runs/NAME/policies/000005046272.safetensors --json out.json
+python scripts/evaluate.py runs/NAME --behaviour --check-substeps 8
 """
 
 from __future__ import annotations
@@ -9,15 +11,17 @@ from __future__ import annotations
 import dataclasses
 import json
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
+from egoskin.behaviour import Behaviour, Motion, behave
 from egoskin.cli import clear_errors
 from egoskin.evaluation import Estimate, Evaluation, evaluate, standard_task
-from egoskin.make import check_num_workers
+from egoskin.make import EnvConfig, check_num_workers
 from egoskin.policies import load_policy
 
 
@@ -26,7 +30,8 @@ class EvaluateConfig:
     """Play a bank of throws with the mean action of a trained policy."""
 
     policy: Annotated[Path, tyro.conf.Positional]
-    """Run folder (its latest checkpoint), checkpoint or policy file."""
+    """Run folder (its latest checkpoint), checkpoint, policy file, or the name of a
+    policy that comes with the package."""
     bank_seed: int = 0
     """Seed of the bank of throws."""
     episodes: int = 1024
@@ -35,6 +40,11 @@ class EvaluateConfig:
     """The standard throw whatever the run trained on, or the run's own."""
     num_workers: int | None = None
     """Processes that simulate; None: the largest divisor of episodes <= cores."""
+    behaviour: bool = False
+    """Also say what the policy does: hits by kind of throw, displacement, effort."""
+    check_substeps: int | None = None
+    """Play the bank once more with this many physics steps in each control step, and
+    say what is lost (8: 480 Hz)."""
     json: Path | None = None
     """File to write the figures to."""
 
@@ -43,8 +53,17 @@ class EvaluateConfig:
         if not 0 <= self.bank_seed < 2**32:
             raise ValueError(f"bank_seed must be in [0, 2**32), got {self.bank_seed}")
         check_num_workers(self.episodes, self.num_workers)
+        if self.check_substeps is not None and self.check_substeps < 1:
+            raise ValueError(
+                f"check_substeps must be at least 1, got {self.check_substeps}"
+            )
         if self.json is not None and not self.json.parent.is_dir():
             raise ValueError(f"--json: there is no folder {self.json.parent}")
+
+
+def share(value: float | None) -> str:
+    """Return a share as text, a dash for None."""
+    return "     -" if value is None else f"{100 * value:6.2f} %"
 
 
 def table(result: Evaluation, title: str) -> str:
@@ -53,9 +72,6 @@ def table(result: Evaluation, title: str) -> str:
     def interval(value: Estimate, scale: float, unit: str) -> str:
         mean, low, high = (scale * v for v in (value.mean, value.low, value.high))
         return f"{mean:6.2f} {unit}  ({low:.2f} to {high:.2f})"
-
-    def share(value: float | None) -> str:
-        return "     -" if value is None else f"{100 * value:6.2f} %"
 
     rows = [
         ("success (no contact for 3 s)", interval(result.success, 100, "%")),
@@ -71,6 +87,56 @@ def table(result: Evaluation, title: str) -> str:
     return "\n".join([title, *lines, "  (95 % intervals in brackets)"])
 
 
+def behaviour_table(result: Behaviour) -> str:
+    """Return what the policy does as text."""
+    lines = []
+    for kind, groups in result.throws.items():
+        lines += ["", f"  {kind:<20} {'success':>8}   of  first hits  later hits   of"]
+        for group in groups:
+            success = None if group.success is None else group.success.mean
+            lines.append(
+                f"    {group.name:<18} {share(success)} {group.episodes:4}    "
+                f"{share(group.first_hits)}    {share(group.later_hits)} "
+                f"{group.later_balls:4}"
+            )
+    lines += ["", "  displacement from the start     mean   a tenth exceeds     of"]
+    for way in result.displacement:
+        if way.mean is not None:
+            lines.append(
+                f"    after {way.age:g} s                {way.mean:6.2f} m "
+                f"{way.largest_tenth:14.2f} m {way.episodes:6}"
+            )
+    lines += ["", f"  {'':<32}{'policy':>10} {'zero action':>13}"]
+
+    def row(name: str, unit: str, show: Callable[[Motion], float]) -> str:
+        own, zero = show(result.motion), show(result.motion_zero_action)
+        return f"  {name:<32}{own:10.3g} {zero:13.3g} {unit}"
+
+    return "\n".join(
+        [
+            *lines,
+            row("mechanical power", "W", lambda m: m.power),
+            row("joint acceleration, rms", "rad/s^2", lambda m: m.joint_acceleration),
+            row("torques at their limit", "%", lambda m: 100 * m.torque_saturation),
+            row("feet slide, while on the floor", "cm/s", lambda m: 100 * m.foot_slip),
+            row("steps without floor contact", "%", lambda m: 100 * m.airborne),
+            row("steps with self-contact", "%", lambda m: 100 * m.self_contact),
+        ]
+    )
+
+
+def with_substeps(config: EnvConfig, substeps: int) -> EnvConfig:
+    """Return the configuration with another number of physics steps."""
+    physics = dataclasses.replace(config.task.physics, substeps=substeps)
+    task = dataclasses.replace(config.task, physics=physics)
+    return dataclasses.replace(config, task=task)
+
+
+def physics_rate(config: EnvConfig) -> str:
+    """Return the physics rate as text."""
+    return f"{1 / config.task.physics.timestep:g} Hz"
+
+
 def main(args: list[str]) -> None:
     """Run the command."""
     config = tyro.cli(EvaluateConfig, args=args)
@@ -84,24 +150,40 @@ def main(args: list[str]) -> None:
             text = f"\r{step / env_config.task.physics.control_hz:5.2f} s, "
             print(f"{text}{running} still running \x1b[K", end="", file=sys.stderr)
 
-    result = evaluate(
-        policy,
-        env_config,
-        policy.skin,
-        bank_seed=config.bank_seed,
-        episodes=config.episodes,
-        num_workers=config.num_workers,
-        on_step=show,
-    )
+    bank: dict[str, Any] = {
+        "bank_seed": config.bank_seed,
+        "episodes": config.episodes,
+        "num_workers": config.num_workers,
+        "on_step": show,
+    }
+    behaviour = None
+    if config.behaviour:
+        result, behaviour = behave(policy, env_config, policy.skin, **bank)
+    else:
+        result = evaluate(policy, env_config, policy.skin, **bank)
+    checked_config, checked = env_config, None
+    if config.check_substeps is not None:
+        checked_config = with_substeps(env_config, config.check_substeps)
+        checked = evaluate(policy, checked_config, policy.skin, **bank)
     if sys.stderr.isatty():
         print("\r\x1b[K", end="", file=sys.stderr)
     title = (
         f"{config.policy}: {policy.spec.frames:,} frames; bank {config.bank_seed} of "
-        f"{config.episodes} episodes, {config.throw} throw"
+        f"{config.episodes} episodes, {config.throw} throw, physics at "
     )
-    print(table(result, title))
+    print(table(result, title + physics_rate(env_config)))
+    content = dataclasses.asdict(result)
+    if behaviour is not None:
+        print(behaviour_table(behaviour))
+        content["behaviour"] = dataclasses.asdict(behaviour)
+    if checked is not None:
+        print("\n" + table(checked, title + physics_rate(checked_config)))
+        lost = 100 * (result.success.mean - checked.success.mean)
+        print(f"  success lost by the other physics rate: {lost:.2f} points")
+        content["check_substeps"] = config.check_substeps
+        content["checked"] = dataclasses.asdict(checked)
     if config.json is not None:
-        config.json.write_text(json.dumps(dataclasses.asdict(result), indent=2) + "\n")
+        config.json.write_text(json.dumps(content, indent=2) + "\n")
 
 
 if __name__ == "__main__":

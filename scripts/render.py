@@ -46,8 +46,9 @@ class RenderConfig:
     """Render an episode of a trained policy, or of the zero action without one."""
 
     policy: Annotated[Path | None, tyro.conf.Positional] = None
-    """Run folder (its latest checkpoint), checkpoint or policy file; None: action 0,
-    which asks the motors for the default pose."""
+    """Run folder (its latest checkpoint), checkpoint, policy file, or the name of a
+    policy that comes with the package; None: action 0, which asks the motors for the
+    default pose."""
     out: Path = Path("episode.mp4")
     """Film to write, .mp4 or .gif."""
     sheet: Path | None = None

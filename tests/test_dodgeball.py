@@ -406,6 +406,25 @@ def counts(step: TensorDict) -> list[list[float]]:
     return [step["balls_arrived"][0].tolist(), step["balls_avoided"][0].tolist()]
 
 
+def test_each_ball_is_told_apart_until_it_is_thrown_again(chest):
+    throws = replace(MISS, interval=(0.1, 0.1), num_balls=2)
+    env = make(1, hold=True, throws=throws)
+    root = env.reset()
+    assert not root["object_arrived"].any()
+    throw(env, 0, (2.0, 0, 1.5), (5.0, 0, 0))
+    for _ in range(7):  # ball 1 is thrown at step 6
+        step, root = advance(env, root)
+    assert step["object_arrived"].tolist() == [[True, False]]
+    for _ in range(5):  # ball 0 is thrown again at step 12, where the flag is the old
+        step, root = advance(env, root)
+    assert step["object_arrived"].tolist() == [[True, False]]
+    touch(env, root, chest)
+    throw(env, 1, AWAY, (0.0, 0, 0))
+    step, _ = advance(env, root)
+    assert step["object_hit"].tolist() == [[True, False]]
+    assert step["object_arrived"].tolist() == [[True, False]]
+
+
 def test_first_and_later_balls_are_counted_once_as_arrived_and_avoided(chest):
     throws = replace(MISS, interval=(0.1, 0.1), num_balls=3)
     env = make(1, hold=True, throws=throws)

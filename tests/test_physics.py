@@ -114,6 +114,7 @@ class Single:
             "object_hit": np.zeros(len(BALLS), bool),
             "self_contact": np.zeros(1, bool),
             "power": np.zeros(1),
+            "torque_saturation": np.zeros(1),
         }
         data = self.data
         data.ctrl[:] = ctrl
@@ -130,6 +131,10 @@ class Single:
                     result["object_hit"][pair["object"]] = True
             joint_vel = data.qvel[6 : 6 + len(DEFAULT)]
             result["power"] += np.abs(data.actuator_force * joint_vel).sum() / substeps
+            low, high = self.model.actuator_forcerange.T
+            force = data.actuator_force
+            limited = (force == low) | (force == high)
+            result["torque_saturation"] += limited.mean() / substeps
         return result
 
 

@@ -182,8 +182,9 @@ def test_a_rigid_robot_is_hit_and_the_last_frame_says_so(skin: Skin):
 
 
 @pytest.mark.usefixtures("painter")
-def test_a_blind_robot_has_no_sensors_to_draw(skin: Skin):
-    config = EnvConfig(sensor=SensorConfig(coverage="none"))
+@pytest.mark.parametrize("coverage", ["none", "oracle"])
+def test_without_a_skin_there_are_no_sensors_to_draw(coverage, skin: Skin):
+    config = EnvConfig(sensor=SensorConfig(coverage=coverage))
     frame = render(config, skin, max_seconds=0.02)[0]
     assert (frame.num_sensors, frame.num_detecting) == (0, 0)
 

@@ -128,6 +128,106 @@ def test_an_evaluation_has_the_figures_promised(trained: Path, tmp_path: Path):
     assert result["success"]["mean"] + ends == pytest.approx(1.0)
 
 
+def test_an_evaluation_says_what_the_policy_does_and_at_another_physics_rate(
+    trained: Path, tmp_path: Path
+):
+    done = run(
+        "evaluate.py",
+        *(trained, "--episodes", "16", "--json", tmp_path / "out.json"),
+        *("--behaviour", "--check-substeps", "8"),
+    )
+    assert done.returncode == 0, done.stderr
+    assert "physics at 120 Hz" in done.stdout
+    assert "physics at 480 Hz" in done.stdout
+    assert "success lost by the other physics rate" in done.stdout
+    assert "speed at arrival" in done.stdout
+    assert "mechanical power" in done.stdout
+    result = json.loads((tmp_path / "out.json").read_text())
+    assert result["check_substeps"] == 8
+    assert result["checked"]["episodes"] == 16
+    # Another rate is another course of events.
+    assert result["checked"]["survival_time"] != result["survival_time"]
+    groups = result["behaviour"]["throws"]["direction"]
+    assert [g["name"] for g in groups] == ["front", "left", "back", "right"]
+    assert sum(g["episodes"] for g in groups) == 16
+
+
+def test_a_run_is_stored_and_reported_again_when_it_is_longer(
+    trained: Path, tmp_path: Path
+):
+    pytest.importorskip("matplotlib")
+    stored, report = tmp_path / "results", tmp_path / "results.md"
+    stored.mkdir()
+    (stored / "notes.md").write_text("## By hand\n\nThis stays.\n")
+    add = ("results.py", "add", trained, "--episodes", "16", "--results", stored)
+    done = run(*add)
+    assert done.returncode == 0, done.stderr
+    folder = stored / "field_proximity_2m_seed0"
+    frames = f"{4 * BATCH:012d}"
+    assert {str(p.relative_to(folder)) for p in folder.rglob("*.*")} == {
+        "config.json",
+        "run.json",
+        "metrics.csv",
+        f"policies/{frames}.safetensors",
+        f"evaluation_{frames}.json",
+    }
+    made = json.loads((folder / "run.json").read_text())
+    assert made["command"].startswith("python scripts/ppo.py --num-envs 32")
+    assert str(trained) not in (folder / "run.json").read_text()
+    assert (made["seed"], made["frames"]) == (0, 4 * BATCH)
+    assert made["wall_s"] == pytest.approx(float(metrics(trained)[-1]["time/wall_s"]))
+    evaluation = json.loads((folder / f"evaluation_{frames}.json").read_text())
+    assert (evaluation["episodes"], evaluation["bank_seed"]) == (16, 0)
+
+    # The same run once more is an update, another configuration is refused.
+    assert run(*add).returncode == 0
+    config = json.loads((folder / "config.json").read_text())
+    config["env"]["sensor"]["range"] = 1.0
+    (folder / "config.json").write_text(json.dumps(config))
+    refused = run(*add)
+    assert refused.returncode == 2
+    assert "another configuration: choose a --name" in refused.stderr
+
+    done = run("results.py", "write", "--results", stored, "--out", report)
+    assert done.returncode == 0, done.stderr
+    text = report.read_text()
+    assert "This stays." in text
+    assert "field proximity, 1 m" in text
+    assert (tmp_path / "results-other-recipes.png").read_bytes()[:4] == b"\x89PNG"
+
+
+@pytest.mark.parametrize(
+    ("args", "expected"),
+    [
+        (["add", "nothing"], "no run folder"),
+        (["add", "nothing", "--name", "a/b"], "must be the name of a folder"),
+        (["add", "nothing", "--episodes", "0"], "must be at least 1"),
+        (["add", "nothing", "--results", "elsewhere"], "no folder elsewhere"),
+        (["write", "--results", "results", "--out", "new.md"], "holds no runs"),
+        (["write", "--out", "no/results.md"], "no folder no"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_bad_input_to_results_is_one_clear_message(
+    args: list[str], expected: str, tmp_path: Path, monkeypatch, capsys
+):
+    pytest.importorskip("matplotlib")
+    (tmp_path / "results").mkdir()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["results.py", *args])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(ROOT / "scripts" / "results.py"), run_name="__main__")
+    assert ended.value.code == 2
+    assert expected in capsys.readouterr().err
+    assert [p.name for p in tmp_path.rglob("*")] == ["results"]
+
+
+def test_physics_steps_that_are_none_are_refused(trained: Path):
+    done = run("evaluate.py", trained, "--check-substeps", "0")
+    assert done.returncode == 2
+    assert "check_substeps must be at least 1, got 0" in done.stderr
+
+
 def test_a_policy_file_runs_on_a_tensordict_without_any_environment(trained: Path):
     policy = egoskin.load_policy(trained / "policies" / f"{4 * BATCH:012d}.safetensors")
     assert policy.in_keys == ["observation", "signal"]
@@ -148,6 +248,8 @@ def test_a_policy_file_runs_on_a_tensordict_without_any_environment(trained: Pat
 
 CELLS = [
     ["--sensor.coverage", "none"],
+    ["--sensor.coverage", "oracle"],
+    ["--sensor.coverage", "oracle", "--history", "2"],
     *(
         ["--sensor.coverage", coverage, "--sensor.signal", signal, *reduced]
         for signal in ("localization", "proximity", "closeness", "binary")

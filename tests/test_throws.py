@@ -259,6 +259,10 @@ def test_a_vertical_fall_of_the_height_by_hand():
     )
     torch.testing.assert_close(release.position, torch.tensor([[5.0, 2, 2]]))
     torch.testing.assert_close(release.velocity, torch.tensor([[-4.0, 0, 4.945875]]))
+    # It comes down with vz = 4.945875 - 9.81 = -4.864125: speed sqrt(16 + 23.660).
+    height, speed = thrower.at_standing_robot(draw(thrower, 1))
+    torch.testing.assert_close(height, torch.tensor([2.0]))
+    torch.testing.assert_close(speed, torch.tensor([6.297600]))
 
 
 def test_turning_the_robot_turns_the_throw():

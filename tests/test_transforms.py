@@ -17,7 +17,7 @@ from torchrl.envs.utils import check_env_specs
 
 from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
 from egoskin.make import EnvConfig, make_worker_env
-from egoskin.observations import Privileged, Proprioception
+from egoskin.observations import Oracle, Privileged, Proprioception
 from egoskin.robots import H1_2
 from egoskin.sensors import (
     Binary,
@@ -60,6 +60,7 @@ BUILDERS = {
     ),
     "localization, yaw": partial(Localization, yaw_only=True, scale=2.0),
     "proprioception": partial(Proprioception, DEFAULT),
+    "oracle": Oracle,
     "privileged objects": partial(Privileged, "objects", JOINTS, len(BALLS)),
     "privileged velocity": partial(Privileged, "velocity", JOINTS, len(BALLS)),
 }
@@ -281,6 +282,25 @@ def test_privileged_objects_by_hand():
     torch.testing.assert_close(observation, torch.tensor(expected).float())
 
 
+def test_an_oracle_is_told_of_every_ball_by_hand():
+    state = privileged_state()
+    state["object_active"][:] = True
+    expected = [
+        *(3, 0, 1, 0, 4, -0.5, 1),  # as above
+        # (4, 5, 4) from the base is (5, -4, 4); the velocity relative to the base
+        # (1, -1, 0.5) is (-1, -1, 0.5).
+        *(5, -4, 4, -1, -1, 0.5, 1),
+    ]
+    signal = BUILDERS["oracle"]()(state)["signal"][0]
+    torch.testing.assert_close(signal, torch.tensor(expected).float())
+
+
+def test_an_oracle_sees_what_the_critic_sees(full_state):
+    state = full_state(64)
+    told = BUILDERS["privileged objects"]()(state.clone())["privileged_observation"]
+    assert torch.equal(BUILDERS["oracle"]()(state)["signal"], told[:, -14:])
+
+
 def test_privileged_velocity_by_hand():
     result = BUILDERS["privileged velocity"]()(privileged_state())
     torch.testing.assert_close(
@@ -304,6 +324,7 @@ SENSORS = {
     "binary": SensorConfig(signal="binary", range=0.5),
     "infinite": SensorConfig(range=float("inf")),
     "blind": SensorConfig(coverage="none"),
+    "oracle": SensorConfig(coverage="oracle"),
     "ray": SensorConfig(coverage="ray", signal="closeness", validity=True),
     "ray, reduced, held": SensorConfig(
         coverage="ray",

@@ -95,6 +95,10 @@ class DodgeballEnv(EnvBase):
     ``fallen``             ``[B, 1]``      a link other than a foot touched the floor
     ``diverged``           ``[B, 1]``      the simulation failed
     ``self_contact``       ``[B, 1]``      the robot touched itself
+    ``power``              ``[B, 1]``      mechanical power of the joints [W]
+    ``torque_saturation``  ``[B, 1]``      share of the joints at their torque limit
+    ``object_hit``         ``[B, O]``      whether the ball touched the robot
+    ``object_arrived``     ``[B, O]``      ... or has passed, since it was thrown
     ``balls_arrived``      ``[B, 2]``      first ball, later balls: arrived so far
     ``balls_avoided``      ``[B, 2]``      ... of which without touching
     ``episode_step``       ``[B, 1]``      age of the episode in control steps
@@ -194,6 +198,10 @@ class DodgeballEnv(EnvBase):
             fallen=flag(1),
             diverged=flag(1),
             self_contact=flag(1),
+            power=unbounded(1),
+            torque_saturation=unbounded(1),
+            object_hit=flag(balls),
+            object_arrived=flag(balls),
             balls_arrived=unbounded(2),
             balls_avoided=unbounded(2),
             episode_step=Bounded(
@@ -254,6 +262,10 @@ class DodgeballEnv(EnvBase):
         out["tactile"] = never.repeat(1, len(self.robot.links))
         for key in ("hit", "fallen", "diverged", "self_contact"):
             out[key] = never.clone()
+        for key in ("power", "torque_saturation"):
+            out[key] = torch.zeros(self.batch_size[0], 1)
+        for key in ("object_hit", "object_arrived"):
+            out[key] = never.repeat(1, self.config.throws.num_balls)
         for key in ("done", "terminated", "truncated"):
             out[key] = never.clone()
         return out
@@ -327,6 +339,8 @@ class DodgeballEnv(EnvBase):
         terminated = hit | fallen | result.diverged
         truncated = (counters["step"] >= config.episode_steps) & ~terminated
         self._count_balls(state, hit_by)
+        # Of the balls in flight until here: a throw makes the flag a new ball's.
+        arrived = counters["passed"].clone()
 
         due = (counters["step"] >= counters["next_throw_step"]) & ~terminated
         rows = (due & ~truncated).nonzero()[:, 0]
@@ -359,6 +373,9 @@ class DodgeballEnv(EnvBase):
         out["hit"], out["fallen"] = hit[:, None], fallen[:, None]
         out["diverged"] = result.diverged[:, None]
         out["self_contact"] = result.self_contact[:, None]
+        out["power"] = result.power[:, None]
+        out["torque_saturation"] = result.torque_saturation[:, None]
+        out["object_hit"], out["object_arrived"] = hit_by, arrived
         out["terminated"], out["truncated"] = terminated[:, None], truncated[:, None]
         out["done"] = (terminated | truncated)[:, None]
         return out

@@ -99,6 +99,8 @@ class StepResult:
     """Whether the robot touched itself, ``[B]`` bool."""
     power: Tensor
     """Mean over the substeps of sum |torque x joint velocity| [W], ``[B]``."""
+    torque_saturation: Tensor
+    """Mean over the substeps of the share of joints at their torque limit, ``[B]``."""
     diverged: Tensor
     """Whether the simulation failed and must be reset, ``[B]`` bool."""
 
@@ -241,6 +243,7 @@ class Physics:
         self._qpos, self._qvel = bind("qpos"), bind("qvel")
         self._ctrl, self._sensordata = bind("ctrl"), bind("sensordata")
         self._torque = bind("actuator_force")
+        self._torque_limit = model.actuator_forcerange[:, 1]
         self.num_envs = num_envs
         self._num_links = len(robot.links)
         self._num_joints = len(robot.joints)
@@ -267,7 +270,7 @@ class Physics:
             active: Objects in play, ``[B, O]`` bool; the others stay parked.
 
         Returns:
-            Contacts, power and failures of the step.
+            Contacts, power, saturation and failures of the step.
         """
         self.park(~active)
         self.set_target(target)
@@ -275,6 +278,7 @@ class Physics:
         warnings = self._failure_count()
         found = np.zeros(self._sensordata.shape, dtype=bool)
         power = np.zeros(len(self._qpos))
+        saturation = np.zeros(len(self._qpos))
         errors = np.zeros(len(self._qpos), dtype=bool)
         for _ in range(self.config.substeps):
             try:
@@ -283,6 +287,7 @@ class Physics:
                 errors[error.ids] = True
             found |= self._sensordata > 0
             power += np.abs(self._torque * self._qvel[:, self._joint_v]).sum(1)
+            saturation += (np.abs(self._torque) >= self._torque_limit).mean(1)
             if held is not None:
                 self._qpos[:, self._robot_q] = held
                 self._qvel[:, self._robot_v] = 0.0
@@ -297,6 +302,9 @@ class Physics:
             object_hit=contact[:, 2 * links : 2 * links + objects],
             self_contact=contact[:, -1],
             power=torch.from_numpy(power / self.config.substeps).float(),
+            torque_saturation=torch.from_numpy(
+                saturation / self.config.substeps
+            ).float(),
             diverged=torch.from_numpy(diverged),
         )
 

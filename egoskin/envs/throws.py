@@ -154,6 +154,33 @@ class Thrower:
         kinematics, link, _ = self._aim_points
         return [kinematics.links[i] for i in link[self._point_index(draw)].tolist()]
 
+    def at_standing_robot(self, draw: Draw) -> tuple[Tensor, Tensor]:
+        """Return how throws arrive at the robot standing in its default pose.
+
+        A property of the draws alone, so that a throw is the same for every policy.
+
+        Args:
+            draw: Draws of ``n`` throws.
+
+        Returns:
+            Height of the points aimed at [m] and speed of the ball there [m/s],
+            ``[n]`` each.
+        """
+        robot, n = self._robot, len(draw.speed)
+        base_pose = torch.tensor([0.0, 0, robot.default_base_height, 1, 0, 0, 0])
+        pose = (
+            base_pose.expand(n, -1),
+            torch.from_numpy(robot.default_joint_pos).float().expand(n, -1),
+        )
+        side = torch.stack((draw.azimuth.cos(), draw.azimuth.sin()), -1)
+        target = self._target(draw, *pose, side)
+        release = self.release(draw, pose[0], torch.zeros(n, 3), pose[1])
+        velocity = release.velocity
+        if self.config.flight == "ballistic":
+            way = (target - release.position)[:, :2].norm(dim=-1)
+            velocity[:, 2] -= GRAVITY * way / draw.speed
+        return target[:, 2], velocity.norm(dim=-1)
+
     def draw(self, seed: int, row: Tensor, episode: Tensor, throw: Tensor) -> Draw:
         """Return the random part of the n-th throws of some episodes.
 

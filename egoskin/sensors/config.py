@@ -79,8 +79,9 @@ class SensorConfig:
     A sensor whose skin file gives it a type or a range of its own keeps them.
     """
 
-    coverage: Literal["field", "ray", "none"] = "field"
-    """Spherical field, grid of beams, or no sensor at all (a blind robot)."""
+    coverage: Literal["field", "ray", "none", "oracle"] = "field"
+    """Spherical field, grid of beams, no sensor at all (a blind robot), or no sensor
+    but the truth: position and velocity of every ball, to find the task's ceiling."""
     signal: Literal["localization", "proximity", "closeness", "binary"] = "proximity"
     """Ball position if any sensor detects it; distance / range; 1 - that; in range?"""
     range: float = 2.0
@@ -125,6 +126,17 @@ class SensorConfig:
                 f"localization options need signal=localization, not {self.signal}"
             )
 
+    @property
+    def uses_skin(self) -> bool:
+        """Whether the actor is given anything that the skin measures."""
+        return self.coverage in ("field", "ray")
+
+    def label(self) -> str:
+        """Return what the actor is given, in a few words without spaces."""
+        if not self.uses_skin:
+            return {"none": "blind", "oracle": "oracle"}[self.coverage]
+        return f"{self.coverage}-{self.signal}-{self.range:g}m"
+
     def filled(self, skin: Skin) -> Skin:
         """Return a skin whose sensors all have a coverage and a range."""
         return skin.filled(
@@ -143,7 +155,7 @@ class SensorConfig:
         out_key: str = "signal",
         compile_kernels: bool = False,
     ) -> list[Transform]:
-        """Return the transforms that write the signal (none for a blind robot).
+        """Return the transforms that write the signal (none without a skin).
 
         Args:
             robot: The robot.
@@ -155,7 +167,7 @@ class SensorConfig:
             out_key: Key of the signal.
             compile_kernels: Whether to compile the sensors; results are the same.
         """
-        if self.coverage == "none":
+        if not self.uses_skin:
             return []
         skin = self.filled(skin)
         groups = self._groups(skin)
@@ -214,9 +226,8 @@ class SensorConfig:
         dense = self.signal == "localization" or self.corruption != "none"
         dense |= self.reduce != "none" or self.per_object or self.validity
         mixed = len(set(skin.range.tolist())) > 1 or len(self._groups(skin)) > 1
-        if self.coverage == "none" or dense or mixed:
-            return None
-        if not isinstance(skin.coverage[0], Ray):
+        rays = self.uses_skin and isinstance(skin.coverage[0], Ray)
+        if dense or mixed or not rays:
             return None
 
         def sensor(compile_kernels: bool) -> RaySensor:
@@ -251,7 +262,7 @@ class SensorConfig:
             state: One row of the environment's output, raw keys kept.
         """
         result = np.zeros(len(skin), dtype=bool)
-        if self.coverage != "none":
+        if self.uses_skin:
             for suffix, index in self._groups(skin).items():
                 distance = state[f"distance{suffix}"].reshape(len(index), -1)
                 result[index] = distance.isfinite().any(-1).numpy()
