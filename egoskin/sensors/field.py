@@ -180,8 +180,13 @@ class FieldSensor(ProximitySensor):
         way = self._to_closest(view, shape, centre)
         x, y, z = (w[sensor, row] for w in way)
         reach = (x * x + y * y + z * z).sqrt()
-        direction = torch.stack((x, y, z))[..., None] / reach.clamp(min=1e-9)[:, None]
+        way = torch.stack((x, y, z))
+        direction = (way / reach.clamp(min=1e-9))[..., None]
         length = reach - shape.radius if isinstance(shape, Sphere) else reach
         found = reading[sensor, row][:, None]
-        kept = self.hide(found, scene, sensor, row, direction, length[:, None])
+        kept = self.hide(
+            *(found, scene, sensor, row, direction, length[:, None]),
+            target=way,
+            radius=0.0,
+        )
         return reading.index_put((sensor, row), kept[:, 0])
