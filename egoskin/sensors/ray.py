@@ -54,7 +54,7 @@ class RaySensor(ProximitySensor):
         body: The robot's shapes, to hide what lies behind them; empty: transparent.
         per_object: Objects told apart in a last dimension ``O``.
         cull: Skip pairs that cannot hit; results are the same.
-        compile: Compile the kernels; results are the same.
+        compile: Compile the kernels of a transparent robot; results are the same.
         in_keys: Keys of the four inputs, in the order above.
         out_keys: Keys of the two outputs, in the order above.
 
@@ -113,7 +113,8 @@ class RaySensor(ProximitySensor):
             slant.numpy(),
             body,
             per_object,
-            compile,
+            # What the body hides is found for some paths: their number is no constant.
+            compile and not body,
             in_keys,
             out_keys,
         )
@@ -126,13 +127,12 @@ class RaySensor(ProximitySensor):
         self._margin_kernel: Callable[..., tuple[Tensor, list[View]]]
         self._margin_kernel = self.margins
         self._kernel: Callable[..., tuple[Tensor, Tensor]] = self.read
-        # Temporaries of an uncompiled kernel should stay in the cache.
-        self._chunk = max(1, _CHUNK // self._beams.shape[-1])
-        if compile:
+        if self._compile:
             self._margin_kernel = compiled(self.margins)
-        # What the body hides is found for some paths: their number is no constant.
-        if compile and not body:
-            self._kernel, self._chunk = compiled(self.read, dynamic=True), 2**31
+            self._kernel = compiled(self.read, dynamic=True)
+        # Temporaries of an uncompiled kernel should stay in the cache.
+        small = max(1, _CHUNK // self._beams.shape[-1])
+        self._chunk = 2**31 if self._compile else small
 
     def margins(self, scene: Scene) -> tuple[Tensor, list[View]]:
         """Return by how much each sensor may see each object.
