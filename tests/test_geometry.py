@@ -67,3 +67,25 @@ def test_poses_of_inactive_objects_are_not_looked_at(skin, random_state, kind):
     sensor = kind(skin, H1_2.chain, SHAPES[:2], RANGE)
     for a, b in zip(measure(sensor, parked), measure(sensor, state), strict=True):
         assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize(
+    ("key", "change", "message"),
+    [
+        ("joint_pos", torch.Tensor.double, "one floating type, got torch.float32, tor"),
+        ("joint_pos", torch.Tensor.int, "one floating type"),
+        ("object_active", torch.Tensor.float, "'object_active' must be bool"),
+        ("object_active", lambda x: x[:, :1], "for 2 objects, 'object_active' holds 1"),
+        ("object_pose", lambda x: x[:, :1], "for 2 objects, 'object_pose' holds 1"),
+        ("object_pose", lambda x: x[..., :3], "'object_pose' must hold 7 num.*got 3"),
+        ("base_pose", lambda x: x[:, :6], "'base_pose' must hold 7 numbers.*got 6"),
+    ],
+)
+@every_kind
+def test_inputs_of_a_wrong_form_are_refused(
+    skin, random_state, kind, key, change, message
+):
+    state = random_state(4, seed=0, objects=2)
+    state[key] = change(state[key])
+    with pytest.raises(ValueError, match=message):
+        measure(kind(skin, H1_2.chain, SHAPES[:2], RANGE), state)

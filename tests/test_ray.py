@@ -565,9 +565,3 @@ def test_an_unknown_reduction_is_refused(skin):
 def test_a_range_that_is_not_positive_is_refused(skin, max_range):
     with pytest.raises(ValueError, match="max_range must be positive, got"):
         RaySensor(skin, H1_2.chain, SHAPES, max_range)
-
-
-def test_another_number_of_objects_is_refused(skin, random_state):
-    sensor = RaySensor(skin, H1_2.chain, SHAPES, RANGE)
-    with pytest.raises(ValueError, match="made for 4 objects, 'object_pose' holds 3"):
-        measure(sensor, random_state(4, objects=3))

@@ -349,14 +349,11 @@ class ProximitySensor(RowTransform):
                 first dimension is ``O``. A new tensor by default.
 
         Raises:
-            ValueError: If the number of objects is not that of the sensor.
+            ValueError: If the number of objects is not that of the sensor, a pose has
+                not seven numbers, or the inputs are not of one floating type and bool.
         """
+        self._check(inputs)
         batch, objects = inputs[3].shape
-        if objects != len(self.objects):
-            raise ValueError(
-                f"the sensor was made for {len(self.objects)} objects, "
-                f"{self.in_keys[2]!r} holds {objects}"
-            )
         if out is None:
             each = (objects,) if self.per_object else ()
             out = inputs[0].new_empty((*each, batch, *self.readings))
@@ -374,6 +371,30 @@ class ProximitySensor(RowTransform):
                 # A reading of NaN may be anything: the object counts as seen.
                 detected[rows] = least.t() != torch.inf
         return (out.movedim(0, -1) if self.per_object else out), detected
+
+    def _check(self, inputs: Sequence[Tensor]) -> None:
+        """Raise ValueError for inputs of a wrong shape or type."""
+        *numbers, active = inputs
+        for key, tensor in zip(self.in_keys[2:], inputs[2:], strict=True):
+            if tensor.shape[1] != len(self.objects):
+                raise ValueError(
+                    f"the sensor was made for {len(self.objects)} objects, {key!r} "
+                    f"holds {tensor.shape[1]}"
+                )
+        types = [x.dtype for x in numbers]
+        if len({*types}) > 1 or not types[0].is_floating_point:
+            raise ValueError(
+                f"{', '.join(map(repr, self.in_keys[:3]))} must be of one floating "
+                f"type, got {', '.join(map(str, types))}"
+            )
+        if active.dtype != torch.bool:
+            raise ValueError(f"{self.in_keys[3]!r} must be bool, got {active.dtype}")
+        for i in (0, 2):
+            if inputs[i].shape[-1] != 7:
+                raise ValueError(
+                    f"{self.in_keys[i]!r} must hold 7 numbers a pose (position, "
+                    f"quaternion w x y z), got {inputs[i].shape[-1]}"
+                )
 
     def _rows_in_reach(
         self,
