@@ -108,7 +108,7 @@ def without(content: dict, name: str) -> dict:
     return {key: value for key, value in content.items() if key != name}
 
 
-def skin_content(*sensors: dict) -> dict:
+def skin_content(*sensors: object) -> dict:
     return {"format": "egoskin-skin-1", "robot": "h1_2", "sensors": list(sensors)}
 
 
