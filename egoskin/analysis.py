@@ -240,6 +240,7 @@ def analyse(
     ranges: Sequence[float],
     throws: ThrowConfig,
     *,
+    occlusion: bool = False,
     num_throws: int = 2000,
     seed: int = 0,
     timestep: float = 1 / 120,
@@ -254,6 +255,7 @@ def analyse(
         coverages: Coverages by name, for sensors without one of their own.
         ranges: Ranges, for sensors without one of their own [m].
         throws: The throws.
+        occlusion: Whether the robot's own body hides what lies behind it.
         num_throws: How many throws are followed.
         seed: Seed of the throws and of the points on the surface.
         timestep: Physics time step of the task [s].
@@ -279,7 +281,11 @@ def analyse(
         def tell(name: str, share: float) -> None:
             progress(f"{what}, {name}", share)
 
-        return trace(body, paths, skin, coverages, ranges, ball, tell)
+        return trace(
+            *(body, paths, skin, coverages, ranges, ball),
+            occlusion=occlusion,
+            progress=tell,
+        )
 
     directions = follow("directions", direction_paths(body, ball, far))
     paths, link = surface_paths(body, ball, far, seed)

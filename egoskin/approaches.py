@@ -138,7 +138,12 @@ class Trace:
 
 
 def _sensors(
-    robot: RobotConfig, skin: Skin, coverage: Coverage, max_range: float, ball: Sphere
+    robot: RobotConfig,
+    skin: Skin,
+    coverage: Coverage,
+    max_range: float,
+    ball: Sphere,
+    occlusion: bool,
 ) -> tuple[list[RowTransform], Tensor]:
     """Return transforms that together are the skin, and each sensor's own range.
 
@@ -149,10 +154,15 @@ def _sensors(
     for index, own in enumerate(full.coverage):
         kind = (own.grid, own.sub_beams) if isinstance(own, Ray) else None
         groups.setdefault(kind, []).append(index)
+    body = robot.primitives if occlusion else ()
     parts: list[RowTransform] = []
     for kind, group in groups.items():
         args = full.select(group), robot.chain, [ball], max_range
-        parts.append(RaySensor(*args, reduce="min") if kind else FieldSensor(*args))
+        parts.append(
+            RaySensor(*args, reduce="min", body=body)
+            if kind
+            else FieldSensor(*args, body=body)
+        )
     order = [index for group in groups.values() for index in group]
     return parts, torch.from_numpy(skin.range[order]).float()
 
@@ -180,6 +190,8 @@ def trace(
     coverages: Mapping[str, Coverage],
     ranges: Sequence[float],
     ball: Sphere,
+    *,
+    occlusion: bool = False,
     progress: Progress = lambda what, share: None,
 ) -> Trace:
     """Return when balls on given paths touch the body and who detects them before.
@@ -191,6 +203,7 @@ def trace(
         coverages: Coverages by name, for sensors without one of their own.
         ranges: Ranges, for sensors without one of their own [m].
         ball: The ball.
+        occlusion: Whether the body hides what lies behind it.
         progress: Told the coverage in work.
 
     Returns:
@@ -218,7 +231,7 @@ def trace(
     rows = visible.reshape(-1).nonzero()[:, 0]
     num_sensors = torch.zeros(len(coverages), len(ranges), n * steps, dtype=torch.int16)
     for c, (name, coverage) in enumerate(coverages.items()):
-        sensors, own = _sensors(body.config, skin, coverage, far, ball)
+        sensors, own = _sensors(body.config, skin, coverage, far, ball, occlusion)
         limits = [torch.where(own.isnan(), r, own) for r in ranges]
         # One measurement at the longest range serves all ranges.
         for k, chunk in enumerate(rows.split(_CHUNK)):

@@ -2,6 +2,7 @@
 
 python scripts/coverage.py --out coverage.png --json coverage.json
 python scripts/coverage.py --skin.path skin.json --coverages field ray --ranges 0.5 1
+python scripts/coverage.py --occlusion
 
 A robot stands still in its default pose. Balls come straight at its base from all
 directions, straight at every part of its surface, and as the task throws them. A ball
@@ -67,6 +68,8 @@ class CoverageConfig:
     """Field sensors."""
     ray: Ray = dataclasses.field(default_factory=Ray)
     """Ray sensors."""
+    occlusion: bool = False
+    """Whether the robot's own body hides what lies behind it."""
     throws: ThrowConfig = dataclasses.field(default_factory=ThrowConfig)
     """The balls and how they are thrown."""
     num_throws: int = 2000
@@ -231,6 +234,7 @@ def main(args: list[str]) -> None:
         {name: coverages[name] for name in config.coverages},
         sorted(config.ranges),
         config.throws,
+        occlusion=config.occlusion,
         num_throws=config.num_throws,
         seed=config.seed,
         timestep=physics.timestep,
@@ -242,6 +246,8 @@ def main(args: list[str]) -> None:
     content = {"config": to_plain(config), "sensors": len(skin), **report}
     config.json.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
     title = f"What {len(skin)} sensors on {robot.name} see"
+    if config.occlusion:
+        title += ", its body in the way"
     figure = draw(analysis, report, title)
     figure.savefig(config.out, dpi=110)
     plt.close(figure)

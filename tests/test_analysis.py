@@ -343,6 +343,15 @@ def test_a_longer_range_sees_no_less(thrown):
     assert (counts[:, 2] > counts[:, 1]).any()
 
 
+def test_a_body_in_the_way_hides_some_of_what_is_seen(body, skin, thrown):
+    paths, _ = throw_paths(body, ThrowConfig(), 60, 0, 1 / 120)
+    ranges = [0.3, 1.0, 2.0]
+    solid = trace(body, paths, skin, BOTH, ranges, BALL, occlusion=True)
+    assert (solid.num_sensors <= thrown.num_sensors).all()
+    assert (solid.num_sensors < thrown.num_sensors).any(-1).any(-1).all()
+    assert (solid.first_seen >= thrown.first_seen).all()
+
+
 def test_what_a_ray_hits_is_in_the_field(thrown):
     field, ray = thrown.num_sensors.unflatten(0, (2, 3))
     assert (field >= ray).all()
@@ -407,6 +416,23 @@ def test_the_command_writes_a_picture_and_figures(tmp_path, monkeypatch, capsys)
     assert 0 <= near < far < 0.2
     groups = result["cells"][0]["warning_by_azimuth"].values()
     assert sum(group["hits"] for group in groups) == result["hits"] == 16
+
+
+def test_the_command_has_the_body_in_the_way_if_asked(tmp_path, monkeypatch):
+    pytest.importorskip("matplotlib")
+    monkeypatch.chdir(tmp_path)
+    small = ("--skin.num-sensors", "8", "--num-throws", "16", "--coverages", "field")
+    for name in ("clear", "solid"):
+        out = ("--out", f"{name}.png", "--json", f"{name}.json")
+        option = ("--occlusion",) if name == "solid" else ()
+        run_script(monkeypatch, *small, *out, *option, "--ranges", "1")
+    clear, solid = (
+        json.loads((tmp_path / f"{name}.json").read_text())
+        for name in ("clear", "solid")
+    )
+    assert solid["config"]["occlusion"]
+    (more,), (less,) = clear["cells"], solid["cells"]
+    assert less["directions_seen"] < more["directions_seen"]
 
 
 def test_bad_input_to_the_command_is_one_clear_message(tmp_path, monkeypatch, capsys):

@@ -143,8 +143,16 @@ def test_a_wrong_unit_is_noticed(header, row, length, load):
         lambda text: text.replace("\n", ",,\n"),
         lambda text: text.upper().replace(TORSO.upper(), TORSO),
         lambda text: text.rstrip("\n"),
+        lambda text: "# Of May\n" + text.replace("\n", "\n #, the next\n"),
+        lambda text: text.replace(",", ";"),
+        lambda text: text.replace(",", "\t"),
+        lambda text: "# a, b\n" + text.replace(",", ";").replace("0.", "0,"),
+        lambda text: text.replace(",", ";").replace("0.02", "2,0e-02"),
     ],
-    ids=["CRLF", "BOM", "spaces", "quotes", "blank", "commas", "capitals", "no-end"],
+    ids=[
+        *("CRLF", "BOM", "spaces", "quotes", "blank", "commas", "capitals", "no-end"),
+        *("comments", "semicolons", "tabs", "decimal commas", "exponents"),
+    ],
 )
 def test_the_form_of_a_table_does_not_matter(change, load):
     expected = load(current(*DIALECTS[CURRENT]))
@@ -176,6 +184,8 @@ GOOD = f"0,0.093,0.02,0.2,1,0,0,0.01,{TORSO},v"
         (current(GOOD, "1,0,0,0,1,0,0"), "export:3: expected 10 values"),
         (current(GOOD, GOOD + ",more"), "export:3: expected 10 values"),
         (current(GOOD, "clips and names only in print exports"), "export:3: expected"),
+        (current(GOOD).replace(",", ";").replace("0.093", "1.000,5"), "got '1.000,5'"),
+        (current("#", GOOD, "1,0"), "export:4: expected 10 values"),
         (current(GOOD, GOOD), "export:3: '0' is there already .*export:2"),
         (current(GOOD, CURRENT), "export:3: index must be a finite number"),
         (current(GOOD, "1,0,0,0,1,0,0,0.01,,v"), "export:3: the file does not say on"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import mujoco
 import numpy as np
@@ -13,7 +14,7 @@ from hypothesis import strategies as st
 
 from egoskin.kinematics import rotate_inverse
 from egoskin.robots import H1_2
-from egoskin.sensors import FieldSensor, Ray, RaySensor, Skin
+from egoskin.sensors import FieldSensor, Ray, RaySensor, Skin, occlusion
 from egoskin.shapes import Box, Capsule, Ellipsoid, Sphere
 
 RANGE = 2.0
@@ -35,10 +36,10 @@ def measure(sensor, state):
     return sensor.compute(*(state[key] for key in KEYS))
 
 
-def crowd(random_state, seed: int):
+def crowd(random_state, seed: int, rows: int = 6):
     """States in float64 with four active objects, turned anyhow."""
-    state = random_state(6, seed, torch.float64, objects=4)
-    quat = torch.from_numpy(np.random.default_rng(seed).normal(size=(6, 4, 4)))
+    state = random_state(rows, seed, torch.float64, objects=4)
+    quat = torch.from_numpy(np.random.default_rng(seed).normal(size=(rows, 4, 4)))
     state["object_pose"][..., 3:] = torch.nn.functional.normalize(quat, dim=-1)
     state["object_active"][:] = True
     return state
@@ -139,6 +140,28 @@ def test_a_field_sees_what_mujoco_sees_before_the_robot(skin, random_state, seed
         seen[near].isinf().numpy(),
         *(some, state, row, sensor, ways[near].numpy(), distance[near]),
     )
+
+
+# --- what may not change a bit --------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", [FieldSensor, partial(RaySensor, coverage=WIDE)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_leaving_parts_of_the_body_out_changes_nothing(
+    skin, random_state, kind, dtype, monkeypatch
+):
+    state = crowd(random_state, 3, rows=64)
+    state = state.apply(lambda x: x.to(dtype) if x.is_floating_point() else x)
+    # Around a sensor, at its centre even.
+    state["object_pose"][0, 0, :3] = state["base_pose"][0, :3]
+    clear = kind(skin, H1_2.chain, SHAPES, math.inf, per_object=True)
+    sensor = kind(skin, H1_2.chain, SHAPES, math.inf, body=BODY, per_object=True)
+    distance, detected = measure(sensor, state)
+    monkeypatch.setattr(occlusion, "_SLACK", math.inf)
+    everything = measure(sensor, state)
+    assert torch.equal(distance, everything[0])
+    assert torch.equal(detected, everything[1])
+    assert (distance.isinf() & measure(clear, state)[0].isfinite()).any()
 
 
 # --- by hand --------------------------------------------------------------------

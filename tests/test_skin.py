@@ -108,7 +108,7 @@ def without(content: dict, name: str) -> dict:
     return {key: value for key, value in content.items() if key != name}
 
 
-def skin_content(*sensors: dict) -> dict:
+def skin_content(*sensors: object) -> dict:
     return {"format": "egoskin-skin-1", "robot": "h1_2", "sensors": list(sensors)}
 
 
@@ -140,6 +140,25 @@ def skin_content(*sensors: dict) -> dict:
         (
             skin_content({**SENSOR, "position": [0, 0, float("nan")]}),
             "position holds values that are not finite",
+        ),
+        ({**skin_content(), "sensors": None}, "'sensors' must be a list, got None"),
+        (skin_content(5), "sensor 0 must be an object, got 5"),
+        (skin_content({**SENSOR, "link": 3}), "sensor 0: 'link' must be a name, got 3"),
+        (skin_content({**SENSOR, "type": [1]}), r"sensor 0: there is no type \[1\]"),
+        ({**skin_content(SENSOR), "robot": 4}, "'robot' must be a name, got 4"),
+        ({**skin_content(SENSOR), "types": [1]}, "'types' must be an object, got"),
+        ({**skin_content(SENSOR), "types": {"a": 3}}, "type 'a' must be an object"),
+        *(
+            (
+                {**skin_content(SENSOR), "types": {"a": {"coverage": "ray", **entry}}},
+                f"type 'a': {message}",
+            )
+            for entry, message in (
+                ({"grid": 5}, r"'grid' must be like \[8, 8\], got 5"),
+                ({"grid": [8.5, 8]}, "grid must be two positive integers"),
+                ({"fov_deg": "63"}, "'fov_deg' must be like 63.0, got '63'"),
+                ({"sub_beams": 1.5}, "'sub_beams' must be like 1, got 1.5"),
+            )
         ),
     ],
 )

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Literal
 
 import numpy as np
@@ -58,12 +59,14 @@ class Ray:
         _check_choice("fov", self.fov, ("diagonal", "axis"))
         _check_choice("beams", self.beams, ("centres", "edges"))
         _check_choice("measure", self.measure, ("beam", "depth"))
-        if len(self.grid) != 2 or min(self.grid) < 1:
-            raise ValueError(f"grid must be two positive numbers, got {self.grid}")
+        if len(self.grid) != 2 or not all(map(_is_positive, self.grid)):
+            raise ValueError(f"grid must be two positive integers, got {self.grid}")
         if not 0 < self.fov_deg < 180:
             raise ValueError(f"fov_deg must be in (0, 180), got {self.fov_deg}")
-        if self.sub_beams < 1:
-            raise ValueError(f"sub_beams must be at least 1, got {self.sub_beams}")
+        if not _is_positive(self.sub_beams):
+            raise ValueError(
+                f"sub_beams must be a positive integer, got {self.sub_beams}"
+            )
         if self.beams == "edges" and (self.sub_beams > 1 or min(self.grid) < 2):
             raise ValueError(
                 "beams='edges' needs a grid of at least 2 x 2 and sub_beams=1, got "
@@ -114,6 +117,11 @@ def _check_choice(name: str, value: str, choices: tuple[str, str]) -> None:
     """Raise ValueError for a word that is none of the choices."""
     if value not in choices:
         raise ValueError(f"{name} must be {' or '.join(choices)}, got {value!r}")
+
+
+def _is_positive(number: object) -> bool:
+    """Whether something is a positive integer, NumPy's too."""
+    return isinstance(number, Integral) and int(number) > 0
 
 
 KINDS: dict[str, type[Field] | type[Ray]] = {"field": Field, "ray": Ray}

@@ -46,7 +46,7 @@ class FieldSensor(ProximitySensor):
         body: The robot's shapes, to hide what lies behind them: an object is seen if
             the straight path to its closest point is free. Empty: transparent.
         per_object: Write ``distance [*B, S, O]``, objects told apart.
-        compile: Compile the kernel; results are the same.
+        compile: Compile the kernel of a transparent robot; results are the same.
         in_keys: Keys of the four inputs, in the order above.
         out_keys: Keys of the two outputs, in the order above.
 
@@ -81,7 +81,7 @@ class FieldSensor(ProximitySensor):
             1.0,
             body,
             per_object,
-            # What the body hides is found for some pairs: their number is no constant.
+            # What the body hides is found for some paths: their number is no constant.
             compile and not body,
             in_keys,
             out_keys,
@@ -180,8 +180,13 @@ class FieldSensor(ProximitySensor):
         way = self._to_closest(view, shape, centre)
         x, y, z = (w[sensor, row] for w in way)
         reach = (x * x + y * y + z * z).sqrt()
-        direction = torch.stack((x, y, z))[..., None] / reach.clamp(min=1e-9)[:, None]
+        way = torch.stack((x, y, z))
+        direction = (way / reach.clamp(min=1e-9))[..., None]
         length = reach - shape.radius if isinstance(shape, Sphere) else reach
         found = reading[sensor, row][:, None]
-        kept = self.hide(found, scene, sensor, row, direction, length[:, None])
+        kept = self.hide(
+            *(found, scene, sensor, row, direction, length[:, None]),
+            target=way,
+            radius=0.0,
+        )
         return reading.index_put((sensor, row), kept[:, 0])

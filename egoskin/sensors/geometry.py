@@ -53,6 +53,9 @@ class Scene(NamedTuple):
     """Their cosines, ``[U, B]``."""
     joints: Tensor
     """These joint positions, ``[U, B]``."""
+    links: tuple[Tensor, Tensor] | None
+    """Rotations ``[3, 3, L, B]`` and positions [m] ``[3, L, B]`` of all links in the
+    base frame; None for a robot that is transparent to its sensors."""
 
 
 class View(NamedTuple):
@@ -100,12 +103,13 @@ def product(a: Tensor, b: Tensor) -> Tensor:
     )  # fmt: skip
 
 
-def _poison(base_pose: Tensor, joint_pos: Tensor) -> Tensor:
-    """Return 0 or, for rows with NaN anywhere, NaN, ``[B]``: 0 NaN = NaN.
+def _poison(base_pose: Tensor, joint_pos: Tensor, object_pose: Tensor) -> Tensor:
+    """Return 0 or, for NaN in the row or in the object, NaN, ``[B, O]``: 0 NaN = NaN.
 
-    It makes all readings of the row NaN, culled or not; no comparison discards it.
+    It makes all readings of the object NaN, culled or not; no comparison discards it.
     """
-    return 0.0 * (joint_pos.sum(-1) + base_pose.sum(-1))
+    row = 0.0 * (joint_pos.sum(-1) + base_pose.sum(-1))
+    return row[:, None] + 0.0 * object_pose.sum(-1)
 
 
 def _matrix(quat: Tensor) -> Tensor:
@@ -162,11 +166,10 @@ class ProximitySensor(RowTransform):
         if compile:
             self._prepare = compiled(self.scene)
         self.readings = torch.Size((len(skin), *num_readings))
-        self._occluder = Occluder(body) if body else None
         links = list(dict.fromkeys(skin.links))
         self._num_links = len(links)
-        if self._occluder is not None:
-            links += [name for name in self._occluder.links if name not in links]
+        links += dict.fromkeys(p.link for p in body if p.link not in links)
+        self._occluder = Occluder(body, links) if body else None
         self._kinematics = LinkKinematics(chain, links)
 
         def constant(name: str, value: object, dtype: torch.dtype) -> None:
@@ -197,10 +200,14 @@ class ProximitySensor(RowTransform):
         Compiled apart from them: otherwise their loops would load with strides, one
         number at a time.
         """
-        poison = _poison(base_pose, joint_pos)[:, None] + 0.0 * object_pose.sum(-1)
+        poison = _poison(base_pose, joint_pos, object_pose)
         objects = (object_pose + poison[..., None]).permute(1, 2, 0).contiguous()
         base, on = base_pose.t().contiguous(), active.t().contiguous()
-        return Scene(base, objects, on, *self._kinematics.trig(joint_pos))
+        trig = self._kinematics.trig(joint_pos)
+        links = None
+        if self._occluder is not None:
+            links = stack_frames(self._kinematics.frames_from(*trig), base)
+        return Scene(base, objects, on, *trig, links)
 
     def views(self, scene: Scene) -> list[View]:
         """Return each object as the links see it."""
@@ -279,6 +286,8 @@ class ProximitySensor(RowTransform):
         row: Tensor,
         direction: Tensor,
         length: Tensor,
+        target: Tensor,
+        radius: float,
     ) -> Tensor:
         """Return readings without those of paths that the robot's body blocks.
 
@@ -288,31 +297,38 @@ class ProximitySensor(RowTransform):
             sensor: Sensor of each pair, ``[n]``.
             row: Row of each pair, ``[n]``.
             direction: Unit directions in the sensors' links, ``[3, n, K]``.
-            length: Lengths of the paths [m], ``[n, K]``.
+            length: Lengths of the paths [m], ``[n, K]``; infinite ones lead to nothing.
+            target: Where the paths of each pair lead, as seen from the sensor, in its
+                link [m], ``[3, n]``.
+            radius: They end no farther from there than this [m].
 
         Returns:
             ``[n, K]``, infinite where blocked.
         """
         assert self._occluder is not None
-        trig = [x[:, row] for x in (scene.sin, scene.cos, scene.joints)]
-        frames = self._kinematics.frames_from(*trig)
-        links = stack_frames(frames[: self._num_links], trig[2])
-        pair = torch.arange(len(row), device=row.device)
-        turn, position = (x[..., self._link[sensor], pair] for x in links)
+        assert scene.links is not None
+        link = self._link[sensor]
+        turn, position = (x[..., link, row] for x in scene.links)
         offset = self._offset[:, sensor, 0].to(reading.dtype)
+
+        def to_base(v: Tensor, of: Tensor | slice = slice(None)) -> list[Tensor]:
+            return [r[0, of] * v[0] + r[1, of] * v[1] + r[2, of] * v[2] for r in turn]
+
         # p + R o
-        origin = [
-            p + r[0] * offset[0] + r[1] * offset[1] + r[2] * offset[2]
-            for p, r in zip(position, turn, strict=True)
-        ]
-        way = [
-            r[0, :, None] * direction[0]
-            + r[1, :, None] * direction[1]
-            + r[2, :, None] * direction[2]
-            for r in turn
-        ]
-        by_name = dict(zip(self._kinematics.links, frames, strict=True))
-        hidden = self._occluder.blocked(by_name, origin, way, length)
+        x, y, z = offset
+        origin = position + turn[:, 0] * x + turn[:, 1] * y + turn[:, 2] * z
+        pair, path = (length < torch.inf).nonzero().unbind(1)
+        hidden = torch.zeros_like(length, dtype=torch.bool)
+        hidden[pair, path] = self._occluder.blocked(
+            scene.links,
+            row,
+            origin,
+            torch.stack(to_base(target)),
+            radius,
+            pair,
+            to_base(direction[:, pair, path], pair),
+            length[pair, path],
+        )
         return torch.where(hidden, torch.inf, reading)
 
     @abstractmethod
@@ -338,14 +354,11 @@ class ProximitySensor(RowTransform):
                 first dimension is ``O``. A new tensor by default.
 
         Raises:
-            ValueError: If the number of objects is not that of the sensor.
+            ValueError: If the number of objects is not that of the sensor, a pose has
+                not seven numbers, or the inputs are not of one floating type and bool.
         """
+        self._check(inputs)
         batch, objects = inputs[3].shape
-        if objects != len(self.objects):
-            raise ValueError(
-                f"the sensor was made for {len(self.objects)} objects, "
-                f"{self.in_keys[2]!r} holds {objects}"
-            )
         if out is None:
             each = (objects,) if self.per_object else ()
             out = inputs[0].new_empty((*each, batch, *self.readings))
@@ -364,6 +377,30 @@ class ProximitySensor(RowTransform):
                 detected[rows] = least.t() != torch.inf
         return (out.movedim(0, -1) if self.per_object else out), detected
 
+    def _check(self, inputs: Sequence[Tensor]) -> None:
+        """Raise ValueError for inputs of a wrong shape or type."""
+        *numbers, active = inputs
+        for key, tensor in zip(self.in_keys[2:], inputs[2:], strict=True):
+            if tensor.shape[1] != len(self.objects):
+                raise ValueError(
+                    f"the sensor was made for {len(self.objects)} objects, {key!r} "
+                    f"holds {tensor.shape[1]}"
+                )
+        types = [x.dtype for x in numbers]
+        if len({*types}) > 1 or not types[0].is_floating_point:
+            raise ValueError(
+                f"{', '.join(map(repr, self.in_keys[:3]))} must be of one floating "
+                f"type, got {', '.join(map(str, types))}"
+            )
+        if active.dtype != torch.bool:
+            raise ValueError(f"{self.in_keys[3]!r} must be bool, got {active.dtype}")
+        for i in (0, 2):
+            if inputs[i].shape[-1] != 7:
+                raise ValueError(
+                    f"{self.in_keys[i]!r} must hold 7 numbers a pose (position, "
+                    f"quaternion w x y z), got {inputs[i].shape[-1]}"
+                )
+
     def _rows_in_reach(
         self,
         base_pose: Tensor,
@@ -375,8 +412,7 @@ class ProximitySensor(RowTransform):
         bounds = [shape.bounding_radius for shape in self.objects]
         limit = self._farthest + object_pose.new_tensor(bounds)
         away = (object_pose[..., :3] - base_pose[:, None, :3]).square().sum(-1)
-        away = away + _poison(base_pose, joint_pos)[:, None]
-        away = away + 0.0 * object_pose.sum(-1)
+        away = away + _poison(base_pose, joint_pos, object_pose)
         return (~(away > limit * limit) & active).any(1).nonzero()[:, 0]
 
     def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:

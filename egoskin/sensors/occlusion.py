@@ -2,79 +2,122 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from egoskin.kinematics import Frame
 from egoskin.robots import Primitive
 from egoskin.shapes import shape_of
 
 # A path is blocked if more than this of it lies inside one primitive [m]: a sensor on
 # the surface is not blocked by the point it sits on, nor is a path along the surface.
 _DEPTH = 1e-3
+# Primitives are left out with this margin for rounding [m].
+_SLACK = 1e-3
+# Bundles worked on at a time: temporaries then stay in the cache.
+_CHUNK = 2**12
 
 
 class Occluder:
     """The body of a robot as an obstacle to straight paths.
 
+    Paths come in bundles: from one sensor to points of one object. Only primitives that
+    reach into the cone of a bundle are tried; the result is that of trying all.
+
     Args:
         primitives: The robot's body.
+        links: Links whose frames will be given, those of the body among them.
     """
 
-    def __init__(self, primitives: Sequence[Primitive]) -> None:
-        self.links = tuple(dict.fromkeys(p.link for p in primitives))
-        self._parts = [
-            (
-                p.link,
-                shape_of(p.kind, p.size.tolist()),
-                p.position.tolist(),
-                p.rotation.T.tolist(),
-            )
-            for p in primitives
-        ]
+    def __init__(self, primitives: Sequence[Primitive], links: Sequence[str]) -> None:
+        self._link = [links.index(p.link) for p in primitives]
+        self._shapes = [shape_of(p.kind, p.size.tolist()) for p in primitives]
+        self._centres = [p.position.tolist() for p in primitives]
+        self._turns = [p.rotation.T.tolist() for p in primitives]
 
     def blocked(
         self,
-        frames: Mapping[str, Frame],
-        origin: Sequence[Tensor],
+        frames: tuple[Tensor, Tensor],
+        row: Tensor,
+        origin: Tensor,
+        target: Tensor,
+        radius: float,
+        bundle: Tensor,
         direction: Sequence[Tensor],
         length: Tensor,
     ) -> Tensor:
         """Return whether straight paths run through the robot.
 
         Args:
-            frames: Frames of ``links`` in the base frame, of each path's row.
-            origin: Start of each path in the base frame [m], three of ``[n]``.
-            direction: Unit directions in the base frame, three of ``[n, K]``.
-            length: Lengths of the paths [m], ``[n, K]``.
+            frames: Rotations ``[3, 3, L, B]`` and positions [m] ``[3, L, B]`` of the
+                links in the base frame.
+            row: Row of each bundle, ``[n]``.
+            origin: Where each bundle starts, in the base frame [m], ``[3, n]``.
+            target: From there to the centre of where it leads [m], ``[3, n]``.
+            radius: No path ends farther from that centre than this [m].
+            bundle: Bundle of each path, ``[m]``.
+            direction: Unit directions in the base frame, three of ``[m]``.
+            length: Lengths of the paths [m], ``[m]``.
 
         Returns:
-            ``[n, K]`` bool.
+            ``[m]`` bool.
         """
+        rotation, position = frames
+        centres = self._centres_b(rotation, position)
+        parts = (row.split(_CHUNK), origin.split(_CHUNK, 1), target.split(_CHUNK, 1))
+        near = [
+            self._near(centres[..., at], start, way, radius)
+            for at, start, way in zip(*parts, strict=True)
+        ]
+        near = torch.cat(near, 1)[:, bundle]
+        row, origin = row[bundle], origin[:, bundle]
         hidden = torch.zeros_like(length, dtype=torch.bool)
-        for link, shape, centre, turn in self._parts:
-            rotation, position = frames[link]
+        for i, shape in enumerate(self._shapes):
+            some = (near[i] & ~hidden).nonzero()[:, 0]
+            if not len(some):
+                continue
+            link, at = self._link[i], row[some]
             # Into the link's frame, then the primitive's: R^T (p - o).
-            columns = [
-                [e[:, None] if isinstance(e, Tensor) else e for e in c]
-                for c in zip(*rotation, strict=True)
-            ]
-            away = [(o - p)[:, None] for o, p in zip(origin, position, strict=True)]
-            start = _turned(columns, away)
-            start = [p - c for p, c in zip(start, centre, strict=True)]
-            start, way = (
-                _turned(turn, start),
-                _turned(turn, _turned(columns, direction)),
-            )
+            columns = rotation[:, :, link, at].transpose(0, 1)
+            start = _turned(columns, origin[:, some] - position[:, link, at])
+            start = [p - c for p, c in zip(start, self._centres[i], strict=True)]
+            way = _turned(columns, [d[some] for d in direction])
+            start, way = (_turned(self._turns[i], v) for v in (start, way))
             enter, leave = shape.ray_interval(*start, *way)
-            inside = torch.minimum(leave, length) - enter.clamp(min=0.0)
-            hidden |= inside > _DEPTH
+            inside = torch.minimum(leave, length[some]) - enter.clamp(min=0.0)
+            hidden[some] = inside > _DEPTH
         return hidden
 
+    def _centres_b(self, rotation: Tensor, position: Tensor) -> Tensor:
+        """Centres of the primitives in the base frame [m], ``[3, P, B]``."""
+        x, y, z = rotation.new_tensor(self._centres).t()[..., None]
+        # p + R c
+        a, b, c = rotation[:, :, self._link].unbind(1)
+        return position[:, self._link] + (a * x + b * y + c * z)
 
-def _turned(rows: Sequence, vector: Sequence[Tensor]) -> list[Tensor]:
+    def _near(
+        self, centre: Tensor, origin: Tensor, target: Tensor, radius: float
+    ) -> Tensor:
+        """Which primitives may block some path of a bundle, ``[P, n]`` bool."""
+        reach = (target * target).sum(0).sqrt()
+        axis = target / reach
+        # All paths lie in the cone about a ball. From within the ball there is none:
+        # NaN, and all of the body is near.
+        sin = radius / reach
+        cos = (1 - sin * sin).sqrt()
+        x, y, z = centre - origin[:, None]
+        along = x * axis[0] + y * axis[1] + z * axis[2]
+        x, y, z = x - along * axis[0], y - along * axis[1], z - along * axis[2]
+        across = (x * x + y * y + z * z).sqrt()
+        # How far the primitive's centre is out of the cone: beside, behind, beyond.
+        gap = torch.maximum(across * cos - along * sin, -along)
+        gap = torch.maximum(gap, along - (reach + radius))
+        bounds = centre.new_tensor([s.bounding_radius for s in self._shapes])
+        return ~(gap > bounds[:, None] + _SLACK)
+
+
+def _turned(rows: Sequence | Tensor, vector: Sequence | Tensor) -> list[Tensor]:
     """The product of a matrix, row by row, with a vector."""
     x, y, z = vector
     return [a * x + b * y + c * z for a, b, c in rows]

@@ -56,7 +56,7 @@ class RaySensor(ProximitySensor):
         body: The robot's shapes, to hide what lies behind them; empty: transparent.
         per_object: Objects told apart in a last dimension ``O``.
         cull: Skip pairs that cannot hit; results are the same.
-        compile: Compile the kernels; results are the same.
+        compile: Compile the kernels of a transparent robot; results are the same.
         in_keys: Keys of the four inputs, in the order above.
         out_keys: Keys of the two outputs, in the order above.
 
@@ -115,7 +115,8 @@ class RaySensor(ProximitySensor):
             slant.numpy(),
             body,
             per_object,
-            compile,
+            # What the body hides is found for some paths: their number is no constant.
+            compile and not body,
             in_keys,
             out_keys,
         )
@@ -128,11 +129,12 @@ class RaySensor(ProximitySensor):
         self._margin_kernel: Callable[..., tuple[Tensor, list[View]]]
         self._margin_kernel = self.margins
         self._kernel: Callable[..., tuple[Tensor, Tensor]] = self.read
-        if compile:
+        if self._compile:
             self._margin_kernel = compiled(self.margins)
             self._kernel = compiled(self.read, dynamic=True)
         # Temporaries of an uncompiled kernel should stay in the cache.
-        self._chunk = 2**31 if compile else max(1, _CHUNK // self._beams.shape[-1])
+        small = max(1, _CHUNK // self._beams.shape[-1])
+        self._chunk = 2**31 if self._compile else small
 
     def margins(self, scene: Scene) -> tuple[Tensor, list[View]]:
         """Return by how much each sensor may see each object.
@@ -195,7 +197,8 @@ class RaySensor(ProximitySensor):
         dtype, link = view.centre.dtype, self._link[sensor]
         axes = self._axes.to(dtype)[:, :, sensor, 0]
         offset = self._offset.to(dtype)[:, sensor, 0]
-        centre = self._in_sensor(view.centre[:, link, row] - offset, axes)
+        away = view.centre[:, link, row] - offset
+        centre = self._in_sensor(away, axes)
         beams = self._beams.to(dtype)
         if beams.shape[1] > 1:
             beams = beams[:, self._beam_of[sensor]]
@@ -210,7 +213,11 @@ class RaySensor(ProximitySensor):
         if self._occluder is not None:
             x, y, z = axes[..., None]
             way = x * beams[0] + y * beams[1] + z * beams[2]
-            distance = self.hide(distance, scene, sensor, row, way, distance)
+            distance = self.hide(
+                *(distance, scene, sensor, row, way, distance),
+                target=away,
+                radius=shape.bounding_radius,
+            )
         if self._depth is not None:
             slanted = self._depth[sensor][:, None]
             distance = torch.where(slanted, distance * beams[2], distance)

@@ -40,22 +40,31 @@ def _is_vector(value: object) -> bool:
     )
 
 
-def _coverage(name: str, entry: Mapping[str, Any]) -> Coverage:
+def _coverage(name: str, entry: object) -> Coverage:
     """Return the coverage that one of a file's types describes."""
+    if not isinstance(entry, Mapping):
+        raise ValueError(f"type {name!r} must be an object, got {entry!r}")
     values = dict(entry)
     kind = values.pop("coverage", None)
     if kind not in KINDS:
         raise ValueError(
             f"type {name!r}: 'coverage' must be one of {', '.join(KINDS)}, got {kind!r}"
         )
-    known = [f.name for f in fields(KINDS[kind])]
-    for field_name in values:
+    default = KINDS[kind]()
+    known = [f.name for f in fields(default)]
+    for field_name, value in values.items():
         _check_known(f"type {name!r}", field_name, known)
-    if "grid" in values:
-        values["grid"] = tuple(values["grid"])
+        if isinstance(value, list):
+            values[field_name] = value = tuple(value)
+        wanted = type(getattr(default, field_name))
+        if type(value) not in ((float, int) if wanted is float else (wanted,)):
+            raise ValueError(
+                f"type {name!r}: {field_name!r} must be like "
+                f"{json.dumps(getattr(default, field_name))}, got {entry[field_name]!r}"
+            )
     try:
         return KINDS[kind](**values)
-    except (TypeError, ValueError) as error:
+    except ValueError as error:
         raise ValueError(f"type {name!r}: {error}") from error
 
 
@@ -67,17 +76,19 @@ def _check_known(where: str, name: str, known: Sequence[str]) -> None:
         raise ValueError(f"{where}: unknown field {name!r}{hint}")
 
 
-def _check_sensor(
-    index: int, sensor: Mapping[str, Any], types: Mapping[str, Coverage]
-) -> None:
+def _check_sensor(index: int, sensor: object, types: Mapping[str, Coverage]) -> None:
     """Raise ValueError for an entry that describes no sensor."""
     where = f"sensor {index}"
+    if not isinstance(sensor, Mapping):
+        raise ValueError(f"{where} must be an object, got {sensor!r}")
     required = ("link", "position", "normal")
     for name in required:
         if name not in sensor:
             raise ValueError(f"{where} lacks the field {name!r}")
     for name in sensor:
         _check_known(where, name, (*required, *_OPTIONAL))
+    if not isinstance(sensor["link"], str):
+        raise ValueError(f"{where}: 'link' must be a name, got {sensor['link']!r}")
     for name in ("position", "normal"):
         if not _is_vector(sensor[name]):
             raise ValueError(
@@ -88,7 +99,7 @@ def _check_sensor(
             raise ValueError(
                 f"{where}: {name!r} must be a number, got {sensor[name]!r}"
             )
-    if "type" in sensor and sensor["type"] not in types:
+    if "type" in sensor and sensor["type"] not in list(types):
         raise ValueError(
             f"{where}: there is no type {sensor['type']!r}; the file's types are "
             f"{', '.join(types) or 'none'}"
@@ -260,11 +271,17 @@ class Skin:
         for name in ("robot", "sensors"):
             if name not in content:
                 raise ValueError(f"a skin needs the field {name!r}")
-        types = {
-            name: _coverage(name, entry)
-            for name, entry in content.get("types", {}).items()
-        }
-        sensors = content["sensors"]
+        entries, sensors = content.get("types", {}), content["sensors"]
+        for name, value, kind in (
+            ("robot", content["robot"], str),
+            ("types", entries, Mapping),
+            ("sensors", sensors, list),
+            ("provenance", content.get("provenance", {}), Mapping),
+        ):
+            if not isinstance(value, kind):
+                wanted = {str: "a name", list: "a list"}.get(kind, "an object")
+                raise ValueError(f"{name!r} must be {wanted}, got {value!r}")
+        types = {name: _coverage(name, entry) for name, entry in entries.items()}
         for index, sensor in enumerate(sensors):
             _check_sensor(index, sensor, types)
 

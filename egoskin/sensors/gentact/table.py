@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -31,6 +32,7 @@ _HEADERS = (
     _PRINT_HEADER,
 )
 _MESH_HEADER = "Index,X,Y,Z,Object Name"
+_DECIMAL_COMMA = re.compile(r"^([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)$")
 # Columns of the oldest dialect by today's names.
 _RENAMED = {
     "sensornum": "index",
@@ -76,8 +78,17 @@ def save_gentact(skin: Skin, path: Path | str) -> tuple[str, ...]:
 
 
 def _rows(text: str, path: Path) -> Iterator[tuple[str, list[str]]]:
-    """Rows that are not blank, as (where, stripped cells)."""
-    reader = csv.reader(io.StringIO(text, newline=""), skipinitialspace=True)
+    """Rows that are neither blank nor comments (#), as (where, stripped cells).
+
+    A spreadsheet may have put semicolons or tabs between the cells, and then decimal
+    commas into them.
+    """
+    lines = (line for line in text.splitlines() if line.strip())
+    header = next((line for line in lines if not line.lstrip().startswith("#")), "")
+    delimiter = max(",;\t", key=header.count)
+    reader = csv.reader(
+        io.StringIO(text, newline=""), delimiter=delimiter, skipinitialspace=True
+    )
     while True:
         where = f"{path}:{reader.line_num + 1}"
         try:
@@ -90,7 +101,9 @@ def _rows(text: str, path: Path) -> Iterator[tuple[str, list[str]]]:
         if any("\n" in cell or "\r" in cell for cell in row):
             raise ValueError(f"{where}: a quoted value must end on its line")
         cells = [cell.strip() for cell in row]
-        if any(cells):
+        if delimiter != ",":
+            cells = [_DECIMAL_COMMA.sub(r"\1.\2", cell) for cell in cells]
+        if any(cells) and not cells[0].startswith("#"):
             yield where, cells
 
 

@@ -1,0 +1,91 @@
+"""What fields and rays share: marked readings for bad input, none for what is away."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+
+import pytest
+import torch
+
+from egoskin.robots import H1_2
+from egoskin.sensors import FieldSensor, Ray, RaySensor
+from egoskin.shapes import Box, Capsule, Ellipsoid, Sphere
+
+RANGE = 1.5
+SHAPES = (
+    Sphere(radius=0.25),
+    Box(half_extents=(0.1, 0.2, 0.3)),
+    Capsule(radius=0.1, half_length=0.3),
+    Ellipsoid(semi_axes=(0.4, 0.1, 0.25)),
+)
+KEYS = ("base_pose", "joint_pos", "object_pose", "object_active")
+SMALL = partial(RaySensor, coverage=Ray(grid=(4, 4)))
+every_kind = pytest.mark.parametrize(
+    "kind",
+    [FieldSensor, SMALL, partial(SMALL, cull=False)],
+    ids=["field", "ray", "dense ray"],
+)
+
+
+def measure(sensor, state):
+    """(distance, detected) of a state."""
+    return sensor.compute(*(state[key] for key in KEYS))
+
+
+@pytest.mark.parametrize("key", KEYS[:3])
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("body", [(), H1_2.primitives], ids=["transparent", "solid"])
+@every_kind
+def test_nan_anywhere_reads_nan(skin, random_state, kind, body, shape, key):
+    state = random_state(8, seed=3, objects=2)
+    state["object_active"][:] = True
+    state["object_active"][6:, 1] = False
+    few = skin.select(range(8))
+    sensor = kind(few, H1_2.chain, (shape, shape), RANGE, body=body)
+    clean, clean_detected = measure(sensor, state)
+    number = state[key][0].numel()
+    for i in range(0, number, 1 if number < 15 else 4):
+        bad = state.clone()
+        bad[key][1::2].view(4, -1)[:, i] = math.nan
+        distance, detected = measure(sensor, bad)
+        assert torch.equal(distance[::2], clean[::2])
+        assert torch.equal(detected[::2], clean_detected[::2])
+        # A bad pose is one object's; that of the second in row 7 is not in play.
+        own = key == "object_pose"
+        marked = [1, 3, 5] if own and i >= number // 2 else [1, 3, 5, 7]
+        assert distance[marked].isnan().all()
+        assert (detected[marked].sum(-1) >= 1).all()
+
+
+@every_kind
+def test_poses_of_inactive_objects_are_not_looked_at(skin, random_state, kind):
+    state = random_state(32, seed=4)
+    parked = state.clone()
+    parked["object_pose"][~state["object_active"]] = math.nan
+    assert not state["object_active"].all()
+    sensor = kind(skin, H1_2.chain, SHAPES[:2], RANGE)
+    for a, b in zip(measure(sensor, parked), measure(sensor, state), strict=True):
+        assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize(
+    ("key", "change", "message"),
+    [
+        ("joint_pos", torch.Tensor.double, "one floating type, got torch.float32, tor"),
+        ("joint_pos", torch.Tensor.int, "one floating type"),
+        ("object_active", torch.Tensor.float, "'object_active' must be bool"),
+        ("object_active", lambda x: x[:, :1], "for 2 objects, 'object_active' holds 1"),
+        ("object_pose", lambda x: x[:, :1], "for 2 objects, 'object_pose' holds 1"),
+        ("object_pose", lambda x: x[..., :3], "'object_pose' must hold 7 num.*got 3"),
+        ("base_pose", lambda x: x[:, :6], "'base_pose' must hold 7 numbers.*got 6"),
+    ],
+)
+@every_kind
+def test_inputs_of_a_wrong_form_are_refused(
+    skin, random_state, kind, key, change, message
+):
+    state = random_state(4, seed=0, objects=2)
+    state[key] = change(state[key])
+    with pytest.raises(ValueError, match=message):
+        measure(kind(skin, H1_2.chain, SHAPES[:2], RANGE), state)
