@@ -138,6 +138,11 @@ class TrainConfig:
         return device
 
 
+def pays_to_compile(config: EnvConfig) -> bool:
+    """Whether compiled sensors are worth their compilation: rays, with a compiler."""
+    return config.sensor.coverage == "ray" and can_compile()
+
+
 # What a run's stored configuration leaves out: it says how a run was called.
 _CALL_FIELDS = ("run_dir", "resume")
 
@@ -214,8 +219,9 @@ class Run:
                 f"by --resume {path}"
             )
         if config.compile_kernels is None:
-            pays = config.env.sensor.coverage == "ray" and can_compile()
-            config = dataclasses.replace(config, compile_kernels=pays)
+            config = dataclasses.replace(
+                config, compile_kernels=pays_to_compile(config.env)
+            )
         (path / "policies").mkdir(parents=True)
         run = cls(path, config)
         skin.save(run.skin_path)

@@ -32,6 +32,7 @@ from egoskin.make import (
     save_env_state,
 )
 from egoskin.policies import PolicySpec, sparse_sources
+from egoskin.runs import pays_to_compile
 from egoskin.workers import WorkerPool
 
 
@@ -141,7 +142,9 @@ class _Loop:
         self.config, self._coverage = config, coverage
         self._skin = config.env.skin.build(config.env.robot_config)
         self._workers = check_num_workers(config.num_envs, config.num_workers)
-        self._sources = sparse_sources(config.env, self._skin, config.ppo.network)
+        self._sources = sparse_sources(
+            config.env, self._skin, config.ppo.network, pays_to_compile(config.env)
+        )
         self._steps = config.ppo.rollout_steps
 
     def rows(self) -> list[Row]:
@@ -313,6 +316,14 @@ def _cpu_time() -> float:
     return sum(t.user + t.system for t in times)
 
 
+def _pss(process: psutil.Process) -> int:
+    """Proportional set size of a process, 0 if it has ended meanwhile."""
+    try:
+        return process.memory_full_info().pss
+    except psutil.NoSuchProcess:
+        return 0
+
+
 def _parts(times: dict[str, list[float]], kind: str) -> list[Row]:
     """What each layer adds to the one before, as shares of physics [us]."""
     median = {name: statistics.median(values) for name, values in times.items()}
@@ -357,5 +368,4 @@ class PeakMemory:
 
     def _watch(self) -> None:
         while not self._closed.wait(0.1):
-            now = sum(p.memory_full_info().pss for p in _processes())
-            self.peak = max(self.peak, now)
+            self.peak = max(self.peak, sum(map(_pss, _processes())))
