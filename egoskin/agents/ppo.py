@@ -28,7 +28,7 @@ from egoskin.sparse import SparseRows
 # Adaptive learning rate (Unitree's and other humanoid codes): bounds and factor.
 _LR_BOUNDS, _LR_FACTOR = (1e-5, 1e-2), 1.5
 # The divergence is estimated on this many frames of each minibatch.
-_KL_FRAMES = 4096
+_KL_FRAMES = 1024
 # More shares of a minibatch than this are smaller than what it costs to call PyTorch.
 _MAX_SHARES = 4
 
