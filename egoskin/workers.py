@@ -10,6 +10,7 @@ Contract: no worker and no file of a pool outlives the parent, however it ends.
 from __future__ import annotations
 
 import atexit
+import ctypes
 import functools
 import os
 import shutil
@@ -49,6 +50,10 @@ _COMPILE_COMMANDS, _COMPILE_LIMIT = 4, 600.0
 _DEATH_NOTICE = 5.0
 
 
+# Numbers of glibc mallopt, and the threshold that every version of it takes [bytes].
+_TRIM_THRESHOLD, _MMAP_THRESHOLD, _MMAP_MOST = -1, -3, 2**25
+
+
 class WorkerError(RuntimeError):
     """A worker died, raised or hung; the text holds its own traceback or signal."""
 
@@ -65,6 +70,20 @@ def default_num_workers(num_envs: int, cores: int | None = None) -> int:
         affinity = getattr(os, "sched_getaffinity", None)
         cores = len(affinity(0)) if affinity else os.cpu_count() or 1
     return max(n for n in range(1, cores + 1) if num_envs % n == 0)
+
+
+def keep_freed_memory() -> None:
+    """Let glibc's malloc keep what is freed, for this process.
+
+    Every step and update asks for the same megabytes again; to get fresh pages from
+    the system each time costs as much as the policy.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    # Other C libraries have no such function.
+    if mallopt is not None:
+        mallopt(_TRIM_THRESHOLD, 2**31 - 1)
+        if not mallopt(_MMAP_THRESHOLD, 2**30):
+            mallopt(_MMAP_THRESHOLD, _MMAP_MOST)
 
 
 class WorkerEnv(TransformedEnv):
@@ -120,6 +139,7 @@ class _Build:
         # TorchRL also builds one in the parent, to read its specs.
         in_worker = os.getpid() != self._parent
         if in_worker:
+            keep_freed_memory()
             Thread(target=_end_with_parent, daemon=True).start()
         with _reported(self._report):
             env = self._build()
@@ -175,6 +195,7 @@ class WorkerPool(ParallelEnv):
     ) -> None:
         self._reports = Path(tempfile.mkdtemp(dir=_temporary_folder()))
         self._compiles = compiles
+        keep_freed_memory()
         threads = torch.get_num_threads()
         # Workers are forked from a clean server that has imported everything once:
         # no thread of this process is copied, and no import is paid for per worker.
