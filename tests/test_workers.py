@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
 import subprocess
@@ -354,3 +355,34 @@ def test_the_default_number_of_workers_is_the_largest_divisor_not_above_the_core
 def test_workers_that_do_not_divide_the_agents_are_refused(skin):
     with pytest.raises(ValueError, match="valid: 1, 2, 4, 8, 16, 32"):
         make_pool(skin, 3)
+
+
+FAULTS = """
+import ctypes, resource, sys
+import torch
+from egoskin.workers import keep_freed_memory
+if sys.argv[1] == "keep":
+    keep_freed_memory()
+
+def faults():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    # As in a rollout: other sizes in between, or malloc learns the one size.
+    for size in (2, 40, 8, 60) * 5:
+        torch.ones(size * 250_000)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+faults()
+print(faults())
+"""
+
+
+@pytest.mark.skipif(
+    not hasattr(ctypes.CDLL(None), "mallopt"), reason="needs glibc's malloc"
+)
+def test_freed_memory_is_kept():
+    counts = {}
+    for how in ("keep", "leave"):
+        command = [sys.executable, "-c", FAULTS, how]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        counts[how] = int(done.stdout)
+    assert counts["keep"] < counts["leave"] / 10
