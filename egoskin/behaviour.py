@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -293,21 +294,22 @@ class _Feet:
             p for p in robot.primitives if p.link in robot.feet and p.kind == "box"
         ]
         signs = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3)
-        self._corners = [
-            (
-                (signs.double().numpy() * box.size) @ box.rotation.T + box.position
-            ).tolist()
+        corners = [
+            (signs.double().numpy() * box.size) @ box.rotation.T + box.position
             for box in boxes
         ]
+        # In the frames of the feet [m], [F, 8, 3].
+        self._corners = torch.from_numpy(np.stack(corners)).float()
         self._kinematics = LinkKinematics(robot.chain, [box.link for box in boxes])
 
     def corners_w(self, state: TensorDictBase) -> Tensor:
         """Return the corners of each foot in the world [m], ``[B, F, 8, 3]``."""
-        points_b = self._kinematics.points_b(state["joint_pos"], self._corners)
-        points_b = points_b.permute(2, 1, 0)
-        pose = state["base_pose"][:, None].expand(-1, points_b.shape[1], -1)
-        points_w = pose[..., :3] + rotate(pose[..., 3:], points_b)
-        return points_w.unflatten(1, (len(self._corners), 8))
+        position, rotation = self._kinematics.poses_b(state["joint_pos"])
+        # p + R x
+        turned = (rotation[:, :, None] * self._corners[..., None, :]).sum(-1)
+        points_b = position[:, :, None] + turned
+        pose = state["base_pose"][:, None, None].expand(*points_b.shape[:-1], 7)
+        return pose[..., :3] + rotate(pose[..., 3:], points_b)
 
     def slip(self, before: TensorDictBase, after: TensorDictBase) -> Tensor:
         """Return how far the lowest corner of each foot slides in a step [m].
