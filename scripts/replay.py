@@ -20,7 +20,7 @@ import tyro
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from egoskin.agents.networks import Agent
+from egoskin.agents.networks import Agent, input_keys
 from egoskin.agents.ppo import PPO, NonFiniteError, PPOConfig
 from egoskin.checkpoint import load_tensors, part
 from egoskin.cli import clear_errors, from_plain
@@ -68,7 +68,8 @@ def forward(agent: Agent, batch: TensorDict) -> dict[str, Tensor]:
         if not list(module.children()):
             module.register_forward_hook(note(name))
     with torch.no_grad():
-        agent.critic(agent.actor(batch.select("inputs")))
+        agent.head(*(batch[key] for key in input_keys(agent.actor_keys)))
+        agent.critic(batch.select("inputs"))
     return outputs
 
 

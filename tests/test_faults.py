@@ -488,7 +488,14 @@ def test_compiling_without_a_compiler_is_refused(tmp_path, monkeypatch, capsys):
     can_compile.cache_clear()
     try:
         with pytest.raises(SystemExit) as ended:
-            here("ppo.py", *SMALL, "--run-dir", tmp_path / "run", "--compile-kernels")
+            here(
+                "ppo.py",
+                *SMALL,
+                "--run-dir",
+                tmp_path / "run",
+                "--compile-kernels",
+                "True",
+            )
     finally:
         can_compile.cache_clear()
     assert ended.value.code == 2
@@ -503,7 +510,7 @@ def test_compiled_training_is_the_same_and_stays_compiled(
 ):
     size = ("--total-frames", 6 * BATCH, *sensor)
     plain, run = tmp_path / "plain", tmp_path / "run"
-    for args in ((plain,), (run, "--compile-kernels")):
+    for args in ((plain,), (run, "--compile-kernels", "True")):
         training = start(*SMALL, *size, "--run-dir", *args)
         assert training.end(600) == 0, training.text()
         assert ("compiling the sensor kernels" in training.text()) == (args[0] == run)
@@ -518,7 +525,7 @@ def test_compiled_training_is_the_same_and_stays_compiled(
     training = start("--resume", run, "--total-frames", 7 * BATCH)
     assert training.end() == 2
     assert "compiles its kernels" in training.text()
-    training = start("--resume", run, "--no-compile-kernels")
+    training = start("--resume", run, "--compile-kernels", "False")
     assert training.end() == 2
     assert "changed: compile_kernels" in training.text()
 
