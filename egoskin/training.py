@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from threading import Thread
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -223,6 +222,9 @@ def open_trainer(run: Run, num_threads: int = 1) -> Iterator[Trainer]:
     skin = Skin.load(run.skin_path)
     network, compile_kernels = config.ppo.network, bool(config.compile_kernels)
     sources = sparse_sources(config.env, skin, network, compile_kernels)
+    # Not in a thread while the workers start: torch tells all threads that it compiles.
+    for source in sources.values():
+        source.warm_up(config.num_envs)
     env = make_env(
         config.env,
         skin,
@@ -233,9 +235,6 @@ def open_trainer(run: Run, num_threads: int = 1) -> Iterator[Trainer]:
         sparse=bool(sources),
         compile_kernels=compile_kernels,
     )
-    # Sources compile while the workers start.
-    for source in sources.values():
-        Thread(target=source.warm_up, args=(config.num_envs,), daemon=True).start()
     try:
         trainer = Trainer(run, env, skin, sources)
         if run.is_new():
