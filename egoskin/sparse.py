@@ -8,7 +8,7 @@ of the time; its weights are those of the dense layer.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
 
@@ -41,51 +41,41 @@ class SparseRows:
         """Return the number of rows ``B``."""
         return len(self.offsets) - 1
 
-    @classmethod
-    def cat(cls, parts: Sequence[SparseRows]) -> SparseRows:
+    @staticmethod
+    def cat(parts: Sequence[SparseRows]) -> SparseRows:
         """Return the rows of several matrices of one kind, one after the other."""
         counts = torch.cat([part.offsets.diff() for part in parts])
-        return cls(
-            offsets=_offsets(counts),
+        return replace(
+            parts[0],
+            offsets=offsets_of(counts),
             column=torch.cat([part.column for part in parts]),
             value=torch.cat([part.value for part in parts]),
-            size=parts[0].size,
-            default=parts[0].default,
         )
 
     def select(self, rows: Tensor) -> SparseRows:
         """Return some rows, ``[n]`` int64, in their order."""
         start = self.offsets[rows]
         counts = self.offsets[rows + 1] - start
-        offsets = _offsets(counts)
+        offsets = offsets_of(counts)
         # Entry i of the result is entry i - offsets[b] + start[b] of this.
         shift = torch.repeat_interleave(start - offsets[:-1], counts)
         entry = shift + torch.arange(len(shift), device=shift.device)
-        return SparseRows(
-            offsets=offsets,
-            column=self.column[entry],
-            value=self.value[entry],
-            size=self.size,
-            default=self.default,
-        )
+        column, value = self.column[entry], self.value[entry]
+        return replace(self, offsets=offsets, column=column, value=value)
 
     def to(self, device: torch.device) -> SparseRows:
         """Return it on a device."""
-        return SparseRows(
+        return replace(
+            self,
             offsets=self.offsets.to(device),
             column=self.column.to(device),
             value=self.value.to(device),
-            size=self.size,
-            default=self.default,
         )
 
     def dense(self) -> Tensor:
         """Return the matrix, ``[B, size]``."""
         matrix = self.value.new_full((len(self), self.size), self.default)
-        row = torch.repeat_interleave(
-            torch.arange(len(self), device=self.offsets.device), self.offsets.diff()
-        )
-        return matrix.index_put_((row, self.column), self.value)
+        return matrix.index_put_((self._row, self.column), self.value)
 
     def linear(self, weight: Tensor, bias: Tensor | None) -> Tensor:
         """Return what a linear layer makes of the matrix, ``[B, out]``.
@@ -103,6 +93,12 @@ class SparseRows:
         return result
 
     @property
+    def _row(self) -> Tensor:
+        """Row of each entry."""
+        rows = torch.arange(len(self), device=self.offsets.device)
+        return torch.repeat_interleave(rows, self.offsets.diff())
+
+    @property
     def _excess(self) -> Tensor:
         """By how much each entry differs from the default."""
         return self.value - self.default if self.default else self.value
@@ -110,10 +106,6 @@ class SparseRows:
     @cached_property
     def _by_column(self) -> tuple[Tensor, Tensor, Tensor]:
         """Row and excess of each entry, column by column, and where columns begin."""
-        device = self.column.device
-        row = torch.repeat_interleave(
-            torch.arange(len(self), device=device), self.offsets.diff()
-        )
         if self.column.is_cpu:
             # A radix sort for 16 bits: several times as fast as PyTorch's.
             bits = np.uint16 if self.size <= 2**16 else np.int64
@@ -122,7 +114,7 @@ class SparseRows:
         else:
             order = self.column.argsort(stable=True)
         counts = torch.bincount(self.column, minlength=self.size)
-        return row[order], self._excess[order], _offsets(counts)
+        return self._row[order], self._excess[order], offsets_of(counts)
 
 
 class SparseSource(Protocol):
@@ -142,7 +134,7 @@ class SparseSource(Protocol):
         ...
 
 
-def _offsets(counts: Tensor) -> Tensor:
+def offsets_of(counts: Tensor) -> Tensor:
     """Return where groups of these sizes begin, and the end, ``[n + 1]``."""
     return torch.cat((counts.new_zeros(1), counts.cumsum(0)))
 

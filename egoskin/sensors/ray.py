@@ -25,7 +25,7 @@ from egoskin.sensors.geometry import (
 from egoskin.sensors.signals import Binary, Proximity
 from egoskin.sensors.skin import Skin
 from egoskin.shapes import Shape, first_hit
-from egoskin.sparse import SparseRows
+from egoskin.sparse import SparseRows, offsets_of
 
 # Pairs of sensor and agent are culled with this margin for rounding [m].
 _SLACK = 1e-4
@@ -234,11 +234,10 @@ class RaySensor(ProximitySensor):
         if rows is None:
             out.fill_(torch.inf)
         least = scene.active.new_full(scene.active.shape, torch.inf, dtype=out.dtype)
-        for i, row, sensor, reading, nearest in self._pairs(scene):
+        for i, row, place, reading, nearest in self._pairs(scene, rows):
             target = out[i] if self.per_object else out
             # A view, or an error: a copy would lose what is written.
             flat = target.view(-1, *target.shape[2:])
-            place = (row if rows is None else rows[row]) * self.num_sensors + sensor
             if i and not self.per_object:
                 reading = torch.minimum(_take(flat, place), reading)
             _put(flat, place, reading)
@@ -246,9 +245,12 @@ class RaySensor(ProximitySensor):
         return least
 
     def _pairs(
-        self, scene: Scene
+        self, scene: Scene, rows: Tensor | None
     ) -> Iterator[tuple[int, Tensor, Tensor, Tensor, Tensor]]:
-        """Yield object, rows, sensors, readings and their least, of what may be hit."""
+        """Yield object, rows, places, readings and their least, of what may be hit.
+
+        Rows count within the scene; a place is that of a sensor in ``[B S]``.
+        """
         margins, views = self._margin_kernel(scene)
         for i, (view, shape) in enumerate(zip(views, self.objects, strict=True)):
             # Whatever is not 0 may be hit, NaN too.
@@ -256,7 +258,10 @@ class RaySensor(ProximitySensor):
             # Nothing wanted would still be a part, and compiled for its own sake.
             for part in pairs.split(self._chunk) if len(pairs) else ():
                 row, sensor = part // self.num_sensors, part % self.num_sensors
-                yield i, row, sensor, *self._kernel(scene, view, sensor, row, shape)
+                place = part
+                if rows is not None:
+                    place = rows[row] * self.num_sensors + sensor
+                yield i, row, place, *self._kernel(scene, view, sensor, row, shape)
 
     def hits(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Return what is hit, without the grid: a thousandth of its numbers.
@@ -273,8 +278,7 @@ class RaySensor(ProximitySensor):
         if rows is not None and not len(rows):
             return places[0], readings[0]
         scene = self._prepare(*(x if rows is None else x[rows] for x in inputs))
-        for _, row, sensor, reading, _ in self._pairs(scene):
-            place = (row if rows is None else rows[row]) * self.num_sensors + sensor
+        for _, _, place, reading, _ in self._pairs(scene, rows):
             # NaN is no miss.
             hit = _nonzero(reading != torch.inf)
             beam = hit % self._num_beams
@@ -333,9 +337,8 @@ class SparseRays:
         sensor = self._sensor if batch == self._batch else self._plain
         place, distance = sensor.hits(*state)
         nothing = self._reading.signal(distance.new_full((1, 1), torch.inf))
-        counts = torch.bincount(place // self.size, minlength=batch)
         return SparseRows(
-            offsets=torch.cat((counts.new_zeros(1), counts.cumsum(0))),
+            offsets=offsets_of(torch.bincount(place // self.size, minlength=batch)),
             column=place % self.size,
             value=self._reading.signal(distance[None])[0],
             size=self.size,
