@@ -34,7 +34,7 @@ from egoskin.runs import Run
 from egoskin.sensors import Skin
 from egoskin.sparse import SparseSource
 from egoskin.survival import SurvivalCurve
-from egoskin.workers import WorkerPool
+from egoskin.workers import WorkerPool, start_server
 
 # What the metrics of an episode are made of.
 METRIC_KEYS = (
@@ -219,6 +219,8 @@ def open_trainer(run: Run, num_threads: int = 1) -> Iterator[Trainer]:
         num_threads: Physics threads of each worker; results do not depend on it.
     """
     config = run.config
+    # It imports while the sources compile.
+    start_server()
     skin = Skin.load(run.skin_path)
     network, compile_kernels = config.ppo.network, bool(config.compile_kernels)
     sources = sparse_sources(config.env, skin, network, compile_kernels)

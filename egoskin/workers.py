@@ -159,6 +159,25 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
+def start_server() -> None:
+    """Start what forks the workers, unless it runs; it imports while the caller goes on.
+
+    Workers are forked from a clean server that has imported everything once: no thread
+    of this process is copied, and no import is paid for per worker.
+    """
+    _temporary_folder()
+    set_forkserver_preload(["egoskin.make"])
+    # Ctrl-C and a batch system's SIGTERM reach the whole group, but when to end is the
+    # parent's decision. The server and the workers inherit the signal mask. The tracker
+    # comes first: its own start unblocks them.
+    resource_tracker.ensure_running()
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+    try:
+        forkserver.ensure_running()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+
+
 @functools.cache
 def _temporary_folder() -> str:
     """Return a folder that is removed when this process ends, however it does.
@@ -197,9 +216,6 @@ class WorkerPool(ParallelEnv):
         self._compiles = compiles
         keep_freed_memory()
         threads = torch.get_num_threads()
-        # Workers are forked from a clean server that has imported everything once:
-        # no thread of this process is copied, and no import is paid for per worker.
-        set_forkserver_preload(["egoskin.make"])
         super().__init__(
             len(builders),
             [_Build(b, self._report(i)) for i, b in enumerate(builders)],
@@ -248,15 +264,7 @@ class WorkerPool(ParallelEnv):
 
     def _start_workers(self) -> None:
         """Start the workers; raise if one cannot."""
-        # Ctrl-C and a batch system's SIGTERM reach the whole group, but when to end is
-        # the parent's decision. The server and the workers inherit the signal mask.
-        # The tracker comes first: its own start unblocks them.
-        resource_tracker.ensure_running()
-        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
-        try:
-            forkserver.ensure_running()
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        start_server()
         self._reports.mkdir(exist_ok=True)
         self._compile_commands = _COMPILE_COMMANDS if self._compiles else 0
         started = Event()
