@@ -160,7 +160,7 @@ def _end_with_parent() -> None:
 
 
 def start_server() -> None:
-    """Start what forks the workers, unless it runs; it imports while the caller goes on.
+    """Start what forks the workers, if it does not run; it imports on its own time.
 
     Workers are forked from a clean server that has imported everything once: no thread
     of this process is copied, and no import is paid for per worker.
