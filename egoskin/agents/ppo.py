@@ -62,7 +62,7 @@ class PPOConfig:
     """Passes over a rollout."""
     num_mini_batches: int = 4
     """Minibatches in each pass."""
-    gamma: float = 0.99
+    gamma: float = 0.995
     """Discount for each control step."""
     gae_lambda: float = 0.95
     """Decay of the generalised advantage estimate."""
