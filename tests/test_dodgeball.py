@@ -476,7 +476,7 @@ def test_an_action_is_a_position_target_scaled_by_torque_over_stiffness():
     # One substep, so that the torque is that of the state the action was chosen in.
     config = PhysicsConfig(substeps=1, control_hz=120)
     env = make(8, physics=config, throws=MISS, action_scale=0.25)
-    kp, kd = (torch.from_numpy(g) for g in H1_2.joint_gains("real"))
+    kp, kd = (torch.from_numpy(g) for g in H1_2.joint_gains(config.gains))
     limit = torch.from_numpy(H1_2.torque_limit)
     root = env.reset()
     clipped = 0
@@ -611,15 +611,16 @@ def test_a_task_that_makes_no_episode_is_refused(changes, message):
     ("changes", "expected"),
     [
         # Ankle roll, gain set "real": 40 N m at 40 N m/rad; range +-0.2618 rad.
-        ({}, 0.5 * 40 / 40),
+        ({"action_scale": 1.0}, 0.5 * 40 / 40),
         ({"action_scale": 0.3}, 0.3 * 0.5 * 40 / 40),
         ({"one_action_scale": 0.2}, 0.5 * 0.2),
-        ({"clip_targets": True}, 0.261799),
+        ({"action_scale": 1.0, "clip_targets": True}, 0.261799),
     ],
     ids=["torque over stiffness", "scaled", "one for all", "clipped"],
 )
 def test_position_targets_of_an_action_by_hand(changes: dict, expected: float):
-    env = DodgeballEnv(H1_2, DodgeballConfig(**changes), num_envs=2)
+    config = DodgeballConfig(physics=PhysicsConfig(gains="real"), **changes)
+    env = DodgeballEnv(H1_2, config, num_envs=2)
     td = env.reset()
     td["action"] = torch.full((2, 21), 0.5)
     env.step(td)
