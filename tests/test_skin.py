@@ -122,6 +122,14 @@ def skin_content(*sensors: object) -> dict:
         (without(skin_content(SENSOR), "sensors"), "needs the field 'sensors'"),
         (skin_content(), "at least one sensor"),
         (
+            {**skin_content(SENSOR), "type": {}},
+            "a skin: unknown field 'type'; did you mean 'types'",
+        ),
+        (
+            skin_content(SENSOR, {**SENSOR, "range": -1}, SENSOR),
+            "range of sensor 1 must be positive, got -1",
+        ),
+        (
             skin_content(SENSOR, without(SENSOR, "normal")),
             "sensor 1 lacks the field 'normal'",
         ),
@@ -154,6 +162,7 @@ def skin_content(*sensors: object) -> dict:
                 f"type 'a': {message}",
             )
             for entry, message in (
+                ({"coverage": ["ray"]}, "'coverage' must be one of field, ray"),
                 ({"grid": 5}, r"'grid' must be like \[8, 8\], got 5"),
                 ({"grid": [8.5, 8]}, "grid must be two positive integers"),
                 ({"fov_deg": "63"}, "'fov_deg' must be like 63.0, got '63'"),
