@@ -29,6 +29,7 @@ from egoskin.approaches import (
     trace,
     unit_vectors,
 )
+from egoskin.draws import check_seed
 from egoskin.envs.throws import ThrowConfig
 from egoskin.robots import RobotConfig
 from egoskin.sensors import Skin
@@ -263,14 +264,15 @@ def analyse(
         progress: Told what is in work, and how much of it is done.
 
     Raises:
-        ValueError: If there is no coverage, range or throw, or a range is not positive
-            and finite.
+        ValueError: If there is no coverage, range or throw, a range is not positive
+            and finite, or the seed is none.
     """
     if not coverages or not ranges:
         raise ValueError("an analysis needs at least one coverage and one range")
     every = [*ranges, *skin.range[~np.isnan(skin.range)].tolist()]
     if not all(0 < r < math.inf for r in every):
         raise ValueError(f"ranges must be positive and finite, got {every}")
+    check_seed(seed)
     if num_throws < 1:
         raise ValueError(f"num_throws must be at least 1, got {num_throws}")
     body, ball = StandingRobot(robot), Sphere(radius=throws.radius)

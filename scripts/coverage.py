@@ -41,12 +41,14 @@ from egoskin.analysis import Analysis, analyse
 from egoskin.cli import clear_errors, to_plain
 from egoskin.envs.physics import PhysicsConfig
 from egoskin.envs.throws import ThrowConfig
+from egoskin.film import check_path
 from egoskin.robots import ROBOTS
 from egoskin.sensors import Field, Ray
 from egoskin.sensors.config import SkinConfig
 
 # Cells whose warning differs for fewer hits than this see alike.
 ALIKE = 0.05
+PICTURE_SUFFIXES = (".png", ".jpg", ".svg", ".pdf")
 BLIND, NOWHERE = "#c1272d", "#e6e6e6"
 
 
@@ -77,7 +79,7 @@ class CoverageConfig:
     seed: int = 0
     """Seed of the throws and of the points on the surface."""
     out: Path = Path("coverage.png")
-    """Picture to write."""
+    """Picture to write, .png, .jpg, .svg or .pdf."""
     json: Path = Path("coverage.json")
     """All figures, to write."""
 
@@ -224,6 +226,9 @@ def draw(analysis: Analysis, report: dict[str, Any], title: str) -> Figure:
 def main(args: list[str]) -> None:
     """Run the command."""
     config = tyro.cli(CoverageConfig, args=args, description=__doc__)
+    # Before the minutes that the analysis takes.
+    check_path(config.out, PICTURE_SUFFIXES)
+    check_path(config.json, (".json",))
     robot = ROBOTS[config.robot]
     skin = config.skin.build(robot)
     physics = PhysicsConfig()

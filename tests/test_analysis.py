@@ -385,6 +385,7 @@ def test_nothing_is_seen_after_the_contact(thrown):
         ({"ranges": []}, "at least one coverage and one range"),
         ({"coverages": {}}, "at least one coverage and one range"),
         ({"num_throws": 0}, "num_throws must be at least 1"),
+        ({"seed": -1}, r"seed must be in \[0, 2\*\*32\), got -1"),
     ],
 )
 def test_what_cannot_be_analysed_is_refused(skin, changes, message):
@@ -435,11 +436,24 @@ def test_the_command_has_the_body_in_the_way_if_asked(tmp_path, monkeypatch):
     assert less["directions_seen"] < more["directions_seen"]
 
 
-def test_bad_input_to_the_command_is_one_clear_message(tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (["--ranges", "-1"], "ranges must be positive"),
+        (["--out", "coverage.mp4"], "coverage.mp4 must end in .png or .jpg"),
+        (["--json", "none/coverage.json"], "there is no folder none"),
+    ],
+)
+def test_bad_input_to_the_command_is_one_clear_message(
+    args, message, tmp_path, monkeypatch, capsys
+):
     pytest.importorskip("matplotlib")
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as ended:
-        run_script(monkeypatch, "--ranges", "-1")
+        run_script(monkeypatch, *args)
     assert ended.value.code == 2
-    assert "ranges must be positive" in capsys.readouterr().err
+    said = capsys.readouterr()
+    assert message in said.err
+    # Told before the analysis, not after it.
+    assert not said.out
     assert not list(tmp_path.iterdir())

@@ -450,7 +450,16 @@ def test_names_of_keys_follow_the_reading():
         (lambda: DeadSensors(probability=NAN), r"DeadSensors.probability must be in"),
         (lambda: Latency(seconds=-1), "Latency.seconds must not be negative"),
         (lambda: SampleAndHold(rate_hz=0), "SampleAndHold.rate_hz must be positive"),
-        (lambda: Quantisation(step=0), "Quantisation.step must be positive, got 0"),
+        (lambda: SampleAndHold(rate_hz=INF), "rate_hz must be positive and finite"),
+        (lambda: Quantisation(step=0), "Quantisation.step must be positive"),
+        (lambda: Quantisation(step=INF), "step must be positive and finite, got inf"),
+        (lambda: Bias(offset=NAN), "Bias.offset and gain must be finite, got nan"),
+        (lambda: Noise(constant=INF), "Noise.constant must not be infinite, got inf"),
+        (lambda: Latency(seconds=INF), "Latency.seconds must not be infinite, got inf"),
+        (
+            lambda: replace(RangeLimits(), below="none"),
+            "below must be nothing or minimum, got 'none'",
+        ),
         (lambda: RangeLimits(minimum=2, maximum=1), "0 <= minimum < maximum, got 2"),
         (
             lambda: FalsePositives(probability=0.1, max_range=INF),

@@ -454,6 +454,24 @@ def test_the_frame_of_a_xacro_is_the_frame_of_the_sensor(
     np.testing.assert_allclose(skin.normal[0], (base @ own)[:, 2], atol=1e-9)
 
 
+def test_a_sensor_tag_left_open_is_read_as_if_closed(load):
+    # Seen in GenTact's exports: normal_z="..." and then <origin> without a > between.
+    tags = [sensor_tag(i, (0, 0, 1), 'xyz="0.1 0 0" rpy="0 0 0"') for i in (0, 1)]
+    closed = xacro("\n".join(tags))
+    left_open = closed.replace("><origin", "\n  <origin")
+    # The dermis is no sensor: it was closed.
+    left_open = left_open.replace('mesh_file}"\n', 'mesh_file}">\n')
+    options = {"parent": "left_elbow_link"}
+    same, skin = load(closed, **options), load(left_open, **options)
+    np.testing.assert_array_equal(skin.position, same.position)
+    np.testing.assert_array_equal(skin.normal, same.normal)
+    # Lines are still those of the file.
+    wrong = left_open.replace('normal_x="0.0"', 'normal_x="x"')
+    line = 1 + wrong[: wrong.index("<xacro:self_cap_sensor rob")].count("\n")
+    with pytest.raises(ValueError, match=f":{line}: normal_x must be a finite number"):
+        load(wrong, **options)
+
+
 def test_gentacts_own_frames_have_no_roll(load):
     # rpy as GenTact computes it: x = normalise(z_link x n), here (0, 1, 0).
     level = origin((0.1, 0, 0, np.pi / 2, 0, np.pi / 2))

@@ -77,6 +77,16 @@ def test_hold_last_by_hand():
     assert held == [0, 1, 2, 2, 2, 0, 5, 5]
 
 
+def test_what_sensors_of_any_kind_detect_is_held():
+    # A skin of two kinds has two detections.
+    signal = torch.tensor([[1.0], [2], [3]])
+    field = torch.tensor([[1], [0], [0]]).bool()
+    ray = torch.tensor([[0], [1], [0]]).bool()
+    data = stored([0, 0, 0], signal=signal, field=field, ray=ray)
+    hold = HoldLast(["signal", "field", "ray"])
+    assert hold(data)["last_signal"].tolist() == [[1], [2], [2]]
+
+
 def test_a_detected_zero_is_a_sight():
     signal, seen = torch.tensor([[1.0], [0.0]]), torch.ones(2, 1).bool()
     data = stored([0, 0], signal=signal, object_detected=seen)

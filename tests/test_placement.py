@@ -278,6 +278,7 @@ def test_darts_stick_unless_they_meet_one_that_stuck_before(seed, n, most):
     ("arguments", "message"),
     [
         ({"num_sensors": 0}, "must be positive, got 0"),
+        ({"seed": -1}, "seed of a placement must not be negative, got -1"),
         ({"links": ["torso_link", "chest"]}, "no link 'chest'"),
         ({"links": []}, "carry no collision shape"),
         ({"method": "grid"}, "method must be .* got 'grid'"),

@@ -14,6 +14,7 @@ from hypothesis.extra.numpy import arrays
 
 from egoskin.robots import H1_2
 from egoskin.sensors import Skin
+from egoskin.sensors.config import SkinConfig
 
 
 def make_skin(normal, **changes) -> Skin:
@@ -122,6 +123,14 @@ def skin_content(*sensors: object) -> dict:
         (without(skin_content(SENSOR), "sensors"), "needs the field 'sensors'"),
         (skin_content(), "at least one sensor"),
         (
+            {**skin_content(SENSOR), "type": {}},
+            "a skin: unknown field 'type'; did you mean 'types'",
+        ),
+        (
+            skin_content(SENSOR, {**SENSOR, "range": -1}, SENSOR),
+            "range of sensor 1 must be positive, got -1",
+        ),
+        (
             skin_content(SENSOR, without(SENSOR, "normal")),
             "sensor 1 lacks the field 'normal'",
         ),
@@ -154,6 +163,7 @@ def skin_content(*sensors: object) -> dict:
                 f"type 'a': {message}",
             )
             for entry, message in (
+                ({"coverage": ["ray"]}, "'coverage' must be one of field, ray"),
                 ({"grid": 5}, r"'grid' must be like \[8, 8\], got 5"),
                 ({"grid": [8.5, 8]}, "grid must be two positive integers"),
                 ({"fov_deg": "63"}, "'fov_deg' must be like 63.0, got '63'"),
@@ -167,6 +177,15 @@ def test_a_bad_file_is_refused_with_its_name_and_its_fault(tmp_path, content, me
     path.write_text(content if isinstance(content, str) else json.dumps(content))
     with pytest.raises(ValueError, match=f"bad.json: .*{message}"):
         Skin.load(path)
+
+
+def test_a_skin_of_another_robot_is_refused_though_its_links_are_named_alike(tmp_path):
+    path = tmp_path / "other.json"
+    path.write_text(json.dumps({**skin_content(SENSOR), "robot": "g1"}))
+    with pytest.raises(ValueError, match=r"other.json: made for the robot 'g1', not"):
+        SkinConfig(path=path).build(H1_2)
+    path.write_text(json.dumps(skin_content(SENSOR)))
+    assert SkinConfig(path=path).build(H1_2).links == ("torso_link",)
 
 
 def test_a_missing_file_is_refused_with_its_name():

@@ -99,6 +99,12 @@ def test_a_threshold_that_is_none_is_refused(threshold):
 # --- rewards --------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("prices", [{}, {"*": float("nan")}, {"*": float("inf")}])
+def test_prices_that_are_none_are_refused(prices):
+    with pytest.raises(ValueError, match="prices must be finite and at least one"):
+        ContactPenalty(LINKS, prices)
+
+
 def test_a_penalty_adds_up_the_prices_of_the_links_touched():
     transform = ContactPenalty(LINKS, {"*_arm": 0.5, "base": 2.0, "left_*": 0.25})
     state = TensorDict(

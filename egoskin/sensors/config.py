@@ -53,6 +53,12 @@ class SkinConfig:
                 robot, self.num_sensors, self.seed, method=self.placement
             )
         skin = Skin.load(self.path)
+        # Robots of one maker name their links alike.
+        if skin.robot != robot.name:
+            raise ValueError(
+                f"skin file {self.path}: made for the robot {skin.robot!r}, not "
+                f"{robot.name!r}; if it fits, change its field 'robot'"
+            )
         try:
             skin.check_links(robot.links)
         except ValueError as error:

@@ -81,12 +81,12 @@ class History(StatefulTransform):
 class HoldLast(StatefulTransform):
     """What was seen last: the signal while anything is detected, then its last value.
 
-    Reads ``signal [*B, F]`` (of `Localization`, for example) and ``object_detected
-    [*B, O]``; writes ``last_signal [*B, F]``, zero until something is detected in the
-    episode.
+    Reads ``signal [*B, F]`` (of `Localization`, for example) and any number of
+    ``object_detected [*B, O]`` (something is detected if one of them says so); writes
+    ``last_signal [*B, F]``, zero until something is detected in the episode.
 
     Args:
-        in_keys: Keys of the signal and of the detections.
+        in_keys: Keys of the signal and of the detections (one or more).
         out_keys: Key of the signal seen last.
     """
 
@@ -110,8 +110,9 @@ class HoldLast(StatefulTransform):
         self, rows: Tensor, inputs: Sequence[Tensor], state: Sequence[Tensor]
     ) -> list[Tensor]:
         """Return the signal where anything is detected, its last value elsewhere."""
-        signal, detected = inputs
-        return [torch.where(detected.any(-1, keepdim=True), signal, state[0])]
+        signal, *detections = inputs
+        detected = torch.stack([d.any(-1, keepdim=True) for d in detections]).any(0)
+        return [torch.where(detected, signal, state[0])]
 
     def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
         """Return the spec of the signal seen last."""

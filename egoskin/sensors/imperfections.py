@@ -35,10 +35,11 @@ def _hide(distance: Tensor, half: Tensor, probability: Tensor | float) -> Tensor
 
 def _check_not_negative(model: object, *names: str) -> None:
     for name in names:
-        if not getattr(model, name) >= 0:
+        value = getattr(model, name)
+        if not 0 <= value < math.inf:
+            wrong = "infinite" if value == math.inf else "negative"
             raise ValueError(
-                f"{type(model).__name__}.{name} must not be negative, "
-                f"got {getattr(model, name)}"
+                f"{type(model).__name__}.{name} must not be {wrong}, got {value}"
             )
 
 
@@ -64,8 +65,13 @@ class Bias(PointModel):
     """Standard deviation of the gain error from sensor to sensor [1]."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for a negative spread."""
+        """Raise ValueError for a negative spread, or what is not finite."""
         _check_not_negative(self, "offset_std", "gain_std")
+        if not (math.isfinite(self.offset) and math.isfinite(self.gain)):
+            raise ValueError(
+                f"Bias.offset and gain must be finite, got {self.offset} and "
+                f"{self.gain}"
+            )
 
     def change(self, distance: Tensor, places: Places, moment: Moment) -> Tensor:
         """Return the distances with the errors of their sensors [m], ``[n]``."""
@@ -273,7 +279,11 @@ class RangeLimits(PointModel):
     """What is read of something nearer than the minimum."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for limits that leave no range."""
+        """Raise ValueError for limits that leave no range, or an unknown word."""
+        if self.below not in ("nothing", "minimum"):
+            raise ValueError(
+                f"RangeLimits.below must be nothing or minimum, got {self.below!r}"
+            )
         if not 0 <= self.minimum < self.maximum:
             raise ValueError(
                 "RangeLimits must have 0 <= minimum < maximum, got "
@@ -295,9 +305,11 @@ class Quantisation(PointModel):
     """Distance between two neighbouring readings [m]."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for a step that is not positive."""
-        if not self.step > 0:
-            raise ValueError(f"Quantisation.step must be positive, got {self.step}")
+        """Raise ValueError for a step that is not positive and finite."""
+        if not 0 < self.step < math.inf:
+            raise ValueError(
+                f"Quantisation.step must be positive and finite, got {self.step}"
+            )
 
     def change(self, distance: Tensor, places: Places, moment: Moment) -> Tensor:
         """Return the nearest multiples [m], ``[n]``."""
@@ -316,10 +328,10 @@ class SampleAndHold(FrameModel):
     """Measurements of a sensor in a second [Hz]."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for a rate that is not positive."""
-        if not self.rate_hz > 0:
+        """Raise ValueError for a rate that is not positive and finite."""
+        if not 0 < self.rate_hz < math.inf:
             raise ValueError(
-                f"SampleAndHold.rate_hz must be positive, got {self.rate_hz}"
+                f"SampleAndHold.rate_hz must be positive and finite, got {self.rate_hz}"
             )
 
     def start(self, reading: Tensor, moment: Moment) -> State:

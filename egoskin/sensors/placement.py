@@ -143,7 +143,11 @@ def _num_darts(area: float, spacing: float, num_sensors: int | None) -> int:
 
 
 def _check(
-    num_sensors: int | None, method: str, spacing: float | None, stand_off: float
+    num_sensors: int | None,
+    seed: int,
+    method: str,
+    spacing: float | None,
+    stand_off: float,
 ) -> None:
     """Raise ValueError for arguments that are out of range or contradict each other."""
     if method not in ("area_uniform", "poisson_disk"):
@@ -159,6 +163,8 @@ def _check(
         raise ValueError("num_sensors=None needs a spacing to decide the number")
     if num_sensors is not None and num_sensors < 1:
         raise ValueError(f"the number of sensors must be positive, got {num_sensors}")
+    if seed < 0:
+        raise ValueError(f"the seed of a placement must not be negative, got {seed}")
     if not 0 <= stand_off < math.inf:
         raise ValueError(f"stand_off must be finite and not negative, got {stand_off}")
 
@@ -203,7 +209,7 @@ def place_sensors(
         ValueError: If an argument is out of its range, a link or pattern is not the
             robot's, the links show no surface, or the sensors do not fit.
     """
-    _check(num_sensors, method, spacing, stand_off)
+    _check(num_sensors, seed, method, spacing, stand_off)
     covered = tuple(robot.skin_links if links is None else links)
     weights = _link_weights(covered, density or {})
     if meshes is None:

@@ -26,6 +26,7 @@ _CONVENTIONS = {
     "range": "metres; sensors without range or type take those of the configuration",
     "radius": "metres, of the sensor itself",
 }
+_FIELDS = ("format", "robot", "conventions", "provenance", "types", "sensors")
 _OPTIONAL = ("range", "roll_deg", "radius", "type")
 # Unit normals must be unit to this.
 _UNIT_TOLERANCE = 1e-3
@@ -46,7 +47,7 @@ def _coverage(name: str, entry: object) -> Coverage:
         raise ValueError(f"type {name!r} must be an object, got {entry!r}")
     values = dict(entry)
     kind = values.pop("coverage", None)
-    if kind not in KINDS:
+    if not isinstance(kind, str) or kind not in KINDS:
         raise ValueError(
             f"type {name!r}: 'coverage' must be one of {', '.join(KINDS)}, got {kind!r}"
         )
@@ -144,8 +145,11 @@ class Skin:
                 object.__setattr__(self, name, np.full(number, default))
             elif array.shape != (number,):
                 raise ValueError(f"{name} must be ({number},), got {array.shape}")
-            elif (array <= 0).any() and name != "roll_deg":
-                raise ValueError(f"{name} must be positive, got {array.min()}")
+            elif name != "roll_deg" and (array <= 0).any():
+                worst = int((array <= 0).argmax())
+                raise ValueError(
+                    f"{name} of sensor {worst} must be positive, got {array[worst]}"
+                )
         if not np.isfinite(self.roll_deg).all():
             raise ValueError("roll_deg holds values that are not finite")
         if not self.coverage:
@@ -268,6 +272,8 @@ class Skin:
         if not isinstance(content, Mapping) or content.get("format") != _FORMAT:
             got = content.get("format") if isinstance(content, Mapping) else content
             raise ValueError(f"not a skin: 'format' must be {_FORMAT!r}, got {got!r}")
+        for name in content:
+            _check_known("a skin", name, _FIELDS)
         for name in ("robot", "sensors"):
             if name not in content:
                 raise ValueError(f"a skin needs the field {name!r}")

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import difflib
 import fnmatch
+import math
 from collections.abc import Mapping, Sequence
 
 import torch
@@ -97,7 +98,8 @@ class ContactPenalty(Transform):
         out_keys: Key of the reward.
 
     Raises:
-        ValueError: If a pattern matches no link.
+        ValueError: If a pattern matches no link, a price is not finite or there is
+            none.
     """
 
     _prices: Tensor
@@ -110,6 +112,8 @@ class ContactPenalty(Transform):
         out_keys: Sequence[NestedKey] = ("reward",),
     ) -> None:
         super().__init__(in_keys=list(in_keys), out_keys=list(out_keys))
+        if not prices or not all(map(math.isfinite, prices.values())):
+            raise ValueError(f"prices must be finite and at least one, got {prices}")
         parts = [price * _matching(links, [p]) for p, price in prices.items()]
         self.register_buffer("_prices", torch.stack(parts).sum(0))
 

@@ -17,6 +17,9 @@ from egoskin.sensors.gentact.source import Export, Links, Sensor, number, read_r
 # A normal and the frame beside it may differ by this [deg]: files rounded by hand.
 _SAME_DIRECTION = 2.0
 _SENSOR_TAGS = ("xacro:self_cap_sensor", "xacro:tof_sensor")
+# Some versions of the exporter leave out the > between a sensor's attributes and its
+# <origin>.
+_UNCLOSED_SENSOR = re.compile(r'(<xacro:\w+_sensor\s[^<>]*")(?=\s*<origin\s)')
 _SENSOR_JOINT = re.compile(r"_sensor_\d+_joint$")
 # GenTact's magnetic sensors sense no proximity.
 _MAGNETIC = "mag_sensor"
@@ -31,9 +34,9 @@ class Xml:
     def __init__(self, text: str, path: Path) -> None:
         self.path = path
         self._lines: dict[ElementTree.Element, int] = {}
-        body = text.lstrip()
+        body = _UNCLOSED_SENSOR.sub(r"\1>", text.lstrip())
         # GenTact writes a newline before the declaration, which XML forbids.
-        above = text[: len(text) - len(body)].count("\n")
+        above = text[: len(text) - len(text.lstrip())].count("\n")
         builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()
 
         def start(tag: str, attributes: dict[str, str]) -> None:
