@@ -37,7 +37,8 @@ class EvaluateConfig:
     episodes: int = 1024
     """Throw sequences in the bank."""
     throw: Literal["standard", "run"] = "standard"
-    """The standard throw whatever the run trained on, or the run's own."""
+    """The standard throw and ends of an episode whatever the run trained on, or the
+    run's own."""
     num_workers: int | None = None
     """Processes that simulate; None: the largest divisor of episodes <= cores."""
     behaviour: bool = False
@@ -79,6 +80,7 @@ def table(result: Evaluation, title: str) -> str:
         ("survival time (at most 10 s)", interval(result.survival_time, 1, "s")),
         ("ended within 3 s by a ball", share(result.ended_by_ball)),
         ("ended within 3 s by a fall", share(result.ended_by_fall)),
+        ("ended within 3 s by self-contact", share(result.ended_by_self_contact)),
         ("ended within 3 s by divergence", share(result.diverged)),
         ("first balls avoided", share(result.avoided.first_ball)),
         ("later balls avoided", share(result.avoided.later_balls)),
