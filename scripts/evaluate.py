@@ -19,7 +19,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from egoskin.behaviour import Behaviour, Motion, behave
-from egoskin.cli import clear_errors
+from egoskin.cli import clear_errors, counted
 from egoskin.evaluation import Estimate, Evaluation, evaluate, standard_task
 from egoskin.make import EnvConfig, check_num_workers
 from egoskin.policies import load_policy
@@ -171,7 +171,7 @@ def main(args: list[str]) -> None:
         print("\r\x1b[K", end="", file=sys.stderr)
     title = (
         f"{config.policy}: {policy.spec.frames:,} frames; bank {config.bank_seed} of "
-        f"{config.episodes} episodes, {config.throw} throw, physics at "
+        f"{counted(config.episodes, 'episode')}, {config.throw} throw, physics at "
     )
     print(table(result, title + physics_rate(env_config)))
     content = dataclasses.asdict(result)

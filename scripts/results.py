@@ -37,7 +37,7 @@ except ImportError:
 
 from egoskin.behaviour import behave
 from egoskin.checkpoint import write_file
-from egoskin.cli import clear_errors
+from egoskin.cli import clear_errors, counted
 from egoskin.evaluation import standard_task
 from egoskin.make import check_num_workers
 from egoskin.policies import load_policy
@@ -162,7 +162,8 @@ class Write:
         notes = self.results / "notes.md"
         hand = notes.read_text() if notes.is_file() else ""
         write_file(self.out, report(runs, pictures, hand).encode())
-        print(f"{self.out}: {len(runs)} runs, pictures {', '.join(pictures.values())}")
+        number = counted(len(runs), "run")
+        print(f"{self.out}: {number}, pictures {', '.join(pictures.values())}")
 
 
 def _json(content: object) -> bytes:
@@ -200,10 +201,9 @@ def draw(cells: dict[str, list[StoredRun]], out: Path) -> None:
 def _draw_cell(axes: Axes, name: str, runs: list[StoredRun], number: int) -> None:
     """Draw the mean and the range of one cell."""
     seen = curve(runs)
-    seeds = f"{len(runs)} seeds" if len(runs) > 1 else "1 seed"
     colour = _COLOURS[number % len(_COLOURS)]
     dash = _DASHES[number // len(_COLOURS) % len(_DASHES)]
-    label = f"{name} ({seeds})"
+    label = f"{name} ({counted(len(runs), 'seed')})"
     axes.plot(
         seen.hours, seen.mean, color=colour, linestyle=dash, linewidth=1.6, label=label
     )
