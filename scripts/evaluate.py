@@ -20,6 +20,7 @@ import tyro
 
 from egoskin.behaviour import Behaviour, Motion, behave
 from egoskin.cli import clear_errors, counted
+from egoskin.draws import check_seed
 from egoskin.evaluation import Estimate, Evaluation, evaluate, standard_task
 from egoskin.make import EnvConfig, check_num_workers
 from egoskin.policies import load_policy
@@ -51,8 +52,7 @@ class EvaluateConfig:
 
     def __post_init__(self) -> None:
         """Raise ValueError for values with which nothing can be played."""
-        if not 0 <= self.bank_seed < 2**32:
-            raise ValueError(f"bank_seed must be in [0, 2**32), got {self.bank_seed}")
+        check_seed(self.bank_seed, "bank_seed")
         check_num_workers(self.episodes, self.num_workers)
         if self.check_substeps is not None and self.check_substeps < 1:
             raise ValueError(

@@ -38,6 +38,7 @@ except ImportError:
 from egoskin.behaviour import behave
 from egoskin.checkpoint import write_file
 from egoskin.cli import clear_errors, counted
+from egoskin.draws import check_seed
 from egoskin.evaluation import standard_task
 from egoskin.make import check_num_workers
 from egoskin.policies import load_policy
@@ -86,8 +87,7 @@ class Add:
 
     def __post_init__(self) -> None:
         """Raise ValueError for values with which nothing can be stored."""
-        if not 0 <= self.bank_seed < 2**32:
-            raise ValueError(f"bank_seed must be in [0, 2**32), got {self.bank_seed}")
+        check_seed(self.bank_seed, "bank_seed")
         check_num_workers(self.episodes, self.num_workers)
         if self.name is not None and Path(self.name).name != self.name:
             raise ValueError(f"name must be the name of a folder, got {self.name!r}")
