@@ -175,10 +175,10 @@ class Thrower:
             ``[n]`` each.
         """
         n = len(draw.speed)
-        pose = tuple(x.expand(n, -1) for x in self._standing)
+        base_pose, joint_pos = (x.expand(n, -1) for x in self._standing)
         side = torch.stack((draw.azimuth.cos(), draw.azimuth.sin()), -1)
-        target = self._target(draw, *pose, side)
-        release = self.release(draw, pose[0], torch.zeros(n, 3), pose[1])
+        target = self._target(draw, base_pose, joint_pos, side)
+        release = self.release(draw, base_pose, torch.zeros(n, 3), joint_pos)
         velocity = release.velocity
         if self.config.flight == "ballistic":
             way = (target - release.position)[:, :2].norm(dim=-1)
