@@ -1,4 +1,4 @@
-"""What the scripts share: errors a user can act on, configurations as plain values."""
+"""What the scripts share: clear errors, wording, configurations as plain values."""
 
 from __future__ import annotations
 
@@ -29,6 +29,11 @@ def clear_errors() -> Iterator[None]:
         raise SystemExit(2) from None
     except KeyboardInterrupt:
         raise SystemExit(130) from None
+
+
+def counted(number: int, noun: str) -> str:
+    """Return a number with its noun: "1 worker", "2 workers"."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 def to_plain(value: Any) -> Any:

@@ -57,10 +57,10 @@ def philox(counter: Tensor, key: tuple[int, int]) -> Tensor:
     return torch.stack((c0, c1, c2, c3))
 
 
-def check_seed(seed: int) -> None:
+def check_seed(seed: int, name: str = "seed") -> None:
     """Raise ValueError for a seed that is not a 32-bit unsigned integer."""
     if not 0 <= seed <= _MASK:
-        raise ValueError(f"seed must be in [0, 2**32), got {seed}")
+        raise ValueError(f"{name} must be in [0, 2**32), got {seed}")
 
 
 def random_words(

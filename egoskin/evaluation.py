@@ -59,7 +59,7 @@ class Avoided:
 class Evaluation:
     """How a policy fares on a bank of throws.
 
-    ``success.mean + ended_by_ball + ended_by_fall + diverged`` is 1.
+    The success and the shares of the ends within 3 s add up to 1.
     """
 
     success: Estimate
@@ -70,6 +70,8 @@ class Evaluation:
     """Share of episodes ended by a ball within 3 s."""
     ended_by_fall: float
     """Share ended by a fall within 3 s."""
+    ended_by_self_contact: float
+    """Share ended within 3 s because the robot touched itself, where that ends it."""
     diverged: float
     """Share whose simulation failed within 3 s."""
     rigid_success: float
@@ -91,7 +93,9 @@ class Episodes:
     fallen: Tensor
     """Ended by a fall (and no ball), bool."""
     diverged: Tensor
-    """Ended by a failed simulation alone, bool."""
+    """Ended by a failed simulation (and neither), bool."""
+    self_contact: Tensor
+    """Ended by self-contact alone, bool."""
     arrived: Tensor
     """Balls that arrived: the first, later ones, ``[N, 2]``."""
     avoided: Tensor
@@ -152,8 +156,8 @@ def play_bank(
         )
     steps = torch.zeros(episodes, dtype=torch.int64)
     running = torch.ones(episodes, dtype=torch.bool)
-    ends = {k: torch.zeros(episodes, dtype=torch.bool) for k in ("hit", "fallen")}
-    ends["diverged"] = ends["hit"].clone()
+    causes = ("hit", "fallen", "diverged", "terminated")
+    ends = {k: torch.zeros(episodes, dtype=torch.bool) for k in causes}
     balls = {k: torch.zeros(episodes, 2) for k in ("balls_arrived", "balls_avoided")}
     try:
         root: TensorDictBase = env.reset()
@@ -183,20 +187,29 @@ def play_bank(
                 break
     finally:
         env.close()
+    hit, fallen, diverged, terminated = ends.values()
     return Episodes(
         steps=steps,
-        hit=ends["hit"],
-        fallen=ends["fallen"] & ~ends["hit"],
-        diverged=ends["diverged"] & ~ends["fallen"] & ~ends["hit"],
+        hit=hit,
+        fallen=fallen & ~hit,
+        diverged=diverged & ~fallen & ~hit,
+        # Nothing else terminates an episode.
+        self_contact=terminated & ~diverged & ~fallen & ~hit,
         arrived=balls["balls_arrived"],
         avoided=balls["balls_avoided"],
     )
 
 
 def standard_task(config: EnvConfig) -> EnvConfig:
-    """Return the configuration with the standard throw and episodes of 10 s."""
+    """Return the configuration with the standard throw and the standard episodes.
+
+    They last 10 s at most, and self-contact ends none.
+    """
     task = dataclasses.replace(
-        config.task, throws=ThrowConfig(), episode_length_s=_LONGEST
+        config.task,
+        throws=ThrowConfig(),
+        episode_length_s=_LONGEST,
+        self_contact_ends=False,
     )
     return dataclasses.replace(config, task=task)
 
@@ -215,7 +228,7 @@ def summarize(played: Episodes, rigid: Episodes, task: DodgeballConfig) -> Evalu
 
     def failed(episodes: Episodes) -> Tensor:
         ended = episodes.hit | episodes.fallen | episodes.diverged
-        return ended & (episodes.steps <= limit)
+        return (ended | episodes.self_contact) & (episodes.steps <= limit)
 
     def avoided(which: int) -> float | None:
         arrived = float(played.arrived[:, which].sum())
@@ -226,6 +239,7 @@ def summarize(played: Episodes, rigid: Episodes, task: DodgeballConfig) -> Evalu
         survival_time=mean_estimate(played.steps / control_hz),
         ended_by_ball=float((played.hit & early).double().mean()),
         ended_by_fall=float((played.fallen & early).double().mean()),
+        ended_by_self_contact=float((played.self_contact & early).double().mean()),
         diverged=float((played.diverged & early).double().mean()),
         rigid_success=1.0 - float(failed(rigid).double().mean()),
         avoided=Avoided(first_ball=avoided(0), later_balls=avoided(1)),

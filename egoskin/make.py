@@ -63,6 +63,8 @@ class EnvConfig:
     """What they measure."""
     privileged: Literal["objects", "velocity"] = "objects"
     """What the critic alone sees: also the balls, or (the paper's) the velocity."""
+    previous_action: bool = False
+    """Whether the actor, too, observes its action of the step before."""
     history: int = 1
     """Observations of this many steps, the present one included."""
 
@@ -136,8 +138,11 @@ def make_worker_env(
         # With a history, what is new goes by other names.
         suffix = "" if config.history == 1 else "_now"
         default = torch.from_numpy(robot.default_joint_pos)
+        felt = [*Proprioception.STATE_KEYS]
+        if config.previous_action:
+            felt.append("previous_action")
         transforms += [
-            Proprioception(default, out_keys=[f"observation{suffix}"]),
+            Proprioception(default, felt, out_keys=[f"observation{suffix}"]),
             Privileged(config.privileged, len(robot.joints), balls),
         ]
         if not sparse:

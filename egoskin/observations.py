@@ -17,43 +17,43 @@ from egoskin.transform import RowTransform
 class Proprioception(RowTransform):
     """Base angular velocity, joint positions and velocities, gravity.
 
-    Reads ``base_pose``, ``base_ang_vel_b``, ``joint_pos`` and ``joint_vel``; writes
-    ``observation [*B, 6 + 2 J]``: angular velocity [rad/s] 3, q - q_default [rad] J,
-    joint velocities [rad/s] J, unit gravity in the base frame 3.
+    Reads ``base_pose``, ``base_ang_vel_b``, ``joint_pos``, ``joint_vel`` and, if asked
+    to, ``previous_action``; writes ``observation [*B, 6 + 2 J]``: angular velocity
+    [rad/s] 3, q - q_default [rad] J, joint velocities [rad/s] J, unit gravity in the
+    base frame 3; and then the previous action J.
 
     Args:
         default_joint_pos: Default pose [rad], ``[J]``.
-        in_keys: Keys of the inputs, in the order above.
+        in_keys: Keys of the inputs, in the order above; the fifth may be left out.
         out_keys: Key of the observation.
     """
 
     _default: Tensor
+    STATE_KEYS = ("base_pose", "base_ang_vel_b", "joint_pos", "joint_vel")
+    """The inputs that it always reads."""
 
     def __init__(
         self,
         default_joint_pos: Tensor,
-        in_keys: Sequence[NestedKey] = (
-            "base_pose",
-            "base_ang_vel_b",
-            "joint_pos",
-            "joint_vel",
-        ),
+        in_keys: Sequence[NestedKey] = STATE_KEYS,
         out_keys: Sequence[NestedKey] = ("observation",),
     ) -> None:
         super().__init__(in_keys, out_keys)
         self.register_buffer("_default", default_joint_pos)
 
     def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
-        """Return the observation, ``[B, 6 + 2 J]``."""
-        base_pose, base_ang_vel_b, joint_pos, joint_vel = inputs
+        """Return the observation, ``[B, 6 + 2 J]`` or ``[B, 6 + 3 J]``."""
+        base_pose, base_ang_vel_b, joint_pos, joint_vel, *action = inputs
         down = base_pose.new_tensor([0.0, 0.0, -1.0]).expand_as(base_ang_vel_b)
         gravity_b = rotate_inverse(base_pose[:, 3:], down)
         deviation = joint_pos - self._default.to(joint_pos.dtype)
-        return (torch.cat((base_ang_vel_b, deviation, joint_vel, gravity_b), -1),)
+        parts = (base_ang_vel_b, deviation, joint_vel, gravity_b, *action)
+        return (torch.cat(parts, -1),)
 
     def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
         """Return the spec of the observation."""
-        size, dtype = 6 + 2 * len(self._default), spec[self.in_keys[2]].dtype
+        size = 6 + (len(self.in_keys) - 2) * len(self._default)
+        dtype = spec[self.in_keys[2]].dtype
         return (Unbounded(shape=torch.Size((*spec.shape, size)), dtype=dtype),)
 
 

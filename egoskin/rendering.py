@@ -162,6 +162,8 @@ def _ending(state: TensorDictBase) -> str | None:
         return "time limit"
     names = {"hit": "hit", "fallen": "fall", "diverged": "diverged"}
     reasons = [name for key, name in names.items() if state[key].item()]
+    if not reasons and state["terminated"].item():
+        return "self-contact"
     return " + ".join(reasons) or None
 
 

@@ -38,6 +38,7 @@ from egoskin.agents.ppo import PPOConfig
 from egoskin.checkpoint import PARTIAL, load_tensors, save_tensors, sync, write_file
 from egoskin.cli import changed_fields, from_plain, to_plain
 from egoskin.compilation import can_compile
+from egoskin.draws import check_seed
 from egoskin.events import EventFile
 from egoskin.make import EnvConfig, check_num_workers
 from egoskin.policies import CHECKPOINT_NAME
@@ -85,8 +86,7 @@ class TrainConfig:
                 raise ValueError(
                     f"{name} must be at least 1, got {getattr(self, name)}"
                 )
-        if not 0 <= self.seed < 2**32:
-            raise ValueError(f"seed must be in [0, 2**32), got {self.seed}")
+        check_seed(self.seed)
         if self.learner_threads is not None and self.learner_threads < 1:
             raise ValueError(
                 f"learner_threads must be at least 1, got {self.learner_threads}"

@@ -38,7 +38,7 @@ except ImportError:
     raise SystemExit(2) from None
 
 from egoskin.analysis import Analysis, analyse
-from egoskin.cli import clear_errors, to_plain
+from egoskin.cli import clear_errors, counted, to_plain
 from egoskin.envs.physics import PhysicsConfig
 from egoskin.envs.throws import ThrowConfig
 from egoskin.film import check_path
@@ -250,7 +250,8 @@ def main(args: list[str]) -> None:
     print_table(analysis, report)
     content = {"config": to_plain(config), "sensors": len(skin), **report}
     config.json.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
-    title = f"What {len(skin)} sensors on {robot.name} see"
+    verb = "sees" if len(skin) == 1 else "see"
+    title = f"What {counted(len(skin), 'sensor')} on {robot.name} {verb}"
     if config.occlusion:
         title += ", its body in the way"
     figure = draw(analysis, report, title)

@@ -19,7 +19,8 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from egoskin.behaviour import Behaviour, Motion, behave
-from egoskin.cli import clear_errors
+from egoskin.cli import clear_errors, counted
+from egoskin.draws import check_seed
 from egoskin.evaluation import Estimate, Evaluation, evaluate, standard_task
 from egoskin.make import EnvConfig, check_num_workers
 from egoskin.policies import load_policy
@@ -37,7 +38,8 @@ class EvaluateConfig:
     episodes: int = 1024
     """Throw sequences in the bank."""
     throw: Literal["standard", "run"] = "standard"
-    """The standard throw whatever the run trained on, or the run's own."""
+    """The standard throw and ends of an episode whatever the run trained on, or the
+    run's own."""
     num_workers: int | None = None
     """Processes that simulate; None: the largest divisor of episodes <= cores."""
     behaviour: bool = False
@@ -50,8 +52,7 @@ class EvaluateConfig:
 
     def __post_init__(self) -> None:
         """Raise ValueError for values with which nothing can be played."""
-        if not 0 <= self.bank_seed < 2**32:
-            raise ValueError(f"bank_seed must be in [0, 2**32), got {self.bank_seed}")
+        check_seed(self.bank_seed, "bank_seed")
         check_num_workers(self.episodes, self.num_workers)
         if self.check_substeps is not None and self.check_substeps < 1:
             raise ValueError(
@@ -79,6 +80,7 @@ def table(result: Evaluation, title: str) -> str:
         ("survival time (at most 10 s)", interval(result.survival_time, 1, "s")),
         ("ended within 3 s by a ball", share(result.ended_by_ball)),
         ("ended within 3 s by a fall", share(result.ended_by_fall)),
+        ("ended within 3 s by self-contact", share(result.ended_by_self_contact)),
         ("ended within 3 s by divergence", share(result.diverged)),
         ("first balls avoided", share(result.avoided.first_ball)),
         ("later balls avoided", share(result.avoided.later_balls)),
@@ -169,7 +171,7 @@ def main(args: list[str]) -> None:
         print("\r\x1b[K", end="", file=sys.stderr)
     title = (
         f"{config.policy}: {policy.spec.frames:,} frames; bank {config.bank_seed} of "
-        f"{config.episodes} episodes, {config.throw} throw, physics at "
+        f"{counted(config.episodes, 'episode')}, {config.throw} throw, physics at "
     )
     print(table(result, title + physics_rate(env_config)))
     content = dataclasses.asdict(result)

@@ -18,7 +18,7 @@ from types import FrameType
 import torch
 
 from egoskin.agents.ppo import NonFiniteError
-from egoskin.cli import clear_errors
+from egoskin.cli import clear_errors, counted
 from egoskin.make import check_num_workers
 from egoskin.progress import ProgressLine
 from egoskin.runs import Run, parse_config
@@ -50,8 +50,9 @@ def main(args: list[str]) -> None:
     run = Run.create(config) if config.resume is None else Run(config.resume, config)
     workers = check_num_workers(config.num_envs, config.num_workers)
     print(
-        f"run {run.path}: {config.num_envs} agents on {workers} workers, learner on "
-        f"{config.device} with {torch.get_num_threads()} threads"
+        f"run {run.path}: {counted(config.num_envs, 'agent')} on "
+        f"{counted(workers, 'worker')}, learner on {config.device} with "
+        f"{counted(torch.get_num_threads(), 'thread')}"
     )
     if run.config.compile_kernels:
         print("compiling the sensor kernels: a minute at the first start on a machine")

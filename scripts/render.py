@@ -29,6 +29,7 @@ except (AttributeError, ImportError, RuntimeError) as fault:
     raise SystemExit(2) from None
 
 from egoskin.cli import clear_errors
+from egoskin.draws import check_seed
 from egoskin.film import (
     FILM_SUFFIXES,
     check_path,
@@ -76,8 +77,7 @@ class RenderConfig:
         """Raise ValueError for what cannot be rendered or written."""
         check_path(self.out, FILM_SUFFIXES)
         check_path(self.sheet_path, (".png",))
-        if not 0 <= self.bank_seed < 2**32:
-            raise ValueError(f"bank_seed must be in [0, 2**32), got {self.bank_seed}")
+        check_seed(self.bank_seed, "bank_seed")
         if not self.slowdown > 0:
             raise ValueError(f"slowdown must be positive, got {self.slowdown}")
         if self.policy is not None and self.env != EnvConfig():

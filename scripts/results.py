@@ -37,7 +37,8 @@ except ImportError:
 
 from egoskin.behaviour import behave
 from egoskin.checkpoint import write_file
-from egoskin.cli import clear_errors
+from egoskin.cli import clear_errors, counted
+from egoskin.draws import check_seed
 from egoskin.evaluation import standard_task
 from egoskin.make import check_num_workers
 from egoskin.policies import load_policy
@@ -86,8 +87,7 @@ class Add:
 
     def __post_init__(self) -> None:
         """Raise ValueError for values with which nothing can be stored."""
-        if not 0 <= self.bank_seed < 2**32:
-            raise ValueError(f"bank_seed must be in [0, 2**32), got {self.bank_seed}")
+        check_seed(self.bank_seed, "bank_seed")
         check_num_workers(self.episodes, self.num_workers)
         if self.name is not None and Path(self.name).name != self.name:
             raise ValueError(f"name must be the name of a folder, got {self.name!r}")
@@ -162,7 +162,8 @@ class Write:
         notes = self.results / "notes.md"
         hand = notes.read_text() if notes.is_file() else ""
         write_file(self.out, report(runs, pictures, hand).encode())
-        print(f"{self.out}: {len(runs)} runs, pictures {', '.join(pictures.values())}")
+        number = counted(len(runs), "run")
+        print(f"{self.out}: {number}, pictures {', '.join(pictures.values())}")
 
 
 def _json(content: object) -> bytes:
@@ -200,10 +201,9 @@ def draw(cells: dict[str, list[StoredRun]], out: Path) -> None:
 def _draw_cell(axes: Axes, name: str, runs: list[StoredRun], number: int) -> None:
     """Draw the mean and the range of one cell."""
     seen = curve(runs)
-    seeds = f"{len(runs)} seeds" if len(runs) > 1 else "1 seed"
     colour = _COLOURS[number % len(_COLOURS)]
     dash = _DASHES[number // len(_COLOURS) % len(_DASHES)]
-    label = f"{name} ({seeds})"
+    label = f"{name} ({counted(len(runs), 'seed')})"
     axes.plot(
         seen.hours, seen.mean, color=colour, linestyle=dash, linewidth=1.6, label=label
     )

@@ -26,7 +26,7 @@ import torch
 import tyro
 from tensordict import TensorDict
 
-from egoskin.cli import clear_errors
+from egoskin.cli import clear_errors, counted
 from egoskin.film import check_path, save_picture
 from egoskin.kinematics import LinkKinematics
 from egoskin.rendering import CameraConfig, Painter
@@ -165,7 +165,7 @@ class Export:
         skin = Skin.load(self.skin)
         lost = save_gentact(skin, self.out)
         note = f"; GenTact's format does not hold {', '.join(lost)}" if lost else ""
-        print(f"{self.out}: {len(skin)} sensors{note}")
+        print(f"{self.out}: {counted(len(skin), 'sensor')}{note}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -224,7 +224,7 @@ def table(skin: Skin, title: str) -> str:
         f"  {link:<{widths[0]}}  {number:>{widths[1]}}  {kind:<{widths[2]}}  {reach}"
         for link, number, kind, reach in rows
     ]
-    head = f"{title}: {len(skin)} sensors on links of {skin.robot}"
+    head = f"{title}: {counted(len(skin), 'sensor')} on links of {skin.robot}"
     notes = [
         "  " + textwrap.shorten(f"{name}: {value}", 100, placeholder=" ...")
         for name, value in skin.provenance.items()

@@ -24,7 +24,7 @@ import torch
 import tyro
 
 from egoskin.checkpoint import load_tensors
-from egoskin.cli import clear_errors
+from egoskin.cli import clear_errors, counted
 from egoskin.make import EnvConfig
 from egoskin.runs import Run, TrainConfig, parse_config
 from egoskin.training import open_trainer, train
@@ -108,21 +108,22 @@ def resumed(config: TrainConfig, iterations: int) -> str:
 def agree(config: TrainConfig, folder: Path, title: str, half: int) -> bool:
     """Print the hash of each way to train; return whether they are equal."""
     odd = config.num_envs % 2
-    print(f"{title}, {config.num_envs} agents", flush=True)
+    print(f"{title}, {counted(config.num_envs, 'agent')}", flush=True)
     hashes = []
 
     def show(what: str, value: str) -> None:
-        rows = config.num_envs // workers
-        print(f"  {value[:32]}  {workers} workers x {rows} rows, {what}", flush=True)
+        rows = counted(config.num_envs // workers, "row")
+        where = f"{counted(workers, 'worker')} x {rows}"
+        print(f"  {value[:32]}  {where}, {what}", flush=True)
         hashes.append(value)
 
     for workers, threads in _ODD_SPLITS if odd else _SPLITS:
         name = f"{title}-{config.num_envs}-{workers}".replace(" ", "-")
         split = dataclasses.replace(config, num_workers=workers, run_dir=folder / name)
-        show(f"{threads} physics threads", whole(split, threads))
+        show(counted(threads, "physics thread"), whole(split, threads))
         if workers == 2:
             again = dataclasses.replace(split, run_dir=folder / f"{name}-resumed")
-            show(f"resumed after {half} rollouts", resumed(again, half))
+            show(f"resumed after {counted(half, 'rollout')}", resumed(again, half))
     return len(set(hashes)) == 1
 
 

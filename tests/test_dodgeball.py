@@ -332,6 +332,25 @@ def test_a_hit_in_the_last_step_terminates(chest):
     assert not step["truncated"].any()
 
 
+@pytest.mark.parametrize("ends", [False, True])
+def test_self_contact_ends_an_episode_only_if_asked(ends):
+    env = make(2, hold=True, throws=MISS, self_contact_ends=ends)
+    root = env.reset()
+    # The left arm of row 0 in the trunk, as it is from -0.2 rad on.
+    joint_pos = DEFAULT.clone()
+    joint_pos[H1_2.joints.index("left_shoulder_roll_joint")] = -0.4
+    env.physics.reset(np.array([0]), root["base_pose"][:1], joint_pos[None])
+    step, root = advance(env, root)
+    assert step["self_contact"][:, 0].tolist() == [True, False]
+    assert step["terminated"][:, 0].tolist() == [ends, False]
+    for key in ("hit", "fallen", "diverged", "truncated"):
+        assert not step[key].any()
+    # The end pays no survival, like any other.
+    survival = step["reward_terms"][:, TERMS.index("survival")]
+    assert (survival == 0).tolist() == [ends, False]
+    assert root["episode_step"][:, 0].tolist() == [0 if ends else 1, 1]
+
+
 def test_feet_on_the_floor_are_what_a_standing_robot_feels():
     env = make(2, throws=MISS)
     root = env.reset()
@@ -600,6 +619,13 @@ def test_the_reward_does_not_depend_on_balls_that_do_not_touch():
         ({"action_scale": 0.0}, "action_scale must be positive, got 0.0"),
         ({"episode_length_s": 0.01}, "at least one control step, got 0.01"),
         ({"start_joint_noise": -0.1}, "start_joint_noise must not be negative"),
+        (
+            {
+                "self_contact_ends": True,
+                "physics": PhysicsConfig(self_collision=False),
+            },
+            "self_contact_ends needs physics.self_collision",
+        ),
     ],
 )
 def test_a_task_that_makes_no_episode_is_refused(changes, message):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import pytest
@@ -11,7 +12,6 @@ from egoskin.envs.dodgeball import DodgeballConfig
 from egoskin.envs.throws import ThrowConfig
 from egoskin.evaluation import (
     Episodes,
-    evaluate,
     mean_estimate,
     play_bank,
     standard_task,
@@ -42,32 +42,40 @@ def flags(*values: int) -> torch.Tensor:
     return torch.tensor(values) > 0
 
 
-def test_figures_of_five_episodes_by_hand():
+def test_figures_of_six_episodes_by_hand():
     # At 60 Hz 3 s are 180 steps: a ball at 100, a fall at 180, a ball at 181 (after
-    # the 3 s: a success), a divergence at 5, and one that lasts the 10 s.
+    # the 3 s: a success), a divergence at 5, one that lasts the 10 s, and one that
+    # self-contact ends at 60.
     played = Episodes(
-        steps=torch.tensor([100, 180, 181, 5, 600]),
-        hit=flags(1, 0, 1, 0, 0),
-        fallen=flags(0, 1, 0, 0, 0),
-        diverged=flags(0, 0, 0, 1, 0),
-        arrived=torch.tensor([[1.0, 0], [1, 0], [1, 1], [0, 0], [1, 5]]),
-        avoided=torch.tensor([[0.0, 0], [1, 0], [1, 0], [0, 0], [1, 5]]),
+        steps=torch.tensor([100, 180, 181, 5, 600, 60]),
+        hit=flags(1, 0, 1, 0, 0, 0),
+        fallen=flags(0, 1, 0, 0, 0, 0),
+        diverged=flags(0, 0, 0, 1, 0, 0),
+        self_contact=flags(0, 0, 0, 0, 0, 1),
+        arrived=torch.tensor([[1.0, 0], [1, 0], [1, 1], [0, 0], [1, 5], [0, 0]]),
+        avoided=torch.tensor([[0.0, 0], [1, 0], [1, 0], [0, 0], [1, 5], [0, 0]]),
     )
     rigid = Episodes(
-        steps=torch.full((5,), 50),
-        hit=flags(1, 1, 1, 1, 0),
-        fallen=flags(0, 0, 0, 0, 0),
-        diverged=flags(0, 0, 0, 0, 0),
-        arrived=torch.zeros(5, 2),
-        avoided=torch.zeros(5, 2),
+        steps=torch.full((6,), 50),
+        hit=flags(1, 1, 1, 1, 0, 1),
+        fallen=flags(0, 0, 0, 0, 0, 0),
+        diverged=flags(0, 0, 0, 0, 0, 0),
+        self_contact=flags(0, 0, 0, 0, 0, 0),
+        arrived=torch.zeros(6, 2),
+        avoided=torch.zeros(6, 2),
     )
     result = summarize(played, rigid, DodgeballConfig())
-    assert result.success.mean == 0.4
-    shares = (result.ended_by_ball, result.ended_by_fall, result.diverged)
-    assert shares == pytest.approx((0.2, 0.2, 0.2))
+    assert result.success.mean == pytest.approx(2 / 6)
+    shares = (
+        result.ended_by_ball,
+        result.ended_by_fall,
+        result.ended_by_self_contact,
+        result.diverged,
+    )
+    assert shares == pytest.approx([1 / 6] * 4)
     assert result.success.mean + sum(shares) == pytest.approx(1.0)
-    assert result.rigid_success == pytest.approx(0.2)
-    mean = (100 + 180 + 181 + 5 + 600) / 5 / 60
+    assert result.rigid_success == pytest.approx(1 / 6)
+    mean = (100 + 180 + 181 + 5 + 600 + 60) / 6 / 60
     assert result.survival_time.mean == pytest.approx(mean)
     assert result.avoided.first_ball == pytest.approx(3 / 4)
     assert result.avoided.later_balls == pytest.approx(5 / 6)
@@ -80,6 +88,7 @@ def test_nothing_arrived_is_not_a_share():
         hit=none,
         fallen=~none,
         diverged=none,
+        self_contact=none,
         arrived=torch.zeros(1, 2),
         avoided=torch.zeros(1, 2),
     )
@@ -88,8 +97,9 @@ def test_nothing_arrived_is_not_a_share():
 
 def test_the_standard_throw_replaces_the_throw_of_the_run():
     own = ThrowConfig(lead=0.0, flight="straight", speed=(1.0, 2.0))
-    config = EnvConfig(task=DodgeballConfig(throws=own, action_scale=0.3))
-    standard = standard_task(config)
+    task = DodgeballConfig(throws=own, action_scale=0.3, self_contact_ends=True)
+    standard = standard_task(EnvConfig(task=task))
+    assert not standard.task.self_contact_ends
     assert standard.task.throws == ThrowConfig()
     assert standard.task.action_scale == 0.3
 
@@ -103,7 +113,7 @@ def make_case() -> dict:
     }
 
 
-def test_a_bank_gives_the_same_figures_for_1_2_and_4_workers():
+def test_a_bank_goes_the_same_way_with_1_2_and_4_workers():
     case = make_case()
     torch.manual_seed(0)
     weights = 0.5 * torch.randn(64, 21)
@@ -116,13 +126,35 @@ def test_a_bank_gives_the_same_figures_for_1_2_and_4_workers():
         def forward(self, td):
             return policy(td)
 
-    results = [
-        evaluate(Module(), **case, bank_seed=3, num_workers=n) for n in (1, 2, 4)
-    ]
-    assert results[0] == results[1] == results[2]
-    assert results[0].episodes == 64
+    first, *others = (
+        play_bank(Module(), **case, bank_seed=3, num_workers=n) for n in (1, 2, 4)
+    )
+    for other in others:
+        for field in dataclasses.fields(Episodes):
+            one, two = getattr(first, field.name), getattr(other, field.name)
+            assert torch.equal(one, two), field.name
+    assert len(first.steps) == 64
     # Every standard throw meets a robot that does not move.
-    assert results[0].rigid_success <= 0.01
+    rigid = play_bank(None, **case, bank_seed=3, num_workers=1, hold=True)
+    assert summarize(first, rigid, DodgeballConfig()).rigid_success <= 0.01
+
+
+def test_ends_by_self_contact_are_told_apart():
+    config = EnvConfig(task=DodgeballConfig(self_contact_ends=True))
+    skin = config.skin.build(config.robot_config)
+    inwards = torch.zeros(32, 21)
+    inwards[:16, config.robot_config.joints.index("left_shoulder_roll_joint")] = -1.0
+
+    class Module(torch.nn.Module):
+        def forward(self, td):
+            return td.set("action", inwards)
+
+    played = play_bank(Module(), config, skin, bank_seed=0, episodes=32, num_workers=1)
+    assert played.self_contact[:16].all()
+    assert not played.self_contact[16:].any()
+    # Every episode has one cause of its end.
+    causes = (played.hit, played.fallen, played.diverged, played.self_contact)
+    assert (torch.stack(causes).sum(0) == 1).all()
 
 
 def test_another_bank_seed_is_another_bank():

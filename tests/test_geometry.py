@@ -10,27 +10,15 @@ import torch
 
 from egoskin.robots import H1_2
 from egoskin.sensors import FieldSensor, Ray, RaySensor
-from egoskin.shapes import Box, Capsule, Ellipsoid, Sphere
+from sensing import KEYS, SHAPES, measure
 
 RANGE = 1.5
-SHAPES = (
-    Sphere(radius=0.25),
-    Box(half_extents=(0.1, 0.2, 0.3)),
-    Capsule(radius=0.1, half_length=0.3),
-    Ellipsoid(semi_axes=(0.4, 0.1, 0.25)),
-)
-KEYS = ("base_pose", "joint_pos", "object_pose", "object_active")
 SMALL = partial(RaySensor, coverage=Ray(grid=(4, 4)))
 every_kind = pytest.mark.parametrize(
     "kind",
     [FieldSensor, SMALL, partial(SMALL, cull=False)],
     ids=["field", "ray", "dense ray"],
 )
-
-
-def measure(sensor, state):
-    """(distance, detected) of a state."""
-    return sensor.compute(*(state[key] for key in KEYS))
 
 
 @pytest.mark.parametrize("key", KEYS[:3])

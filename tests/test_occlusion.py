@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from egoskin.kinematics import rotate_inverse
 from egoskin.robots import H1_2
 from egoskin.sensors import FieldSensor, Ray, RaySensor, Skin, occlusion
 from egoskin.shapes import Box, Capsule, Ellipsoid, Sphere
+from sensing import SEED, measure, turned
 
 RANGE = 2.0
 SHAPES = (
@@ -25,22 +25,13 @@ SHAPES = (
     Ellipsoid(semi_axes=(0.2, 0.1, 0.15)),
 )
 BALL = SHAPES[0]
-KEYS = ("base_pose", "joint_pos", "object_pose", "object_active")
-SEED = st.integers(0, 2**32 - 1)
 WIDE = Ray(grid=(4, 4), fov_deg=120)
 BODY = H1_2.primitives
 
 
-def measure(sensor, state):
-    """(distance, detected) of a state."""
-    return sensor.compute(*(state[key] for key in KEYS))
-
-
 def crowd(random_state, seed: int, rows: int = 6):
     """States in float64 with four active objects, turned anyhow."""
-    state = random_state(rows, seed, torch.float64, objects=4)
-    quat = torch.from_numpy(np.random.default_rng(seed).normal(size=(rows, 4, 4)))
-    state["object_pose"][..., 3:] = torch.nn.functional.normalize(quat, dim=-1)
+    state = turned(random_state(rows, seed, torch.float64, objects=4), seed)
     state["object_active"][:] = True
     return state
 

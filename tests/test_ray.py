@@ -17,40 +17,21 @@ from hypothesis import strategies as st
 from egoskin.kinematics import rotate
 from egoskin.robots import H1_2, build_chain
 from egoskin.sensors import BeamMinimum, Field, FieldSensor, Ray, RaySensor, Skin
-from egoskin.shapes import Box, Capsule, Ellipsoid, Sphere, shape_of
+from egoskin.shapes import Box, Sphere, shape_of
+from sensing import (
+    KEYS,
+    KINDS,
+    SEED,
+    SHAPES,
+    assert_same_bits,
+    assert_same_bits_in_any_batch,
+    measure,
+    turned,
+)
 
 RANGE = 1.5
-KINDS = ("sphere", "box", "capsule", "ellipsoid")
-SHAPES = (
-    Sphere(radius=0.25),
-    Box(half_extents=(0.1, 0.2, 0.3)),
-    Capsule(radius=0.1, half_length=0.3),
-    Ellipsoid(semi_axes=(0.4, 0.1, 0.25)),
-)
 every_shape = pytest.mark.parametrize("shape", SHAPES, ids=KINDS)
-KEYS = ("base_pose", "joint_pos", "object_pose", "object_active")
-SEED = st.integers(0, 2**32 - 1)
 SMALL = Ray(grid=(4, 4))
-
-
-def measure(sensor, state):
-    """(distance, detected) of a state."""
-    return sensor.compute(*(state[key] for key in KEYS))
-
-
-def assert_same_bits(one, other):
-    """Equal, NaN with NaN."""
-    for a, b in zip(one, other, strict=True):
-        torch.testing.assert_close(a, b, rtol=0, atol=0, equal_nan=True)
-
-
-def turned(state, seed: int):
-    """The state with its objects turned anyhow."""
-    rng = np.random.default_rng(seed)
-    quat = torch.from_numpy(rng.normal(size=(*state["object_active"].shape, 4)))
-    quat = torch.nn.functional.normalize(quat, dim=-1)
-    pose = state["object_pose"]
-    return state.set("object_pose", torch.cat((pose[..., :3], quat.to(pose)), -1))
 
 
 def draw_skin(skin: Skin, rng) -> Skin:
@@ -439,11 +420,7 @@ def test_reduced_is_the_minimum_of_the_grid(crowd):
 def test_a_row_has_the_same_bits_in_any_batch(crowd):
     mixed, state = crowd
     sensor = RaySensor(mixed, H1_2.chain, SHAPES, RANGE)
-    result = measure(sensor, state)
-    for size in (1, 5, 27, 32):
-        for start in (0, 3, 69):
-            rows = slice(start, start + size)
-            assert_same_bits(measure(sensor, state[rows]), [x[rows] for x in result])
+    assert_same_bits_in_any_batch(sensor, state)
 
 
 def test_readings_go_into_a_tensor_that_exists(crowd):

@@ -22,6 +22,7 @@ from egoskin.rendering import (
     CameraConfig,
     Painter,
     RenderingError,
+    _ending,
     closest_point,
     render_episode,
 )
@@ -171,6 +172,23 @@ def test_an_episode_shows_lines_only_in_range(
     assert all((f.num_detecting == 64) == shows for f in frames)
     assert all((count_blue(f) > 0) == shows for f in frames)
     assert [f.ending for f in frames] == [None] * 6 + ["cut"]
+
+
+@pytest.mark.parametrize(
+    ("flags", "expected"),
+    [
+        ((), None),
+        (("truncated",), "time limit"),
+        (("self_contact",), None),
+        (("terminated", "self_contact"), "self-contact"),
+        (("terminated", "self_contact", "fallen"), "fall"),
+        (("terminated", "hit", "fallen"), "hit + fall"),
+    ],
+)
+def test_the_end_of_an_episode_is_named(flags, expected):
+    keys = ("truncated", "terminated", "hit", "fallen", "diverged", "self_contact")
+    state = TensorDict({key: torch.tensor([key in flags]) for key in keys})
+    assert _ending(state) == expected
 
 
 @pytest.mark.usefixtures("painter")

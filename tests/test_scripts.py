@@ -117,6 +117,7 @@ def test_an_evaluation_has_the_figures_promised(trained: Path, tmp_path: Path):
         "survival_time",
         "ended_by_ball",
         "ended_by_fall",
+        "ended_by_self_contact",
         "diverged",
         "rigid_success",
         "avoided",

@@ -43,6 +43,8 @@ def test_a_placed_skin_is_a_file_that_training_reads(run):
     assert "skin.json: 20 sensors" in out
     run("place", "--num-sensors", "20", "--seed", "3", "--out", "again.json")
     assert Path("again.json").read_bytes() == Path("skin.json").read_bytes()
+    one = run("place", "--num-sensors", "1", "--out", "one.json")
+    assert one.startswith("one.json: 1 sensor on links of h1_2\n")
 
 
 def test_the_options_of_a_placement_reach_it(run):

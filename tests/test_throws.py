@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from egoskin.draws import Stream, uniform
 from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
 from egoskin.envs.physics import Physics, PhysicsConfig, build_scene
 from egoskin.envs.throws import Release, ThrowConfig, Thrower
@@ -265,6 +266,94 @@ def test_a_vertical_fall_of_the_height_by_hand():
     torch.testing.assert_close(speed, torch.tensor([6.297600]))
 
 
+# --- total speed ----------------------------------------------------------------
+
+
+def at_standing(thrower: Thrower, drawn) -> tuple[torch.Tensor, Release]:
+    """Points aimed at and throws at robots in the default pose, all at one place."""
+    n = len(drawn.speed)
+    base_pose = torch.tensor([0, 0, H1_2.default_base_height, 1, 0, 0, 0]).expand(n, 7)
+    joint_pos = DEFAULT.expand(n, -1)
+    release = thrower.release(drawn, base_pose, torch.zeros(n, 3), joint_pos)
+    return aim_points(thrower, drawn, base_pose, joint_pos), release
+
+
+@pytest.mark.parametrize("aim", ["body", "box"])
+def test_a_total_speed_is_that_of_the_lower_arc_to_a_standing_robot(aim):
+    config = ThrowConfig(aim=aim, speed_is="total")
+    thrower = make(config)
+    drawn = draw(thrower)
+    target, release = at_standing(thrower, drawn)
+    assert closest(fly(release, config), target, torch.zeros(N, 3)).max() < 0.01
+    # Each is one of its 32 draws: eight random numbers each, the fourth the speed.
+    zeros = torch.zeros(N, dtype=torch.int64)
+    u = uniform(0, Stream.THROW, torch.arange(N), zeros, zeros, 8 * 32)
+    tries = 4 + 4 * u.unflatten(-1, (32, 8))[..., 3]
+    # Of the parabola, which the integrator's speed is half a step of gravity above.
+    velocity = release.velocity.clone()
+    velocity[:, 2] -= 9.81 * PHYSICS.timestep / 2
+    speed = velocity.norm(dim=-1)
+    assert ((tries - speed[:, None]).abs().amin(-1) < 1e-4).all()
+    assert len(set(speed.tolist())) == N
+    # The lower arc: its time is below that of the slowest throw, sqrt(2 way / g).
+    gap = target - release.position
+    time = gap[:, :2].norm(dim=-1) / velocity[:, :2].norm(dim=-1)
+    assert (time.square() < 2 * gap.norm(dim=-1) / 9.81).all()
+
+
+def test_draws_of_a_total_speed_that_cannot_arrive_are_drawn_again():
+    n = 4096
+    plain, total = make(ThrowConfig()), make(ThrowConfig(speed_is="total"))
+    once, again = draw(plain, n), draw(total, n)
+    target, release = at_standing(plain, once)
+    gap = target - release.position
+    across, rise = gap[:, :2].norm(dim=-1), gap[:, 2]
+    # The highest point that a ball of speed s reaches at a distance r:
+    # s^2 / 2 g - g r^2 / 2 s^2 (the parabola that envelops all throws).
+    s2 = once.speed.square()
+    arrives = rise < s2 / 19.62 - 9.81 * across.square() / (2 * s2)
+    assert 0.45 < arrives.float().mean() < 0.52
+    for name in ("azimuth", "distance", "height", "interval"):
+        kept = getattr(once, name) == getattr(again, name)
+        assert torch.equal(kept, arrives), name
+    assert torch.equal((once.target == again.target).all(-1), arrives)
+
+
+@pytest.mark.parametrize(
+    ("drawn", "horizontal"),
+    [
+        # 4 m away at the same height: sin 2a = g r / s^2 = 39.24 / 64, a = 18.90790
+        # deg, and 8 cos a; for 4 m/s there is none, the slowest is at 45 deg:
+        # s^2 = g r, sqrt(39.24 / 2).
+        (8.0, 7.568325),
+        (4.0, 4.429447),
+    ],
+)
+def test_a_total_speed_by_hand(drawn, horizontal):
+    config = ThrowConfig(
+        aim="box",
+        box_half_width=0.0,
+        box_height=(2.0, 2.0),
+        height=(2.0, 2.0),
+        distance=(4.0, 4.0),
+        speed=(drawn, drawn),
+        speed_is="total",
+    )
+    speed = draw(make(config), 1).speed
+    torch.testing.assert_close(speed, torch.tensor([horizontal]))
+
+
+def test_the_speed_of_a_straight_throw_is_the_whole_in_either_case():
+    one, other = (
+        draw(make(ThrowConfig(flight="straight", speed_is=kind))).speed
+        for kind in ("horizontal", "total")
+    )
+    assert torch.equal(one, other)
+
+
+# --- invariances ----------------------------------------------------------------
+
+
 def test_turning_the_robot_turns_the_throw():
     thrower = make(ThrowConfig())
     drawn, (base_pose, joint_pos) = draw(thrower), poses()
@@ -286,8 +375,9 @@ def test_turning_the_robot_turns_the_throw():
     torch.testing.assert_close(again.velocity, expected, atol=1e-4, rtol=1e-4)
 
 
-def test_a_padded_subset_is_thrown_to_the_same_bits():
-    thrower = make(ThrowConfig())
+@pytest.mark.parametrize("speed_is", ["horizontal", "total"])
+def test_a_padded_subset_is_thrown_to_the_same_bits(speed_is):
+    thrower = make(ThrowConfig(speed_is=speed_is))
     drawn, (base_pose, joint_pos) = draw(thrower), poses()
     velocity = torch.ones(N, 3)
     whole = thrower.release(drawn, base_pose, velocity, joint_pos)
@@ -309,14 +399,22 @@ def test_a_padded_subset_is_thrown_to_the_same_bits():
 # --- the rigid robot ------------------------------------------------------------
 
 
-@pytest.mark.parametrize("flight", FLIGHTS)
-def test_every_throw_hits_a_rigid_robot(flight, capsys):
-    config = DodgeballConfig(throws=ThrowConfig(flight=flight))
+@pytest.mark.parametrize(
+    "throws",
+    [
+        ThrowConfig(),
+        ThrowConfig(speed_is="total"),
+        ThrowConfig(flight="straight"),
+    ],
+    ids=["ballistic", "ballistic, total speed", "straight"],
+)
+def test_every_throw_hits_a_rigid_robot(throws, request, capsys):
+    config = DodgeballConfig(throws=throws)
     env = DodgeballEnv(H1_2, config, num_envs=256, seed=0, hold=True)
     td = env.reset()
     zero = torch.zeros(256, len(DEFAULT))
     alive, survival = torch.ones(256, dtype=torch.bool), torch.zeros(256)
-    for _ in range(120):
+    while alive.any() and survival.max() < 2:
         step, td = env.step_and_maybe_reset(td.set("action", zero))
         step = step["next"]
         survival += alive / 60
@@ -329,7 +427,8 @@ def test_every_throw_hits_a_rigid_robot(flight, capsys):
         alive &= ~ended
     assert not alive.any()
     with capsys.disabled():
-        print(f" [{flight}: rigid robot survives {survival.mean():.2f} s]", end="")
+        case = request.node.callspec.id
+        print(f" [{case}: rigid robot survives {survival.mean():.2f} s]", end="")
 
 
 # --- errors ---------------------------------------------------------------------

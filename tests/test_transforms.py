@@ -60,6 +60,11 @@ BUILDERS = {
     ),
     "localization, yaw": partial(Localization, yaw_only=True, scale=2.0),
     "proprioception": partial(Proprioception, DEFAULT),
+    "proprioception, action": partial(
+        Proprioception,
+        DEFAULT,
+        in_keys=(*Proprioception.STATE_KEYS, "previous_action"),
+    ),
     "oracle": Oracle,
     "privileged objects": partial(Privileged, "objects", JOINTS, len(BALLS)),
     "privileged velocity": partial(Privileged, "velocity", JOINTS, len(BALLS)),
@@ -382,6 +387,23 @@ def test_signals_are_those_of_the_state_under_staggered_resets(signal, content):
                 torch.testing.assert_close(state[key], again[key])
     per_step = torch.stack(ended[::2]).sum(1)
     assert ((per_step > 0) & (per_step < 6)).sum() >= 3  # partial resets happened
+
+
+def test_the_actor_observes_its_previous_action_only_if_asked():
+    plain, told = (
+        make_worker_env(config, SKIN, num_envs=6, seed=0, keep_raw=True)
+        for config in (EnvConfig(), EnvConfig(previous_action=True))
+    )
+    check_env_specs(told)
+    taken = set()
+    told.set_seed(0, static_seed=True)
+    for state, other in zip(run(plain, 70), run(told, 70), strict=True):
+        action = state["previous_action"]
+        taken.update(action.any(-1).tolist())
+        expected = torch.cat((state["observation"], action), -1)
+        assert torch.equal(other["observation"], expected)
+    # None at the start of an episode.
+    assert taken == {False, True}
 
 
 def outside(config: EnvConfig, parallel, **kwargs) -> TransformedEnv:

@@ -42,6 +42,8 @@ class DodgeballConfig:
     """Episodes are truncated at this age [s]."""
     success_s: float = 3.0
     """An episode that is not terminated up to this age is a success [s]."""
+    self_contact_ends: bool = False
+    """Whether a robot that touches itself terminates the episode, as a fall does."""
     start_joint_noise: float = 0.05
     """Joints start uniformly within this of the default pose [rad]."""
 
@@ -55,6 +57,11 @@ class DodgeballConfig:
             raise ValueError(
                 f"episode_length_s must be at least one control step, got "
                 f"{self.episode_length_s}"
+            )
+        if self.self_contact_ends and not self.physics.self_collision:
+            raise ValueError(
+                "self_contact_ends needs physics.self_collision: without it the robot "
+                "never touches itself"
             )
         if self.start_joint_noise < 0:
             raise ValueError(
@@ -109,8 +116,9 @@ class DodgeballEnv(EnvBase):
     **Start**: default pose with a little joint noise on the ground at the origin,
     uniform heading, at rest; the first ball is in the air at once.
 
-    **End**: ``terminated`` = hit or fallen or diverged; ``truncated`` at the age
-    limit. A diverged row is reset like any other and harms no other row.
+    **End**: ``terminated`` = hit or fallen or diverged, or self-contact if that ends
+    an episode; ``truncated`` at the age limit. A diverged row is reset like any other
+    and harms no other row.
 
     All draws are functions of (seed, global row, episode, ...): rows
     ``row_offset`` to ``row_offset + num_envs`` give the same episodes whichever
@@ -337,6 +345,8 @@ class DodgeballEnv(EnvBase):
         hit = hit_by.any(-1)
         fallen = (result.floor_contact & ~self._may_touch_floor).any(-1)
         terminated = hit | fallen | result.diverged
+        if config.self_contact_ends:
+            terminated |= result.self_contact
         truncated = (counters["step"] >= config.episode_steps) & ~terminated
         self._count_balls(state, hit_by)
         # Of the balls in flight until here: a throw makes the flag a new ball's.

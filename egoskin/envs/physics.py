@@ -43,7 +43,7 @@ class PhysicsConfig:
     substeps: int = 2
     """Physics steps in each control step."""
     self_collision: bool = True
-    """Whether arms, torso and legs collide with each other (never ends an episode)."""
+    """Whether arms, torso and legs collide with each other."""
     solver_iterations: int = 10
     """Most Newton iterations in each physics step."""
     target_velocity: Literal["zero", "finite_difference"] = "zero"

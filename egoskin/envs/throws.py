@@ -7,7 +7,7 @@ pose the robot has at release. One bank of draws therefore serves every policy.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
@@ -27,6 +27,9 @@ _NUM_AIM_POINTS, _AIM_SEED = 4096, 0
 # A robot that runs away faster than this share of the ball's speed is led as if it
 # ran at it; otherwise no throw could reach it.
 _MAX_LEAD_RATIO = 0.9
+# Draws of a throw until one arrives at the total speed drawn. Half of those of the
+# default ranges do not: all of them, once in a thousand million throws.
+_MAX_TRIES = 32
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +49,12 @@ class ThrowConfig:
     distance: tuple[float, float] = (4.0, 6.0)
     """Horizontal distance of release from the base [m]."""
     speed: tuple[float, float] = (4.0, 8.0)
-    """Initial speed [m/s]: the horizontal one if ballistic, else the whole."""
+    """Initial speed [m/s]: see speed_is if ballistic, else the whole."""
+    speed_is: Literal["horizontal", "total"] = "horizontal"
+    """For flight=ballistic: the horizontal part of the initial speed, or the whole of
+    it for the lower arc to a robot standing in its default pose (one that moves is
+    thrown at with the same horizontal speed). A draw that is too slow to arrive is
+    drawn again, 32 times at most; then the first is thrown as slowly as arrives."""
     azimuth_deg: tuple[float, float] = (-180.0, 180.0)
     """Direction the ball comes from, relative to the robot's heading [deg]."""
     aim: Literal["body", "box"] = "body"
@@ -98,7 +106,7 @@ class Draw:
     height: Tensor
     """Height of release [m]."""
     speed: Tensor
-    """Initial speed [m/s]."""
+    """Initial speed [m/s]: the horizontal one if ballistic, else the whole."""
     interval: Tensor
     """Time until the next throw [s]."""
     target: Tensor
@@ -166,15 +174,11 @@ class Thrower:
             Height of the points aimed at [m] and speed of the ball there [m/s],
             ``[n]`` each.
         """
-        robot, n = self._robot, len(draw.speed)
-        base_pose = torch.tensor([0.0, 0, robot.default_base_height, 1, 0, 0, 0])
-        pose = (
-            base_pose.expand(n, -1),
-            torch.from_numpy(robot.default_joint_pos).float().expand(n, -1),
-        )
+        n = len(draw.speed)
+        base_pose, joint_pos = (x.expand(n, -1) for x in self._standing)
         side = torch.stack((draw.azimuth.cos(), draw.azimuth.sin()), -1)
-        target = self._target(draw, *pose, side)
-        release = self.release(draw, pose[0], torch.zeros(n, 3), pose[1])
+        target = self._target(draw, base_pose, joint_pos, side)
+        release = self.release(draw, base_pose, torch.zeros(n, 3), joint_pos)
         velocity = release.velocity
         if self.config.flight == "ballistic":
             way = (target - release.position)[:, :2].norm(dim=-1)
@@ -193,7 +197,18 @@ class Thrower:
         Returns:
             Draws, a pure function of the arguments.
         """
-        u = uniform(seed, Stream.THROW, row, episode, throw, 7)
+        what = (seed, Stream.THROW, row, episode, throw)
+        if self.config.flight == "straight" or self.config.speed_is == "horizontal":
+            return self._scaled(uniform(*what, 7))
+        # Whole blocks of random words: the first try is the draw above.
+        u = uniform(*what, 8 * _MAX_TRIES).unflatten(-1, (_MAX_TRIES, 8))
+        _, arrives = self._direct_throw(self._scaled(u.flatten(0, 1)))
+        first = arrives.reshape(-1, _MAX_TRIES).to(torch.uint8).argmax(-1)
+        draw = self._scaled(u[torch.arange(len(u)), first])
+        return replace(draw, speed=self._direct_throw(draw)[0])
+
+    def _scaled(self, u: Tensor) -> Draw:
+        """Return draws from uniform numbers, ``[n, 7]`` or more."""
         config = self.config
 
         def scale(column: int, bounds: tuple[float, float]) -> Tensor:
@@ -208,6 +223,29 @@ class Thrower:
             interval=scale(4, config.interval),
             target=u[:, 5:7],
         )
+
+    def _direct_throw(self, draw: Draw) -> tuple[Tensor, Tensor]:
+        """Return how fast to throw for draws whose speed is the total one.
+
+        At the standing robot, so that it is a property of the draws alone.
+
+        Returns:
+            Horizontal speed of the lower throw [m/s], and whether the speed drawn
+            suffices (if not: that of the slowest throw that arrives), ``[n]`` each.
+        """
+        side = torch.stack((draw.azimuth.cos(), draw.azimuth.sin()), -1)
+        gap = self._target(draw, *self._standing, side)
+        rise = gap[:, 2] - draw.height
+        across = (gap[:, :2] - draw.distance[:, None] * side).square().sum(-1)
+        way = (across + rise.square()).sqrt()
+        # In time T: s^2 = (way / T)^2 + g rise + (g T / 2)^2, which is least where the
+        # terms with T are equal; of two times the shorter. What a physics step does to
+        # the parabola is left out.
+        excess = draw.speed.square() - GRAVITY * (rise + way)
+        above = excess.clamp(min=0.0)
+        root = (above * (above + 2 * GRAVITY * way)).sqrt()
+        horizontal = (across * (above + GRAVITY * way + root) / 2).sqrt() / way
+        return horizontal, excess >= 0
 
     def release(
         self, draw: Draw, base_pose: Tensor, base_lin_vel_w: Tensor, joint_pos: Tensor
@@ -259,6 +297,13 @@ class Thrower:
             velocity[:, 2] += 0.5 * GRAVITY * (time + self._timestep)
         return Release(position=start, velocity=velocity)
 
+    @cached_property
+    def _standing(self) -> tuple[Tensor, Tensor]:
+        """Base pose ``[1, 7]`` and joint positions ``[1, J]`` of the standing robot."""
+        height = self._robot.default_base_height
+        joint_pos = torch.from_numpy(self._robot.default_joint_pos).float()
+        return torch.tensor([[0.0, 0, height, 1, 0, 0, 0]]), joint_pos[None]
+
     def _point_index(self, draw: Draw) -> Tensor:
         index = (draw.target[:, 0] * _NUM_AIM_POINTS).long()
         return index.clamp(max=_NUM_AIM_POINTS - 1)
@@ -266,7 +311,10 @@ class Thrower:
     def _target(
         self, draw: Draw, base_pose: Tensor, joint_pos: Tensor, side: Tensor
     ) -> Tensor:
-        """Point in the world that each throw is aimed at [m], ``[n, 3]``."""
+        """Point in the world that each throw is aimed at [m], ``[n, 3]``.
+
+        The poses are those of each throw's own robot, or of one for all, ``[1, ...]``.
+        """
         if self.config.aim == "box":
             offset = (2 * draw.target[:, :1] - 1) * self.config.box_half_width
             across = torch.stack((-side[:, 1], side[:, 0]), -1)
@@ -276,7 +324,7 @@ class Thrower:
         kinematics, link, local = self._aim_points
         index = self._point_index(draw)
         position, rotation = kinematics.poses_b(joint_pos)
-        row = torch.arange(len(index))
+        row = torch.arange(len(joint_pos)).expand(len(index))
         turn, shift = rotation[row, link[index]], position[row, link[index]]
         point_b = (turn * local[index][:, None, :]).sum(-1) + shift
         return base_pose[:, :3] + rotate(base_pose[:, 3:], point_b)

@@ -1,0 +1,50 @@
+"""What the tests of sensors share: shapes, measuring, turned objects, equal bits."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from hypothesis import strategies as st
+
+from egoskin.shapes import Box, Capsule, Ellipsoid, Sphere
+
+KINDS = ("sphere", "box", "capsule", "ellipsoid")
+SHAPES = (
+    Sphere(radius=0.25),
+    Box(half_extents=(0.1, 0.2, 0.3)),
+    Capsule(radius=0.1, half_length=0.3),
+    Ellipsoid(semi_axes=(0.4, 0.1, 0.25)),
+)
+"""One of each of `KINDS`."""
+KEYS = ("base_pose", "joint_pos", "object_pose", "object_active")
+"""What a sensor reads, in the order of its `compute`."""
+SEED = st.integers(0, 2**32 - 1)
+
+
+def measure(sensor, state):
+    """(distance, detected) of a state."""
+    return sensor.compute(*(state[key] for key in KEYS))
+
+
+def turned(state, seed: int):
+    """The state with its objects turned anyhow."""
+    rng = np.random.default_rng(seed)
+    quat = torch.from_numpy(rng.normal(size=(*state["object_active"].shape, 4)))
+    quat = torch.nn.functional.normalize(quat, dim=-1)
+    pose = state["object_pose"]
+    return state.set("object_pose", torch.cat((pose[..., :3], quat.to(pose)), -1))
+
+
+def assert_same_bits(one, other) -> None:
+    """Equal, NaN with NaN."""
+    for a, b in zip(one, other, strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=0, equal_nan=True)
+
+
+def assert_same_bits_in_any_batch(sensor, state) -> None:
+    """A row reads the same whichever rows are computed with it."""
+    whole = measure(sensor, state)
+    for size in (1, 5, 27, 32):
+        for start in (0, 3, 69):
+            rows = slice(start, start + size)
+            assert_same_bits(measure(sensor, state[rows]), [x[rows] for x in whole])
