@@ -208,6 +208,8 @@ class Run:
             ValueError: If the folder holds anything already, or the skin is none.
         """
         skin = config.env.skin.build(config.env.robot_config)
+        # Sensors that do not fit each other are found now, not in a worker.
+        config.env.sensor.filled(skin)
         path = config.run_dir
         if path is None:
             kind = config.env.sensor.label()

@@ -38,6 +38,8 @@ from egoskin.sensors.mesh_surface import Meshes, meshes_in_folder, meshes_of_mjc
 from egoskin.sensors.placement import place_sensors
 
 # The picture: size of each of its two views [px], and how normals are drawn [m].
+# Sensors farther from the robot than this are told of [m].
+_FAR_OFF = 0.15
 _VIEW_SIZE = (640, 960)
 _NORMAL_LENGTH, _NORMAL_RADIUS = 0.08, 0.003
 _NORMAL_RGBA = (0.1, 0.95, 1.0, 1.0)
@@ -148,6 +150,14 @@ class Import:
         )
         skin.save(self.out)
         print(table(skin, str(self.out)))
+        nearest, farthest = skin.provenance.get("distance_to_primitives", (0, 0))
+        off = max(abs(nearest), abs(farthest))
+        if off > _FAR_OFF:
+            print(
+                f"warning: a sensor is {off:.2f} m off the robot's surface: is it the "
+                "right --scale and --link-map? Look at: python scripts/skin.py "
+                f"show {self.out} --picture skin.png"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)

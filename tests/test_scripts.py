@@ -290,6 +290,7 @@ BAD_SKIN = """{"format": "egoskin-skin-1", "robot": "h1_2", "sensors": [
         (["--sensor.signal", "smell"], "proximity"),
         (["--num-envs", "32", "--num-workers", "3"], "valid: 1, 2, 4, 8, 16, 32"),
         (["--task.physics.gains", "strong"], "real, rotor_inertia"),
+        (["--sensor.reduce", "min"], "reduce=min is for ray sensors"),
         (["--device", "gpu"], "available: cpu"),
         (["--skin.path", "skin.json"], "did you mean 'torso_link'"),
         (["--skin.path", "nothing.json"], "nothing.json"),

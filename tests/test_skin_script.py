@@ -105,6 +105,16 @@ def test_millimetres_and_a_link_that_the_file_leaves_out(run):
     assert skin.links == ("torso_link",)
 
 
+@pytest.mark.parametrize(("height", "told"), [("200", False), ("970", True)])
+def test_sensors_far_from_the_robot_are_told(run, height: str, told: bool):
+    Path("gentact.csv").write_text(
+        "Index,X,Y,Z,NormX,NormY,NormZ,Radius,Parent\n"
+        f"0,93,20,{height},1,0,0,4,torso_link\n"
+    )
+    out = run("import", "gentact.csv", "--scale", "0.001", "--out", "skin.json")
+    assert ("m off the robot's surface" in out) is told
+
+
 @pytest.fixture
 def mixed(tmp_path: Path) -> Path:
     """A skin of three kinds of sensor."""

@@ -144,10 +144,22 @@ class SensorConfig:
         return f"{self.coverage}-{self.signal}-{self.range:g}m"
 
     def filled(self, skin: Skin) -> Skin:
-        """Return a skin whose sensors all have a coverage and a range."""
-        return skin.filled(
+        """Return a skin whose sensors all have a coverage and a range.
+
+        Raises:
+            ValueError: If ``reduce`` would reduce nothing.
+        """
+        filled = skin.filled(
             self.ray if self.coverage == "ray" else self.field, self.range
         )
+        if self.reduce != "none" and not any(
+            isinstance(coverage, Ray) for coverage in filled.coverage
+        ):
+            raise ValueError(
+                f"reduce={self.reduce} is for ray sensors, and the skin has none: use "
+                "coverage=ray"
+            )
+        return filled
 
     def transforms(
         self,
