@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import os
 import runpy
@@ -10,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import pytest
@@ -29,16 +31,26 @@ def command(script: str, *args: str | Path) -> list[str]:
 
 
 def run(script: str, *args: str | Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        command(script, *args), capture_output=True, text=True, timeout=200
+    """As a user calls it, but in this process: importing takes most of a call."""
+    out, errors = io.StringIO(), io.StringIO()
+    handlers = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)}
+    status: int | str | None = 0
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(out):
+        patch.setattr(sys, "argv", [script, *map(str, args)])
+        try:
+            with redirect_stderr(errors):
+                runpy.run_path(str(ROOT / "scripts" / script), run_name="__main__")
+        except SystemExit as end:
+            status = end.code
+        finally:
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+    if isinstance(status, str):
+        errors.write(status)
+        status = 1
+    return subprocess.CompletedProcess(
+        [script, *map(str, args)], status or 0, out.getvalue(), errors.getvalue()
     )
-
-
-def train(folder: Path, rollouts: int, *args: str) -> None:
-    done = run(
-        "ppo.py", *SMALL, "--run-dir", folder, "--total-frames", rollouts * BATCH, *args
-    )
-    assert done.returncode == 0, done.stderr
 
 
 def metrics(folder: Path) -> list[dict[str, str]]:
@@ -50,7 +62,10 @@ def metrics(folder: Path) -> list[dict[str, str]]:
 def trained(tmp_path_factory) -> Path:
     """A run of four rollouts."""
     folder = tmp_path_factory.mktemp("runs") / "trained"
-    train(folder, 4)
+    args = ("ppo.py", *SMALL, "--run-dir", folder, "--total-frames", 4 * BATCH)
+    # In a process of its own.
+    done = subprocess.run(command(*args), capture_output=True, text=True, timeout=200)
+    assert done.returncode == 0, done.stderr
     return folder
 
 
@@ -72,7 +87,9 @@ def test_a_run_folder_holds_what_is_needed_to_understand_it(trained: Path):
 
 
 def test_a_resumed_run_equals_one_that_never_stopped(trained: Path, tmp_path: Path):
-    train(tmp_path / "halves", 2)
+    args = ("--run-dir", tmp_path / "halves", "--total-frames", 2 * BATCH)
+    done = run("ppo.py", *SMALL, *args)
+    assert done.returncode == 0, done.stderr
     done = run("ppo.py", "--resume", tmp_path / "halves", "--total-frames", 4 * BATCH)
     assert done.returncode == 0, done.stderr
     whole, _ = load_tensors(trained / "checkpoint.safetensors")
