@@ -68,7 +68,7 @@ class PPOConfig:
     """Decay of the generalised advantage estimate."""
     clip_epsilon: float = 0.2
     """Clip range of the probability ratio."""
-    entropy_coeff: float = 0.0
+    entropy_coeff: float = 0.003
     """Weight of the entropy bonus."""
     critic_coeff: float = 1.0
     """Weight of the value loss."""
