@@ -14,6 +14,7 @@ import egoskin  # noqa: F401  (before torch: it says how torch's threads wait)
 import dataclasses
 import json
 import sys
+import textwrap
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -55,6 +56,8 @@ from egoskin.results import (
 )
 from egoskin.runs import Run
 
+# Characters in a line of a legend: a recipe may differ in many settings.
+_LEGEND_WIDTH = 64
 # Okabe and Ito's colours, told apart by colour-blind readers as well.
 _COLOURS = (
     "#000000",
@@ -203,7 +206,7 @@ def _draw_cell(axes: Axes, name: str, runs: list[StoredRun], number: int) -> Non
     seen = curve(runs)
     colour = _COLOURS[number % len(_COLOURS)]
     dash = _DASHES[number // len(_COLOURS) % len(_DASHES)]
-    label = f"{name} ({counted(len(runs), 'seed')})"
+    label = textwrap.fill(f"{name} ({counted(len(runs), 'seed')})", _LEGEND_WIDTH)
     axes.plot(
         seen.hours, seen.mean, color=colour, linestyle=dash, linewidth=1.6, label=label
     )

@@ -62,13 +62,13 @@ class PPOConfig:
     """Passes over a rollout."""
     num_mini_batches: int = 4
     """Minibatches in each pass."""
-    gamma: float = 0.995
+    gamma: float = 0.99
     """Discount for each control step."""
     gae_lambda: float = 0.95
     """Decay of the generalised advantage estimate."""
     clip_epsilon: float = 0.2
     """Clip range of the probability ratio."""
-    entropy_coeff: float = 0.003
+    entropy_coeff: float = 0.0
     """Weight of the entropy bonus."""
     critic_coeff: float = 1.0
     """Weight of the value loss."""
