@@ -37,6 +37,7 @@ def run(script: str, *args: str | Path) -> subprocess.CompletedProcess[str]:
     status: int | str | None = 0
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(out):
         patch.setattr(sys, "argv", [script, *map(str, args)])
+        patch.syspath_prepend(str(ROOT / "scripts"))
         try:
             with redirect_stderr(errors):
                 runpy.run_path(str(ROOT / "scripts" / script), run_name="__main__")
