@@ -37,9 +37,9 @@ from egoskin.sensors.gentact import load_gentact, save_gentact
 from egoskin.sensors.mesh_surface import Meshes, meshes_in_folder, meshes_of_mjcf
 from egoskin.sensors.placement import place_sensors
 
-# The picture: size of each of its two views [px], and how normals are drawn [m].
 # Sensors farther from the robot than this are told of [m].
 _FAR_OFF = 0.15
+# The picture: size of each of its two views [px], and how normals are drawn [m].
 _VIEW_SIZE = (640, 960)
 _NORMAL_LENGTH, _NORMAL_RADIUS = 0.08, 0.003
 _NORMAL_RGBA = (0.1, 0.95, 1.0, 1.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -241,18 +242,20 @@ def test_the_speed_is_horizontal_if_ballistic_and_whole_if_straight(
     assert release.velocity.isfinite().all()
 
 
+# 4 m away, to a target at the height of release.
+LEVEL = ThrowConfig(
+    aim="box",
+    box_half_width=0.0,
+    box_height=(2.0, 2.0),
+    height=(2.0, 2.0),
+    distance=(4.0, 4.0),
+)
+
+
 def test_a_vertical_fall_of_the_height_by_hand():
     # A robot of no velocity, ball 4 m ahead at 4 m/s: 1 s of flight. To a target at
     # the height of release: vz = g (T + dt) / 2 = 9.81 (1 + 1/120) / 2 = 4.945875.
-    config = ThrowConfig(
-        aim="box",
-        box_half_width=0.0,
-        box_height=(2.0, 2.0),
-        height=(2.0, 2.0),
-        distance=(4.0, 4.0),
-        speed=(4.0, 4.0),
-        azimuth_deg=(0.0, 0.0),
-    )
+    config = replace(LEVEL, speed=(4.0, 4.0), azimuth_deg=(0.0, 0.0))
     thrower = make(config)
     base_pose = torch.tensor([[1.0, 2, 1, 1, 0, 0, 0]])
     release = thrower.release(
@@ -330,15 +333,7 @@ def test_draws_of_a_total_speed_that_cannot_arrive_are_drawn_again():
     ],
 )
 def test_a_total_speed_by_hand(drawn, horizontal):
-    config = ThrowConfig(
-        aim="box",
-        box_half_width=0.0,
-        box_height=(2.0, 2.0),
-        height=(2.0, 2.0),
-        distance=(4.0, 4.0),
-        speed=(drawn, drawn),
-        speed_is="total",
-    )
+    config = replace(LEVEL, speed=(drawn, drawn), speed_is="total")
     speed = draw(make(config), 1).speed
     torch.testing.assert_close(speed, torch.tensor([horizontal]))
 
