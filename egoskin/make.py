@@ -134,7 +134,7 @@ def make_worker_env(
     )
     transforms: list[Transform] = []
     if not bare:
-        balls = config.task.throws.num_balls
+        throws = config.task.throws
         # With a history, what is new goes by other names.
         suffix = "" if config.history == 1 else "_now"
         default = torch.from_numpy(robot.default_joint_pos)
@@ -143,13 +143,18 @@ def make_worker_env(
             felt.append("previous_action")
         transforms += [
             Proprioception(default, felt, out_keys=[f"observation{suffix}"]),
-            Privileged(config.privileged, len(robot.joints), balls),
+            Privileged(
+                config.privileged,
+                len(robot.joints),
+                throws.num_balls,
+                throws.gravity,
+            ),
         ]
         if not sparse:
             transforms += config.sensor.transforms(
                 robot,
                 skin,
-                config.task.throws.balls,
+                throws.balls,
                 dt=1 / config.task.physics.control_hz,
                 seed=seed,
                 row_offset=row_offset,

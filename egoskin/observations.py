@@ -10,8 +10,13 @@ from tensordict import NestedKey
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 
+from egoskin.envs.throws import GRAVITY
 from egoskin.kinematics import rotate_inverse
 from egoskin.transform import RowTransform
+
+# An approach is looked ahead for this long [s], a pass is told up to this far [m], and
+# what comes within this time [s] is near.
+_LONGEST_APPROACH, _FARTHEST_PASS, _SOON = 2.0, 3.0, 0.3
 
 
 class Proprioception(RowTransform):
@@ -85,6 +90,47 @@ def object_states_b(
     return torch.cat((position * flag, speed * flag, flag), -1).flatten(1)
 
 
+def approaches_b(
+    base_pose: Tensor,
+    base_lin_vel_w: Tensor,
+    object_pose: Tensor,
+    object_lin_vel_w: Tensor,
+    object_active: Tensor,
+    *,
+    gravity: float,
+) -> Tensor:
+    """Return how soon and where each object passes the base, if both fly on.
+
+    It follows from the objects' states, but a small network cannot work it out.
+
+    Args:
+        base_pose: Base pose in the world, ``[B, 7]``.
+        base_lin_vel_w: Base velocity [m/s], ``[B, 3]``; the base keeps it.
+        object_pose: Poses in the world, ``[B, O, 7]``.
+        object_lin_vel_w: Velocities [m/s], ``[B, O, 3]``.
+        object_active: Whether each is in play, ``[B, O]`` bool.
+        gravity: What pulls the objects down [m/s^2].
+
+    Returns:
+        ``[B, 4 O]``, for each object: nearness in time 0.3 s / (0.3 s + t), where t
+        is the time until its horizontal distance from the base is least (at least 0,
+        at most 2 s), and its position relative to the base at that time [m], at most
+        3 m along each of the base's axes; zero where inactive.
+    """
+    gap = object_pose[..., :3] - base_pose[:, None, :3]
+    speed = object_lin_vel_w - base_lin_vel_w[:, None]
+    (x, y, _), (u, v, _) = gap.unbind(-1), speed.unbind(-1)
+    time = -(x * u + y * v) / (u * u + v * v).clamp(min=1e-3)
+    time = time.clamp(0.0, _LONGEST_APPROACH)[..., None]
+    fall = torch.nn.functional.pad(0.5 * gravity * time * time, (2, 0))
+    turn = base_pose[:, None, 3:].expand(-1, gap.shape[1], -1)
+    passing = rotate_inverse(turn, gap + speed * time - fall)
+    passing = passing.clamp(-_FARTHEST_PASS, _FARTHEST_PASS)
+    nearness = _SOON / (_SOON + time)
+    flag = object_active[..., None].to(gap.dtype)
+    return (torch.cat((nearness, passing), -1) * flag).flatten(1)
+
+
 class Oracle(RowTransform):
     """What every ball does: a diagnostic of the task, no sensor can give it.
 
@@ -126,13 +172,15 @@ class Privileged(RowTransform):
     Reads ``base_pose``, ``base_lin_vel_w`` and, unless told of the velocity alone,
     ``displacement_w``, ``previous_action``, ``object_pose``, ``object_lin_vel_w`` and
     ``object_active``. Writes ``privileged_observation``: base velocity [m/s] 3; then
-    displacement from the start [m] 3, previous action J, and the objects' states
-    (`object_states_b`) 7 O. Vectors are in the base frame.
+    displacement from the start [m] 3, previous action J, the objects' states
+    (`object_states_b`) 7 O and approaches (`approaches_b`) 4 O, and height of the base
+    above the ground [m] 1. Vectors are in the base frame.
 
     Args:
         content: "objects" for everything above, "velocity" for the paper's critic.
         num_joints: ``J``.
         num_objects: ``O``.
+        gravity: What pulls the objects down [m/s^2].
         in_keys: Keys of the inputs, in the order above.
         out_keys: Key of the observation.
 
@@ -154,6 +202,7 @@ class Privileged(RowTransform):
         content: Literal["objects", "velocity"],
         num_joints: int,
         num_objects: int,
+        gravity: float = GRAVITY,
         in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] = ("privileged_observation",),
     ) -> None:
@@ -161,10 +210,11 @@ class Privileged(RowTransform):
         self._size = 3
         if content == "objects":
             read = (*read, *self._OBJECT_KEYS)
-            self._size += 3 + num_joints + 7 * num_objects
+            self._size += 3 + num_joints + 11 * num_objects + 1
         if in_keys is not None and len(in_keys) != len(read):
             raise ValueError(f"in_keys must name {', '.join(read)}, got {in_keys}")
         super().__init__(in_keys or read, out_keys)
+        self._gravity = gravity
 
     def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Return the privileged observation, ``[B, P]``."""
@@ -172,12 +222,14 @@ class Privileged(RowTransform):
         quat = base_pose[:, 3:]
         parts = [rotate_inverse(quat, base_lin_vel_w)]
         if rest:
-            displacement_w, previous_action, pose, velocity, active = rest
+            displacement_w, previous_action, *objects = rest
             planar = torch.nn.functional.pad(displacement_w, (0, 1))
-            parts += [rotate_inverse(quat, planar), previous_action]
-            parts.append(
-                object_states_b(base_pose, base_lin_vel_w, pose, velocity, active)
+            states = object_states_b(base_pose, base_lin_vel_w, *objects)
+            approaches = approaches_b(
+                base_pose, base_lin_vel_w, *objects, gravity=self._gravity
             )
+            parts += [rotate_inverse(quat, planar), previous_action, states]
+            parts += [approaches, base_pose[:, 2:3]]
         return (torch.cat(parts, -1),)
 
     def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:

@@ -98,10 +98,11 @@ class Trainer:
             self.root,
             self.config.ppo.rollout_steps,
             METRIC_KEYS,
+            self.config.ppo.noise_correlation,
         )
         collected = time.perf_counter()
         try:
-            learned = self.ppo.update(rollout)
+            learned = self.ppo.update(rollout, self.frames)
         except NonFiniteError as error:
             path = self.dump(error)
             error.args = (f"{error}\nreplay it with: python scripts/replay.py {path}",)
@@ -187,12 +188,15 @@ class Trainer:
     def dump(self, error: NonFiniteError) -> Path:
         """Write what `scripts/replay.py` needs to meet an error again; return where."""
         path = self.run.dump_path(self.frames)
+        ppo = self.config.ppo
+        now = ppo.entropy_coeff_at(self.frames)
+        ppo = dataclasses.replace(ppo, entropy_coeff=now, entropy_frames=None)
         save_tensors(
             path,
             {**self._learner_tensors(), **prefixed("batch", error.batch)},
             {
                 "policy": self._spec_now().header(),
-                "ppo": to_plain(self.config.ppo),
+                "ppo": to_plain(ppo),
                 "learning_rate": self.ppo.learning_rate,
                 "error": str(error),
             },

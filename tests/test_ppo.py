@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -57,6 +59,39 @@ class CountingEnv(EnvBase):
                 "done": terminated | truncated,
             },
             [2],
+        )
+
+
+class StillEnv(EnvBase):
+    """256 rows in which nothing ever happens."""
+
+    batch_locked = True
+
+    def __init__(self) -> None:
+        super().__init__(batch_size=[256])
+        self.observation_spec = Composite(
+            observation=Unbounded(shape=(256, 3)), shape=(256,)
+        )
+        self.action_spec = Unbounded(shape=(256, 2))
+        self.reward_spec = Unbounded(shape=(256, 1))
+
+    def _set_seed(self, seed: int | None) -> None:
+        pass
+
+    def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDict:
+        return TensorDict({"observation": torch.zeros(256, 3)}, [256])
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        never = torch.zeros(256, 1, dtype=torch.bool)
+        return TensorDict(
+            {
+                "observation": torch.zeros(256, 3),
+                "reward": torch.zeros(256, 1),
+                "terminated": never,
+                "truncated": never.clone(),
+                "done": never.clone(),
+            },
+            [256],
         )
 
 
@@ -116,6 +151,50 @@ def test_advantages_of_a_timeout_and_a_termination_by_hand():
     raw = target - rollout["state_value"][..., 0]
     expected = (raw - raw.mean()) / (raw.std() + 1e-8)
     torch.testing.assert_close(rollout["advantage"][..., 0], expected)
+
+
+def test_the_critic_may_learn_from_another_estimate_than_the_actor():
+    env, agent = truncating_spec(CountingEnv()), counting_agent()
+    rollout, _, _ = collect(env, agent, env.reset(), 4)
+    add_advantages(rollout, gamma=0.5, gae_lambda=0.0, value_lambda=0.5)
+    target = rollout["value_target"][..., 0]
+    assert target[:, 1].tolist() == [5.375, 6.5, 1.0, 6.5]  # as above
+    # lambda = 0: the differences alone, by hand above.
+    raw = torch.tensor([[5.5, 0.5, 5.5, 0.5], [5.5, 0.5, -20.0, 5.5]]).t()
+    expected = (raw - raw.mean()) / (raw.std() + 1e-8)
+    torch.testing.assert_close(rollout["advantage"][..., 0], expected)
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.8])
+def test_noise_is_as_wide_as_without_correlation_and_correlated(correlation: float):
+    torch.manual_seed(0)
+    env, agent = truncating_spec(StillEnv()), bandit_agent()
+    rollout, _, _ = collect(env, agent, env.reset(), 64, (), correlation)
+    noise = (rollout["action"] - rollout["loc"]) / rollout["scale"]
+    assert noise.std() == pytest.approx(1.0, abs=0.02)
+    for lag in (1, 3):
+        found = (noise[lag:] * noise[:-lag]).mean()
+        assert found == pytest.approx(correlation**lag, abs=0.03)
+    assert (noise[..., 0] * noise[..., 1]).mean() == pytest.approx(0.0, abs=0.03)
+    each = torch.distributions.Normal(rollout["loc"], rollout["scale"])
+    torch.testing.assert_close(
+        rollout["action_log_prob"], each.log_prob(rollout["action"]).sum(-1)
+    )
+
+
+def test_the_entropy_bonus_falls_to_zero():
+    config = PPOConfig(entropy_coeff=0.004, entropy_frames=1000)
+    shares = [config.entropy_coeff_at(n) / 0.004 for n in (0, 250, 1000, 5000)]
+    assert shares == pytest.approx([1.0, 0.75, 0.0, 0.0])
+    assert PPOConfig(entropy_coeff=0.004).entropy_coeff_at(10**9) == 0.004
+
+    def learnt(frames: int) -> float:
+        agent = bandit_agent()
+        ppo = PPO(agent, replace(config, entropy_coeff=1.0))
+        return ppo.update(bandit_rollout(agent), frames)["action_std"]
+
+    assert learnt(0) > learnt(900) > learnt(1000)
+    assert learnt(1000) == learnt(2000)
 
 
 def test_gaussian_kl_equals_torch_distributions():
@@ -212,7 +291,15 @@ def test_shares_of_a_minibatch_add_up_to_the_whole(threads: int):
 
 @pytest.mark.parametrize(
     "field",
-    [{"gamma": 1.5}, {"clip_epsilon": 0.0}, {"desired_kl": -1.0}, {"ppo_epochs": 0}],
+    [
+        {"gamma": 1.5},
+        {"value_lambda": -0.1},
+        {"clip_epsilon": 0.0},
+        {"desired_kl": -1.0},
+        {"ppo_epochs": 0},
+        {"noise_correlation": 1.0},
+        {"entropy_frames": 0},
+    ],
 )
 def test_values_outside_their_range_are_refused(field: dict):
     with pytest.raises(ValueError, match=next(iter(field))):

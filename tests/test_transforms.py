@@ -16,8 +16,9 @@ from torchrl.envs import Compose, ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
+from egoskin.envs.throws import GRAVITY
 from egoskin.make import EnvConfig, make_worker_env
-from egoskin.observations import Oracle, Privileged, Proprioception
+from egoskin.observations import Oracle, Privileged, Proprioception, approaches_b
 from egoskin.robots import H1_2
 from egoskin.sensors import (
     Binary,
@@ -283,8 +284,39 @@ def test_privileged_objects_by_hand():
         # the base (-4, 0, -.5) is (0, 4, -.5); active.
         *(3, 0, 1, 0, 4, -0.5, 1),
         *(0,) * 7,  # the second ball is not in play
+        # It flies past in the base's y: now it is as near as it gets, 3 m ahead.
+        *(1, 3, 0, 1),
+        *(0,) * 4,
+        1,  # height of the base
     ]
     torch.testing.assert_close(observation, torch.tensor(expected).float())
+
+
+@pytest.mark.parametrize("gravity", [GRAVITY, 0.0])
+def test_an_approach_is_where_the_ball_will_be(gravity):
+    # A ball that was thrown at a base which walks and is turned: simulated on.
+    base_pose = torch.tensor([[1.0, 2, 1, HALF, 0, 0, HALF]]).double()
+    base_velocity = torch.tensor([[0.5, -0.25, 0.0]]).double()
+    ball = torch.tensor([[[5.0, 2.5, 2.0]]]).double()
+    velocity = torch.tensor([[[-6.0, 0.0, 1.0]]]).double()
+    times = torch.linspace(0, 2, 20_001).double()[:, None]
+    flown = ball[0] + velocity[0] * times
+    flown[:, 2] -= 0.5 * gravity * times[:, 0] ** 2
+    offset = flown - (base_pose[:, :3] + base_velocity * times)
+    nearest = int(offset[:, :2].norm(dim=-1).argmin())
+    dx, dy, dz = offset[nearest]
+    pose = torch.cat((ball, torch.tensor([[[1.0, 0, 0, 0]]]).double()), -1)
+    active = torch.tensor([[True]])
+
+    def approach(velocity: torch.Tensor) -> torch.Tensor:
+        state = (base_pose, base_velocity, pose, velocity, active)
+        return approaches_b(*state, gravity=gravity)[0]
+
+    expected = torch.stack((0.3 / (0.3 + times[nearest, 0]), dy, -dx, dz))
+    torch.testing.assert_close(approach(velocity), expected, atol=1e-3, rtol=0)
+    # One that flies away is nearest now.
+    expected = torch.tensor([1.0, 0.5, -3.0, 1.0]).double()
+    torch.testing.assert_close(approach(-velocity), expected)
 
 
 def test_an_oracle_is_told_of_every_ball_by_hand():
@@ -303,7 +335,7 @@ def test_an_oracle_is_told_of_every_ball_by_hand():
 def test_an_oracle_sees_what_the_critic_sees(full_state):
     state = full_state(64)
     told = BUILDERS["privileged objects"]()(state.clone())["privileged_observation"]
-    assert torch.equal(BUILDERS["oracle"]()(state)["signal"], told[:, -14:])
+    assert torch.equal(BUILDERS["oracle"]()(state)["signal"], told[:, -23:-9])
 
 
 def test_privileged_velocity_by_hand():

@@ -66,10 +66,17 @@ class PPOConfig:
     """Discount for each control step."""
     gae_lambda: float = 0.95
     """Decay of the generalised advantage estimate."""
+    value_lambda: float | None = None
+    """Decay of the estimate that the critic learns from; None is gae_lambda."""
+    noise_correlation: float = 0.0
+    """Correlation of the exploration noise with that of the step before, within a
+    rollout (white noise at 60 Hz hardly moves a body)."""
     clip_epsilon: float = 0.2
     """Clip range of the probability ratio."""
     entropy_coeff: float = 0.0
-    """Weight of the entropy bonus."""
+    """Weight of the entropy bonus at the start."""
+    entropy_frames: int | None = None
+    """It falls linearly to zero over this many frames; None keeps it."""
     critic_coeff: float = 1.0
     """Weight of the value loss."""
     learning_rate: float = 1e-3
@@ -88,17 +95,28 @@ class PPOConfig:
             "clip_epsilon",
             "learning_rate",
             "max_grad_norm",
+            "desired_kl",
+            "entropy_frames",
         )
         for name in positive:
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        for name in ("gamma", "gae_lambda"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(
-                    f"{name} must be between 0 and 1, got {getattr(self, name)}"
-                )
-        if self.desired_kl is not None and self.desired_kl <= 0:
-            raise ValueError(f"desired_kl must be positive, got {self.desired_kl}")
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise ValueError(f"{name} must be positive, got {value}")
+        for name in ("gamma", "gae_lambda", "value_lambda"):
+            value = getattr(self, name)
+            if value is not None and not 0 <= value <= 1:
+                raise ValueError(f"{name} must be between 0 and 1, got {value}")
+        if not 0 <= self.noise_correlation < 1:
+            raise ValueError(
+                f"noise_correlation must be at least 0 and below 1, got "
+                f"{self.noise_correlation}"
+            )
+
+    def entropy_coeff_at(self, frames: int) -> float:
+        """Return the weight of the entropy bonus after a number of frames."""
+        if self.entropy_frames is None:
+            return self.entropy_coeff
+        return self.entropy_coeff * max(0.0, 1.0 - frames / self.entropy_frames)
 
 
 @torch.no_grad()
@@ -108,6 +126,7 @@ def collect(
     root: TensorDictBase,
     num_steps: int,
     info_keys: Sequence[str] = (),
+    noise_correlation: float = 0.0,
 ) -> tuple[TensorDict, TensorDictBase, list[TensorDict]]:
     """Step an environment with an agent; return what PPO needs.
 
@@ -117,6 +136,7 @@ def collect(
         root: Tensordict to start from.
         num_steps: Number of steps ``T``.
         info_keys: What else to keep of what the environment says, for metrics.
+        noise_correlation: See `PPOConfig`.
 
     Returns:
         The rollout ``[T, N]`` with the agent's ``inputs``, what it normalises, and
@@ -126,10 +146,13 @@ def collect(
     """
     device = agent.head.log_std.device
     frames, bootstraps, infos = [], [], []
+    noise: Tensor | None = None
     for _ in range(num_steps):
         read = _read(agent, root, device)
         frame = agent.encode(read)
         agent.actor(frame)
+        if noise_correlation:
+            noise = _correlate(agent, frame, noise, noise_correlation)
         root["action"] = frame["action"].reshape(*root.batch_size, -1).to(root.device)
         step, root = env.step_and_maybe_reset(root)
         after = step["next"].reshape(-1)
@@ -152,6 +175,34 @@ def collect(
 def _read(agent: Agent, root: TensorDictBase, device: torch.device) -> TensorDictBase:
     """Return what the agent reads, ``[N]``, on its device."""
     return root.select(*agent.read_keys).reshape(-1).to(device)
+
+
+def _correlate(
+    agent: Agent, frame: TensorDict, before: Tensor | None, correlation: float
+) -> Tensor:
+    """Let the noise of a frame's actions go on from that of the step before.
+
+    Each step's action is distributed as without, and has that log-probability: what
+    is learnt is what a shift that lasts as long as the noise would do.
+
+    Args:
+        agent: Chose the actions.
+        frame: Holds ``action``, ``loc`` and ``scale``; the action and its
+            ``action_log_prob`` are replaced.
+        before: What this returned at the step before, ``[N, J]``; None at the first.
+        correlation: Of the noise with that of the step before.
+
+    Returns:
+        The noise in standard deviations, ``[N, J]``.
+    """
+    noise = (frame["action"] - frame["loc"]) / frame["scale"]
+    if before is not None:
+        # AR(1), whose variance stays 1.
+        noise = correlation * before + (1 - correlation**2) ** 0.5 * noise
+        frame["action"] = frame["loc"] + frame["scale"] * noise
+        likelihood = agent.actor.get_dist(frame)
+        frame["action_log_prob"] = likelihood.log_prob(frame["action"])
+    return noise
 
 
 def _joined(frames: Sequence[TensorDict]) -> TensorDict:
@@ -177,24 +228,36 @@ def _timeout_values(
     return ended.to(device), agent.critic(terminal)["state_value"]
 
 
-def add_advantages(rollout: TensorDict, gamma: float, gae_lambda: float) -> None:
+def add_advantages(
+    rollout: TensorDict,
+    gamma: float,
+    gae_lambda: float,
+    value_lambda: float | None = None,
+) -> None:
     """Write ``advantage`` (normalised over the rollout) and ``value_target``.
 
     Args:
         rollout: What `collect` returned, ``[T, N]``.
         gamma: Discount.
         gae_lambda: Decay of the estimate.
+        value_lambda: Decay of the estimate that makes the targets; None for the same.
     """
-    advantage, target = generalized_advantage_estimate(
-        gamma,
-        gae_lambda,
-        rollout["state_value"],
-        rollout["next_state_value"],
-        rollout["reward"],
-        rollout["done"],
-        rollout["terminated"],
-        time_dim=0,
-    )
+
+    def estimate(decay: float) -> tuple[Tensor, Tensor]:
+        return generalized_advantage_estimate(
+            gamma,
+            decay,
+            rollout["state_value"],
+            rollout["next_state_value"],
+            rollout["reward"],
+            rollout["done"],
+            rollout["terminated"],
+            time_dim=0,
+        )
+
+    advantage, target = estimate(gae_lambda)
+    if value_lambda is not None and value_lambda != gae_lambda:
+        target = estimate(value_lambda)[1]
     rollout["value_target"] = target
     rollout["advantage"] = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
 
@@ -259,11 +322,12 @@ class PPO:
         content["param_groups"][0]["lr"] = learning_rate
         self.optimizer.load_state_dict(content)
 
-    def update(self, rollout: TensorDict) -> dict[str, float]:
+    def update(self, rollout: TensorDict, frames: int = 0) -> dict[str, float]:
         """Improve the agent on a rollout, then take it into the normalisers.
 
         Args:
             rollout: What `collect` returned, ``[T, N]``.
+            frames: Frames learnt from before it.
 
         Returns:
             Metrics by name.
@@ -272,7 +336,10 @@ class PPO:
             NonFiniteError: If a loss, gradient, weight or normaliser is not finite.
         """
         config = self.config
-        add_advantages(rollout, config.gamma, config.gae_lambda)
+        weight = self.loss.entropy_coeff
+        assert isinstance(weight, Tensor)
+        weight.fill_(config.entropy_coeff_at(frames))
+        add_advantages(rollout, config.gamma, config.gae_lambda, config.value_lambda)
         residual = rollout["value_target"] - rollout["state_value"]
         explained = 1 - residual.var() / rollout["value_target"].var().clamp(min=1e-12)
         data = rollout.reshape(-1)

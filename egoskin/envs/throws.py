@@ -90,6 +90,11 @@ class ThrowConfig:
                 )
 
     @property
+    def gravity(self) -> float:
+        """What pulls the balls down [m/s^2]."""
+        return GRAVITY if self.flight == "ballistic" else 0.0
+
+    @property
     def balls(self) -> tuple[Sphere, ...]:
         """The shapes in play."""
         return (Sphere(radius=self.radius),) * self.num_balls
