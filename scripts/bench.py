@@ -1,9 +1,10 @@
-"""Measure how fast the parts of the project are.
+"""Measure how fast and how exact the parts of the project are.
 
 python scripts/bench.py loop --json loop.json
 python scripts/bench.py sensors
 python scripts/bench.py physics
 python scripts/bench.py accuracy
+python scripts/bench.py gradients --run runs/NAME
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import sys
 import tyro
 
 from benchmarks.accuracy import AccuracyBench, accuracy_rows
+from benchmarks.gradients import GradientBench, gradient_rows
 from benchmarks.loop import LoopConfig, loop
 from benchmarks.physics import PhysicsBench, physics_rows
 from benchmarks.report import report
@@ -31,6 +33,7 @@ def main(args: list[str]) -> None:
         "physics": PhysicsBench,
         "sensors": SensorBench,
         "accuracy": AccuracyBench,
+        "gradients": GradientBench,
     }
     config = tyro.extras.subcommand_cli_from_dict(benches, args=args)
     if isinstance(config, LoopConfig):
@@ -39,6 +42,8 @@ def main(args: list[str]) -> None:
         rows = physics_rows(config)
     elif isinstance(config, AccuracyBench):
         rows = accuracy_rows(config)
+    elif isinstance(config, GradientBench):
+        rows = gradient_rows(config)
     else:
         rows = sensor_rows(config)
     report(rows, config.json)

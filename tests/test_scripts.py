@@ -383,6 +383,22 @@ def test_bench_loop_gives_its_rows(tmp_path: Path):
     assert sum(parts) == pytest.approx(1e6 / by_name["train_field"]["value"])
 
 
+def test_bench_gradients_compares_rollouts_and_leaves_the_run_alone(
+    trained: Path, tmp_path: Path
+):
+    before = {p: p.read_bytes() for p in trained.rglob("*") if p.is_file()}
+    args = ("--run", trained, "--rollouts", "3", "--json", tmp_path / "g.json")
+    done = run("bench.py", "gradients", *args)
+    assert done.returncode == 0, done.stderr
+    rows = json.loads((tmp_path / "g.json").read_text())["rows"]
+    # The run's own decay comes first.
+    names = [row["name"] for row in rows]
+    assert names[:3] == ["lambda_0.95", "lambda_0", "lambda_0.5"]
+    assert rows[0]["ratio"] == 1.0
+    assert all(-1 < row["value"] < 1 for row in rows)
+    assert {p: p.read_bytes() for p in trained.rglob("*") if p.is_file()} == before
+
+
 def test_bench_accuracy_compares_two_rates(tmp_path: Path):
     args = ("--throws", "6", "--json", tmp_path / "accuracy.json")
     done = run("bench.py", "accuracy", *args)

@@ -1,0 +1,104 @@
+"""How much of an update is signal: gradients of rollouts of one policy, compared."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from benchmarks.report import Row, show
+from egoskin.agents.ppo import PPO, add_advantages, collect
+from egoskin.runs import Run
+from egoskin.training import open_trainer
+
+
+@dataclass(frozen=True, kw_only=True)
+class GradientBench:
+    """The actor's gradients of several rollouts of a run's policy, compared."""
+
+    run: Path
+    """Run folder; a copy of it goes on from its checkpoint, without learning."""
+    rollouts: int = 8
+    """Rollouts to compare."""
+    lambdas: tuple[float, ...] = (0.0, 0.5, 0.8, 0.9, 0.95, 1.0)
+    """Decays of the advantage estimate, after the run's own."""
+    json: Path | None = None
+    """File to write the rows to."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for counts that compare nothing."""
+        if self.rollouts < 3:
+            raise ValueError(f"rollouts must be at least 3, got {self.rollouts}")
+
+
+def gradient_rows(config: GradientBench) -> list[Row]:
+    """Return the agreement for each decay.
+
+    The value is the mean cosine between the gradients of two rollouts: that between one
+    of them and the true gradient is its square root. The ratio is that of the cosines
+    with the gradient at lambda 1 of all other rollouts, which has the least bias.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "run"
+        shutil.copytree(config.run, path)
+        stored = Run.open(path).config
+        planned = dataclasses.replace(stored, resume=path)
+        gradients = _gradients(config, Run(path, planned))
+    reference = gradients[1.0]
+    others = reference.sum(0) - reference
+
+    def along(g: Tensor) -> float:
+        return float(torch.nn.functional.cosine_similarity(g, others, dim=1).mean())
+
+    own = stored.ppo.gae_lambda
+    return [
+        Row(
+            name=f"lambda_{decay:g}",
+            value=agreement(gradients[decay]),
+            unit="cosine between two rollouts",
+            ratio=along(gradients[decay]) / along(gradients[own]),
+        )
+        for decay in dict.fromkeys((own, *config.lambdas))
+    ]
+
+
+def agreement(gradients: Tensor) -> float:
+    """Return the mean cosine between two of several gradients, ``[n, P]``."""
+    unit = torch.nn.functional.normalize(gradients, dim=1)
+    n = len(unit)
+    return float(((unit @ unit.t()).sum() - n) / (n * (n - 1)))
+
+
+def _gradients(config: GradientBench, run: Run) -> dict[float, Tensor]:
+    """Return the actor's gradients for each decay, ``[rollouts, P]``."""
+    ppo_config = run.config.ppo
+    found: dict[float, list[Tensor]] = {}
+    with open_trainer(run) as trainer:
+        for i in range(config.rollouts):
+            show(f"rollout {i + 1}/{config.rollouts}")
+            rollout, trainer.root, _ = collect(
+                trainer.env,
+                trainer.agent,
+                trainer.root,
+                ppo_config.rollout_steps,
+                noise_correlation=ppo_config.noise_correlation,
+            )
+            for decay in {ppo_config.gae_lambda, *config.lambdas, 1.0}:
+                add_advantages(rollout, ppo_config.gamma, decay)
+                gradient = _actor_gradient(trainer.ppo, rollout)
+                found.setdefault(decay, []).append(gradient)
+    show("")
+    return {decay: torch.stack(each) for decay, each in found.items()}
+
+
+def _actor_gradient(ppo: PPO, rollout: TensorDict) -> Tensor:
+    """Return the gradient of PPO's objective for the mean action, ``[P]``."""
+    loss = ppo.loss(rollout.reshape(-1))["loss_objective"]
+    parameters = list(ppo.agent.head.body.parameters())
+    return torch.cat([g.flatten() for g in torch.autograd.grad(loss, parameters)])
