@@ -200,7 +200,7 @@ def _correlate(
         # AR(1), whose variance stays 1.
         noise = correlation * before + (1 - correlation**2) ** 0.5 * noise
         frame["action"] = frame["loc"] + frame["scale"] * noise
-        likelihood = agent.actor.get_dist(frame)
+        likelihood = agent.actor.build_dist_from_params(frame)
         frame["action_log_prob"] = likelihood.log_prob(frame["action"])
     return noise
 
