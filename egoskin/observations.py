@@ -10,7 +10,6 @@ from tensordict import NestedKey
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 
-from egoskin.envs.throws import GRAVITY
 from egoskin.kinematics import rotate_inverse
 from egoskin.transform import RowTransform
 
@@ -202,7 +201,7 @@ class Privileged(RowTransform):
         content: Literal["objects", "velocity"],
         num_joints: int,
         num_objects: int,
-        gravity: float = GRAVITY,
+        gravity: float,
         in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] = ("privileged_observation",),
     ) -> None:

@@ -67,8 +67,8 @@ BUILDERS = {
         in_keys=(*Proprioception.STATE_KEYS, "previous_action"),
     ),
     "oracle": Oracle,
-    "privileged objects": partial(Privileged, "objects", JOINTS, len(BALLS)),
-    "privileged velocity": partial(Privileged, "velocity", JOINTS, len(BALLS)),
+    "privileged objects": partial(Privileged, "objects", JOINTS, len(BALLS), GRAVITY),
+    "privileged velocity": partial(Privileged, "velocity", JOINTS, len(BALLS), GRAVITY),
 }
 every_transform = pytest.mark.parametrize("build", BUILDERS.values(), ids=BUILDERS)
 
@@ -220,7 +220,7 @@ def test_a_reset_works_on_batches_of_workers(build, full_state):
 
 def test_privileged_refuses_the_wrong_number_of_keys():
     with pytest.raises(ValueError, match="in_keys must name base_pose, base_lin_vel_w"):
-        Privileged("velocity", JOINTS, 2, in_keys=["base_pose"])
+        Privileged("velocity", JOINTS, 2, GRAVITY, in_keys=["base_pose"])
 
 
 # --- layouts by hand ------------------------------------------------------------
@@ -446,7 +446,7 @@ def outside(config: EnvConfig, parallel, **kwargs) -> TransformedEnv:
     ]
     transforms = [
         Proprioception(DEFAULT),
-        Privileged("objects", JOINTS, len(BALLS)),
+        Privileged("objects", JOINTS, len(BALLS), GRAVITY),
         *config.sensor.transforms(H1_2, SKIN, BALLS, dt=1 / 60),
     ]
     return TransformedEnv(parallel(2, bases, **kwargs), Compose(*transforms))
