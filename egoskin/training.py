@@ -98,7 +98,7 @@ class Trainer:
             self.root,
             self.config.ppo.rollout_steps,
             METRIC_KEYS,
-            self.config.ppo.noise_correlation,
+            self.config.ppo.noise_correlation_at(self.frames),
         )
         collected = time.perf_counter()
         try:

@@ -182,6 +182,13 @@ def test_noise_is_as_wide_as_without_correlation_and_correlated(correlation: flo
     )
 
 
+def test_the_noise_is_white_at_first():
+    config = PPOConfig(noise_correlation=0.5, noise_correlation_start=1000)
+    found = [config.noise_correlation_at(n) for n in (0, 999, 1000, 5000)]
+    assert found == [0.0, 0.0, 0.5, 0.5]
+    assert PPOConfig(noise_correlation=0.5).noise_correlation_at(0) == 0.5
+
+
 def test_the_entropy_bonus_falls_to_zero():
     config = PPOConfig(entropy_coeff=0.004, entropy_frames=1000)
     shares = [config.entropy_coeff_at(n) / 0.004 for n in (0, 250, 1000, 5000)]
@@ -298,6 +305,7 @@ def test_shares_of_a_minibatch_add_up_to_the_whole(threads: int):
         {"desired_kl": -1.0},
         {"ppo_epochs": 0},
         {"noise_correlation": 1.0},
+        {"noise_correlation_start": -1},
         {"entropy_frames": 0},
     ],
 )

@@ -71,6 +71,8 @@ class PPOConfig:
     noise_correlation: float = 0.0
     """Correlation of the exploration noise with that of the step before, within a
     rollout (white noise at 60 Hz hardly moves a body)."""
+    noise_correlation_start: int = 0
+    """Frames before which the noise is white all the same."""
     clip_epsilon: float = 0.2
     """Clip range of the probability ratio."""
     entropy_coeff: float = 0.0
@@ -106,11 +108,20 @@ class PPOConfig:
             value = getattr(self, name)
             if value is not None and not 0 <= value <= 1:
                 raise ValueError(f"{name} must be between 0 and 1, got {value}")
+        if self.noise_correlation_start < 0:
+            raise ValueError(
+                f"noise_correlation_start must not be negative, got "
+                f"{self.noise_correlation_start}"
+            )
         if not 0 <= self.noise_correlation < 1:
             raise ValueError(
                 f"noise_correlation must be at least 0 and below 1, got "
                 f"{self.noise_correlation}"
             )
+
+    def noise_correlation_at(self, frames: int) -> float:
+        """Return the correlation of the noise after a number of frames."""
+        return self.noise_correlation if frames >= self.noise_correlation_start else 0.0
 
     def entropy_coeff_at(self, frames: int) -> float:
         """Return the weight of the entropy bonus after a number of frames."""
@@ -136,7 +147,7 @@ def collect(
         root: Tensordict to start from.
         num_steps: Number of steps ``T``.
         info_keys: What else to keep of what the environment says, for metrics.
-        noise_correlation: See `PPOConfig`.
+        noise_correlation: Of the noise with that of the step before.
 
     Returns:
         The rollout ``[T, N]`` with the agent's ``inputs``, what it normalises, and

@@ -87,7 +87,7 @@ def _gradients(config: GradientBench, run: Run) -> dict[float, Tensor]:
                 trainer.agent,
                 trainer.root,
                 ppo_config.rollout_steps,
-                noise_correlation=ppo_config.noise_correlation,
+                noise_correlation=ppo_config.noise_correlation_at(trainer.frames),
             )
             for decay in {ppo_config.gae_lambda, *config.lambdas, 1.0}:
                 add_advantages(rollout, ppo_config.gamma, decay)
