@@ -28,7 +28,7 @@ from egoskin.sensors import Skin
 _AGES = (1.0, 2.0, 3.0)
 # Bounds of the groups by height aimed at [m] and by speed at arrival [m/s]: about a
 # third of the standard throws in each.
-_HEIGHTS, _SPEEDS = (0.9, 1.2), (8.0, 9.0)
+_HEIGHTS, _SPEEDS = (0.9, 1.2), (5.3, 6.7)
 _QUARTERS = ("front", "left", "back", "right")
 # A point of a foot this close to the floor stands on it [m] (contacts give way a
 # little, so zero is too strict).

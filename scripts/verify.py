@@ -23,6 +23,7 @@ from typing import Annotated
 import torch
 import tyro
 
+from egoskin.agents.ppo import PPOConfig
 from egoskin.checkpoint import load_tensors
 from egoskin.cli import clear_errors, counted
 from egoskin.make import EnvConfig
@@ -33,6 +34,9 @@ from egoskin.training import open_trainer, train
 _SPLITS = ((1, 1), (2, 2), (4, 3))
 # Divisors of an odd number of agents: rows of a worker that fill no vector.
 _ODD_SPLITS = ((1, 1), (3, 1), (5, 2))
+
+# What a training does from some millions of frames on, it does here from the start.
+_LATE = PPOConfig(noise_correlation_start=0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,7 +145,9 @@ def main(args: list[str]) -> None:
     with tempfile.TemporaryDirectory(prefix="egoskin-verify-") as folder:
         for title, env in skins.items():
             for num_envs in (config.num_envs, config.odd_num_envs):
-                base = TrainConfig(env=env, seed=config.seed, num_envs=num_envs)
+                base = TrainConfig(
+                    env=env, seed=config.seed, num_envs=num_envs, ppo=_LATE
+                )
                 frames = config.iterations * base.frames_per_batch
                 planned = dataclasses.replace(base, total_frames=frames)
                 half = config.iterations // 2

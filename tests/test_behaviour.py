@@ -108,7 +108,7 @@ def test_heights_and_speeds_are_split_at_their_bounds():
         "above 1.2 m",
     ]
     fast = groups["speed at arrival"][-1]
-    assert (fast.name, fast.episodes) == ("above 9 m/s", int((speed > 9).sum()))
+    assert (fast.name, fast.episodes) == ("above 6.7 m/s", int((speed > 6.7).sum()))
 
 
 def state(n: int, **values) -> TensorDict:

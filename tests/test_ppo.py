@@ -186,14 +186,15 @@ def test_the_noise_is_white_at_first():
     config = PPOConfig(noise_correlation=0.5, noise_correlation_start=1000)
     found = [config.noise_correlation_at(n) for n in (0, 999, 1000, 5000)]
     assert found == [0.0, 0.0, 0.5, 0.5]
-    assert PPOConfig(noise_correlation=0.5).noise_correlation_at(0) == 0.5
+    assert PPOConfig(noise_correlation_start=0).noise_correlation_at(0) == 0.5
 
 
 def test_the_entropy_bonus_falls_to_zero():
     config = PPOConfig(entropy_coeff=0.004, entropy_frames=1000)
     shares = [config.entropy_coeff_at(n) / 0.004 for n in (0, 250, 1000, 5000)]
     assert shares == pytest.approx([1.0, 0.75, 0.0, 0.0])
-    assert PPOConfig(entropy_coeff=0.004).entropy_coeff_at(10**9) == 0.004
+    steady = PPOConfig(entropy_coeff=0.004, entropy_frames=None)
+    assert steady.entropy_coeff_at(10**9) == 0.004
 
     def learnt(frames: int) -> float:
         agent = bandit_agent()

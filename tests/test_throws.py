@@ -244,6 +244,7 @@ def test_the_speed_is_horizontal_if_ballistic_and_whole_if_straight(
 
 # 4 m away, to a target at the height of release.
 LEVEL = ThrowConfig(
+    flight="ballistic",
     aim="box",
     box_half_width=0.0,
     box_height=(2.0, 2.0),
@@ -283,7 +284,7 @@ def at_standing(thrower: Thrower, drawn) -> tuple[torch.Tensor, Release]:
 
 @pytest.mark.parametrize("aim", ["body", "box"])
 def test_a_total_speed_is_that_of_the_lower_arc_to_a_standing_robot(aim):
-    config = ThrowConfig(aim=aim, speed_is="total")
+    config = ThrowConfig(flight="ballistic", aim=aim, speed_is="total")
     thrower = make(config)
     drawn = draw(thrower)
     target, release = at_standing(thrower, drawn)
@@ -306,7 +307,8 @@ def test_a_total_speed_is_that_of_the_lower_arc_to_a_standing_robot(aim):
 
 def test_draws_of_a_total_speed_that_cannot_arrive_are_drawn_again():
     n = 4096
-    plain, total = make(ThrowConfig()), make(ThrowConfig(speed_is="total"))
+    plain = make(ThrowConfig(flight="ballistic"))
+    total = make(ThrowConfig(flight="ballistic", speed_is="total"))
     once, again = draw(plain, n), draw(total, n)
     target, release = at_standing(plain, once)
     gap = target - release.position
@@ -349,8 +351,9 @@ def test_the_speed_of_a_straight_throw_is_the_whole_in_either_case():
 # --- invariances ----------------------------------------------------------------
 
 
-def test_turning_the_robot_turns_the_throw():
-    thrower = make(ThrowConfig())
+@pytest.mark.parametrize("flight", FLIGHTS)
+def test_turning_the_robot_turns_the_throw(flight):
+    thrower = make(ThrowConfig(flight=flight))
     drawn, (base_pose, joint_pos) = draw(thrower), poses()
     generator = torch.Generator().manual_seed(3)
     velocity = torch.randn(N, 3, generator=generator)
@@ -370,9 +373,12 @@ def test_turning_the_robot_turns_the_throw():
     torch.testing.assert_close(again.velocity, expected, atol=1e-4, rtol=1e-4)
 
 
-@pytest.mark.parametrize("speed_is", ["horizontal", "total"])
-def test_a_padded_subset_is_thrown_to_the_same_bits(speed_is):
-    thrower = make(ThrowConfig(speed_is=speed_is))
+@pytest.mark.parametrize(
+    ("flight", "speed_is"),
+    [("straight", "horizontal"), ("ballistic", "horizontal"), ("ballistic", "total")],
+)
+def test_a_padded_subset_is_thrown_to_the_same_bits(flight, speed_is):
+    thrower = make(ThrowConfig(flight=flight, speed_is=speed_is))
     drawn, (base_pose, joint_pos) = draw(thrower), poses()
     velocity = torch.ones(N, 3)
     whole = thrower.release(drawn, base_pose, velocity, joint_pos)
@@ -397,8 +403,8 @@ def test_a_padded_subset_is_thrown_to_the_same_bits(speed_is):
 @pytest.mark.parametrize(
     "throws",
     [
-        ThrowConfig(),
-        ThrowConfig(speed_is="total"),
+        ThrowConfig(flight="ballistic"),
+        ThrowConfig(flight="ballistic", speed_is="total"),
         ThrowConfig(flight="straight"),
     ],
     ids=["ballistic", "ballistic, total speed", "straight"],

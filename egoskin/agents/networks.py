@@ -30,7 +30,7 @@ class NetworkConfig:
 
     hidden: tuple[int, ...] = (32, 32)
     """Units of the hidden layers, the same for actor and critic."""
-    init_std: float = 0.5
+    init_std: float = 0.8
     """Standard deviation of the action at the start."""
     std_bounds: tuple[float, float] = (0.1, 1.0)
     """The standard deviation never leaves these bounds."""

@@ -62,22 +62,22 @@ class PPOConfig:
     """Passes over a rollout."""
     num_mini_batches: int = 4
     """Minibatches in each pass."""
-    gamma: float = 0.99
+    gamma: float = 0.995
     """Discount for each control step."""
-    gae_lambda: float = 0.95
-    """Decay of the generalised advantage estimate."""
-    value_lambda: float | None = None
+    gae_lambda: float = 0.8
+    """Decay of the generalised advantage estimate that the actor learns from."""
+    value_lambda: float | None = 0.95
     """Decay of the estimate that the critic learns from; None is gae_lambda."""
-    noise_correlation: float = 0.0
+    noise_correlation: float = 0.5
     """Correlation of the exploration noise with that of the step before, within a
     rollout (white noise at 60 Hz hardly moves a body)."""
-    noise_correlation_start: int = 0
+    noise_correlation_start: int = 16_000_000
     """Frames before which the noise is white all the same."""
     clip_epsilon: float = 0.2
     """Clip range of the probability ratio."""
-    entropy_coeff: float = 0.0
+    entropy_coeff: float = 0.003
     """Weight of the entropy bonus at the start."""
-    entropy_frames: int | None = None
+    entropy_frames: int | None = 65_536_000
     """It falls linearly to zero over this many frames; None keeps it."""
     critic_coeff: float = 1.0
     """Weight of the value loss."""

@@ -32,7 +32,7 @@ class DodgeballConfig:
     """The balls and how they are thrown."""
     reward: RewardConfig = field(default_factory=RewardConfig)
     """Weights of the reward terms."""
-    action_scale: float = 1.0
+    action_scale: float = 0.3
     """q* = q_default + action_scale x torque limit / kp x action, per joint."""
     one_action_scale: float | None = None
     """The same scale for all joints instead [rad]."""

@@ -36,7 +36,7 @@ _MAX_SPEED = 200.0
 class PhysicsConfig:
     """Actuation, rates and accuracy of the simulation."""
 
-    gains: str = "real"
+    gains: str = "rotor_inertia"
     """Named PD gain set of the robot ("real", "rotor_inertia")."""
     control_hz: float = 60.0
     """Rate at which the policy acts [Hz]."""

@@ -22,7 +22,7 @@ class RewardConfig:
     """For every control step without contact or fall."""
     upright: float = 0.01
     """Posture: times exp(-|gravity_xy|^2 / 0.2), the horizontal part in the base."""
-    posture: float = -0.02
+    posture: float = -0.05
     """Posture: times the mean squared deviation from the default pose [rad^2]."""
     energy: float = -5e-7
     """Times the mechanical power, sum |torque x velocity| [W]."""

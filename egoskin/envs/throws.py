@@ -65,8 +65,8 @@ class ThrowConfig:
     """For aim=box: height above ground [m]."""
     lead: float = 1.0
     """Share of the base's planar velocity by which the aim is led."""
-    flight: Literal["ballistic", "straight"] = "ballistic"
-    """With gravity, or without weight at constant speed."""
+    flight: Literal["ballistic", "straight"] = "straight"
+    """With gravity, or without weight at constant speed (the last 2 m take longer)."""
     on_ground: Literal["inactive", "bounce"] = "inactive"
     """A ball that has touched the ground is out of play, or rolls on and counts."""
 
