@@ -1,7 +1,7 @@
 """Evaluate a policy on a fixed bank of throws.
 
 python scripts/evaluate.py runs/NAME
-python scripts/evaluate.py oracle
+python scripts/evaluate.py localization
 python scripts/evaluate.py runs/NAME/policies/000005046272.safetensors --json out.json
 python scripts/evaluate.py runs/NAME --behaviour --check-substeps 8
 """

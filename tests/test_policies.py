@@ -16,7 +16,7 @@ ASSETS = Path(egoskin.__file__).parent / "assets" / "policies"
 
 def test_all_files_of_the_folder_are_policies_known_by_name():
     assert shipped_policies() == sorted(path.stem for path in ASSETS.iterdir())
-    assert "oracle" in shipped_policies()
+    assert "localization" in shipped_policies()
 
 
 @pytest.mark.parametrize("name", shipped_policies())
@@ -34,15 +34,17 @@ def test_a_shipped_policy_acts_in_the_environment_it_was_trained_in(name):
 
 def test_a_file_that_is_there_comes_before_a_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "oracle").write_bytes(b"mine")
-    with pytest.raises(ValueError, match="oracle is"):
-        egoskin.load_policy("oracle")
+    (tmp_path / "localization").write_bytes(b"mine")
+    with pytest.raises(ValueError, match="localization is"):
+        egoskin.load_policy("localization")
 
 
-@pytest.mark.parametrize("name", ["orcle", "../oracle", "oracle.safetensors"])
+@pytest.mark.parametrize(
+    "name", ["localisation", "../localization", "localization.safetensors"]
+)
 def test_an_unknown_name_lists_those_there_are(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(ValueError, match=rf"no policy {name}: .*oracle"):
+    with pytest.raises(ValueError, match=rf"no policy {name}: .*localization"):
         egoskin.load_policy(name)
 
 
