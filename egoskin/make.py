@@ -19,7 +19,7 @@ from torchrl.envs import (
 
 from egoskin.checkpoint import part, prefixed
 from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
-from egoskin.observations import Oracle, Privileged, Proprioception
+from egoskin.observations import Numb, Oracle, Privileged, Proprioception
 from egoskin.robots import ROBOTS, RobotConfig
 from egoskin.sensors import History, Skin
 from egoskin.sensors.config import SensorConfig, SkinConfig
@@ -150,6 +150,8 @@ def make_worker_env(
                 throws.gravity,
             ),
         ]
+        if config.sensor.numb:
+            transforms.append(Numb())
         if not sparse:
             transforms += config.sensor.transforms(
                 robot,
@@ -167,7 +169,8 @@ def make_worker_env(
             new = [f"{key}{suffix}" for key in config.actor_keys]
             transforms.append(History(config.history, new, config.actor_keys))
     if not keep_raw:
-        kept = {*_NETWORK_KEYS, *(k for t in transforms for k in _state_keys(t))}
+        states = (key for t in transforms for key in _state_keys(t))
+        kept = {*_NETWORK_KEYS, *_RAW_KEYS, *states}
         written = dict.fromkeys(key for t in transforms for key in t.out_keys)
         between = [key for key in written if key not in kept]
         unread = [key for key in _RAW_KEYS if not (sparse and key in STATE_KEYS)]

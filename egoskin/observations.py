@@ -130,6 +130,32 @@ def approaches_b(
     return (torch.cat((nearness, passing), -1) * flag).flatten(1)
 
 
+class Numb(RowTransform):
+    """Hides all objects from the transforms after it.
+
+    Reads ``object_active [*B, O]`` and writes it again, false.
+
+    Args:
+        in_keys: Key of the flags.
+        out_keys: The same.
+    """
+
+    def __init__(
+        self,
+        in_keys: Sequence[NestedKey] = ("object_active",),
+        out_keys: Sequence[NestedKey] = ("object_active",),
+    ) -> None:
+        super().__init__(in_keys, out_keys)
+
+    def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """Return the flags, ``[B, O]``."""
+        return (torch.zeros_like(inputs[0]),)
+
+    def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
+        """Return the spec of the flags."""
+        return (spec[self.in_keys[0]].clone(),)
+
+
 class Oracle(RowTransform):
     """What every ball does: a diagnostic of the task, no sensor can give it.
 

@@ -47,6 +47,9 @@ class EvaluateConfig:
     check_substeps: int | None = None
     """Play the bank once more with this many physics steps in each control step, and
     say what is lost (8: 480 Hz)."""
+    numb: bool = False
+    """Play the bank once more with sensors that are told of no ball, and say what is
+    lost: the rest is done blindly."""
     json: Path | None = None
     """File to write the figures to."""
 
@@ -167,6 +170,11 @@ def main(args: list[str]) -> None:
     if config.check_substeps is not None:
         checked_config = with_substeps(env_config, config.check_substeps)
         checked = evaluate(policy, checked_config, policy.skin, **bank)
+    numb = None
+    if config.numb:
+        sensor = dataclasses.replace(env_config.sensor, numb=True)
+        numb_config = dataclasses.replace(env_config, sensor=sensor)
+        numb = evaluate(policy, numb_config, policy.skin, **bank)
     if sys.stderr.isatty():
         print("\r\x1b[K", end="", file=sys.stderr)
     title = (
@@ -184,6 +192,12 @@ def main(args: list[str]) -> None:
         print(f"  success lost by the other physics rate: {lost:.2f} points")
         content["check_substeps"] = config.check_substeps
         content["checked"] = dataclasses.asdict(checked)
+    if numb is not None:
+        numb_title = title + physics_rate(env_config) + ", sensors numb"
+        print("\n" + table(numb, numb_title))
+        lost = 100 * (result.success.mean - numb.success.mean)
+        print(f"  success lost without what the sensors tell: {lost:.2f} points")
+        content["numb"] = dataclasses.asdict(numb)
     if config.json is not None:
         config.json.write_text(json.dumps(content, indent=2) + "\n")
 

@@ -153,17 +153,18 @@ def test_an_evaluation_says_what_the_policy_does_and_at_another_physics_rate(
     done = run(
         "evaluate.py",
         *(trained, "--episodes", "16", "--json", tmp_path / "out.json"),
-        *("--behaviour", "--check-substeps", "8"),
+        *("--behaviour", "--check-substeps", "8", "--numb"),
     )
     assert done.returncode == 0, done.stderr
     assert "physics at 120 Hz" in done.stdout
     assert "physics at 480 Hz" in done.stdout
     assert "success lost by the other physics rate" in done.stdout
+    assert "success lost without what the sensors tell" in done.stdout
     assert "speed at arrival" in done.stdout
     assert "mechanical power" in done.stdout
     result = json.loads((tmp_path / "out.json").read_text())
     assert result["check_substeps"] == 8
-    assert result["checked"]["episodes"] == 16
+    assert result["checked"]["episodes"] == result["numb"]["episodes"] == 16
     # Another rate is another course of events.
     assert result["checked"]["survival_time"] != result["survival_time"]
     groups = result["behaviour"]["throws"]["direction"]

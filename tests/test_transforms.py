@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -401,6 +402,36 @@ def test_environment_keeps_its_specs(sensor):
     check_env_specs(env)
     env = make_worker_env(config, SKIN, num_envs=6, seed=0, keep_raw=True)
     check_env_specs(env)
+
+
+@pytest.mark.parametrize("sparse", [False, True])
+@pytest.mark.parametrize("keep_raw", [False, True])
+def test_numb_sensors_feel_no_ball_and_the_critic_is_still_told(sparse, keep_raw):
+    # Within 5 m of the body nearly all balls are felt.
+    sensor = SensorConfig(coverage="ray", range=5.0)
+    feeling, numb = (
+        make_worker_env(
+            EnvConfig(sensor=replace(sensor, numb=numb)),
+            SKIN,
+            num_envs=6,
+            seed=0,
+            sparse=sparse,
+            keep_raw=keep_raw,
+        )
+        for numb in (False, True)
+    )
+    felt = False
+    for one, other in zip(run(feeling, 40), run(numb, 40), strict=True):
+        assert torch.equal(one["done"], other["done"])
+        told = "privileged_observation"
+        assert torch.equal(one[told], other[told])
+        if sparse or keep_raw:
+            assert not other["object_active"].any()
+        if not sparse:
+            assert (other["signal"] == 1).all()
+        felt |= bool((one["object_active"] if sparse else one["signal"] < 1).any())
+    assert felt
+    check_env_specs(numb)
 
 
 @pytest.mark.parametrize("content", ["objects", "velocity"])

@@ -111,6 +111,8 @@ class SensorConfig:
         default_factory=LocalizationConfig
     )
     """The position of the ball (signal=localization)."""
+    numb: bool = False
+    """Tell the sensors, or the oracle, of no ball: what does a policy do blindly?"""
 
     def __post_init__(self) -> None:
         """Raise ValueError for a range that is not positive, or what has no effect."""
