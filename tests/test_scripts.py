@@ -394,7 +394,7 @@ def test_bench_gradients_compares_rollouts_and_leaves_the_run_alone(
     rows = json.loads((tmp_path / "g.json").read_text())["rows"]
     # The run's own decay comes first.
     names = [row["name"] for row in rows]
-    assert names[:3] == ["lambda_0.95", "lambda_0", "lambda_0.5"]
+    assert names[:3] == ["lambda_0.8", "lambda_0", "lambda_0.5"]
     assert rows[0]["ratio"] == 1.0
     assert all(-1 < row["value"] < 1 for row in rows)
     assert {p: p.read_bytes() for p in trained.rglob("*") if p.is_file()} == before

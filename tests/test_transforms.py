@@ -475,9 +475,10 @@ def outside(config: EnvConfig, parallel, **kwargs) -> TransformedEnv:
         partial(DodgeballEnv, H1_2, config.task, num_envs=3, seed=5, row_offset=i)
         for i in (0, 3)
     ]
+    gravity = config.task.throws.gravity
     transforms = [
         Proprioception(DEFAULT),
-        Privileged("objects", JOINTS, len(BALLS), GRAVITY),
+        Privileged("objects", JOINTS, len(BALLS), gravity),
         *config.sensor.transforms(H1_2, SKIN, BALLS, dt=1 / 60),
     ]
     return TransformedEnv(parallel(2, bases, **kwargs), Compose(*transforms))

@@ -73,12 +73,12 @@ class _Simulation:
 
     def __init__(self, robot: RobotConfig, config: PhysicsConfig) -> None:
         self._robot, throws = robot, ThrowConfig(num_balls=1)
-        self._mass = throws.mass
+        self._mass, self._gravity = throws.mass, throws.gravity
         self.model = build_scene(
             robot,
             throws.balls,
             config,
-            weightless_objects=False,
+            weightless_objects=not self._gravity,
             objects_bounce=False,
             object_mass=self._mass,
         )
@@ -134,7 +134,7 @@ class _Simulation:
             return _Impact(time=np.nan, link=-1, impulse=np.nan, base=nothing)
         change = self._mass * self.data.qvel[-3:] - momentum
         # Gravity's share of the time since.
-        change[2] -= self._mass * self.model.opt.gravity[2] * _AFTER
+        change[2] += self._mass * self._gravity * _AFTER
         return _Impact(
             time=met,
             link=link,

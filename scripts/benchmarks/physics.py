@@ -49,7 +49,7 @@ def physics_rows(config: PhysicsBench) -> list[Row]:
             robot,
             ThrowConfig().balls,
             physics_config,
-            weightless_objects=False,
+            weightless_objects=not ThrowConfig().gravity,
             objects_bounce=False,
             object_mass=ThrowConfig().mass,
         )
