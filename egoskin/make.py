@@ -169,10 +169,9 @@ def make_worker_env(
             new = [f"{key}{suffix}" for key in config.actor_keys]
             transforms.append(History(config.history, new, config.actor_keys))
     if not keep_raw:
-        states = (key for t in transforms for key in _state_keys(t))
-        kept = {*_NETWORK_KEYS, *_RAW_KEYS, *states}
+        kept = {*_NETWORK_KEYS, *(k for t in transforms for k in _state_keys(t))}
         written = dict.fromkeys(key for t in transforms for key in t.out_keys)
-        between = [key for key in written if key not in kept]
+        between = [key for key in written if key not in {*kept, *_RAW_KEYS}]
         unread = [key for key in _RAW_KEYS if not (sparse and key in STATE_KEYS)]
         transforms.append(ExcludeTransform(*unread, *between))
     return TransformedEnv(env, Compose(transforms))

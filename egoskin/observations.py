@@ -136,16 +136,11 @@ class Numb(RowTransform):
     Reads ``object_active [*B, O]`` and writes it again, false.
 
     Args:
-        in_keys: Key of the flags.
-        out_keys: The same.
+        keys: Key of the flags.
     """
 
-    def __init__(
-        self,
-        in_keys: Sequence[NestedKey] = ("object_active",),
-        out_keys: Sequence[NestedKey] = ("object_active",),
-    ) -> None:
-        super().__init__(in_keys, out_keys)
+    def __init__(self, keys: Sequence[NestedKey] = ("object_active",)) -> None:
+        super().__init__(keys, keys)
 
     def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Return the flags, ``[B, O]``."""

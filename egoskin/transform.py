@@ -96,7 +96,7 @@ class RowTransform(_KeyedTransform):
     with any leading dimensions (a stored batch with time, for example).
 
     Args:
-        in_keys: Keys read; never written.
+        in_keys: Keys read; written only if they are out keys, too.
         out_keys: Keys written.
     """
 

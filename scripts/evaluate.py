@@ -166,15 +166,19 @@ def main(args: list[str]) -> None:
         result, behaviour = behave(policy, env_config, policy.skin, **bank)
     else:
         result = evaluate(policy, env_config, policy.skin, **bank)
-    checked_config, checked = env_config, None
+    # Under each one's name: what is changed, and how the success lost by it is called.
+    changes: dict[str, tuple[EnvConfig, str]] = {}
     if config.check_substeps is not None:
-        checked_config = with_substeps(env_config, config.check_substeps)
-        checked = evaluate(policy, checked_config, policy.skin, **bank)
-    numb = None
+        changed = with_substeps(env_config, config.check_substeps)
+        changes["checked"] = changed, "by the other physics rate"
     if config.numb:
         sensor = dataclasses.replace(env_config.sensor, numb=True)
-        numb_config = dataclasses.replace(env_config, sensor=sensor)
-        numb = evaluate(policy, numb_config, policy.skin, **bank)
+        changed = dataclasses.replace(env_config, sensor=sensor)
+        changes["numb"] = changed, "without what the sensors tell"
+    again = {
+        name: evaluate(policy, changed, policy.skin, **bank)
+        for name, (changed, _) in changes.items()
+    }
     if sys.stderr.isatty():
         print("\r\x1b[K", end="", file=sys.stderr)
     title = (
@@ -186,18 +190,14 @@ def main(args: list[str]) -> None:
     if behaviour is not None:
         print(behaviour_table(behaviour))
         content["behaviour"] = dataclasses.asdict(behaviour)
-    if checked is not None:
-        print("\n" + table(checked, title + physics_rate(checked_config)))
-        lost = 100 * (result.success.mean - checked.success.mean)
-        print(f"  success lost by the other physics rate: {lost:.2f} points")
+    if config.check_substeps is not None:
         content["check_substeps"] = config.check_substeps
-        content["checked"] = dataclasses.asdict(checked)
-    if numb is not None:
-        numb_title = title + physics_rate(env_config) + ", sensors numb"
-        print("\n" + table(numb, numb_title))
-        lost = 100 * (result.success.mean - numb.success.mean)
-        print(f"  success lost without what the sensors tell: {lost:.2f} points")
-        content["numb"] = dataclasses.asdict(numb)
+    for name, (changed, how) in changes.items():
+        rate = physics_rate(changed) + ", sensors numb" * changed.sensor.numb
+        print("\n" + table(again[name], title + rate))
+        lost = 100 * (result.success.mean - again[name].success.mean)
+        print(f"  success lost {how}: {lost:.2f} points")
+        content[name] = dataclasses.asdict(again[name])
     if config.json is not None:
         config.json.write_text(json.dumps(content, indent=2) + "\n")
 

@@ -235,7 +235,7 @@ class DodgeballEnv(EnvBase):
                 self.robot,
                 throws.balls,
                 config.physics,
-                weightless_objects=throws.flight == "straight",
+                weightless_objects=not throws.gravity,
                 objects_bounce=throws.on_ground == "bounce",
                 object_mass=throws.mass,
             )
