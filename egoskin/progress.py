@@ -35,6 +35,8 @@ class ProgressLine:
             f"success {metrics['episode/success']:6.1%}  "
             f"reward {metrics['reward/mean']:+.4f}"
         )
+        if metrics["episode/ball_speed"] < 1:
+            text += f"  balls at {metrics['episode/ball_speed']:.0%} of their speed"
         if self._live:
             print(f"\r{text}\x1b[K", end="", flush=True)
         elif now - self._shown >= _FILE_INTERVAL or frames >= self._total:

@@ -19,6 +19,7 @@ import torch
 
 import egoskin
 from egoskin.checkpoint import load_tensors
+from egoskin.workers import WorkerPool
 
 ROOT = Path(__file__).parents[1]
 SMALL = ["--num-envs", "32", "--num-workers", "2", "--ppo.num-mini-batches", "2"]
@@ -85,6 +86,22 @@ def test_a_run_folder_holds_what_is_needed_to_understand_it(trained: Path):
     assert list(trained.glob("events.out.tfevents.*"))
     names = [path.stem for path in sorted((trained / "policies").iterdir())]
     assert names == ["000000000000", f"{4 * BATCH:012d}"]
+
+
+def test_balls_are_slow_at_first(tmp_path: Path, monkeypatch):
+    speeds = []
+    throw = WorkerPool.set_ball_speed
+    monkeypatch.setattr(
+        *(WorkerPool, "set_ball_speed"),
+        lambda pool, share: speeds.append(share) or throw(pool, share),
+    )
+    args = ("--slow-start-frames", 2 * BATCH, "--total-frames", 4 * BATCH)
+    done = run("ppo.py", *SMALL, "--run-dir", tmp_path / "run", *args)
+    assert done.returncode == 0, done.stderr
+    assert speeds == pytest.approx([0.4, 0.7, 1.0])
+    logged = [float(row["episode/ball_speed"]) for row in metrics(tmp_path / "run")]
+    assert logged == pytest.approx([0.4, 0.7, 1.0, 1.0])
+    assert "balls at 40% of their speed" in done.stdout
 
 
 def test_a_resumed_run_equals_one_that_never_stopped(trained: Path, tmp_path: Path):
