@@ -149,7 +149,13 @@ def main(args: list[str]) -> None:
                     env=env, seed=config.seed, num_envs=num_envs, ppo=_LATE
                 )
                 frames = config.iterations * base.frames_per_batch
-                planned = dataclasses.replace(base, total_frames=frames)
+                planned = dataclasses.replace(
+                    base,
+                    total_frames=frames,
+                    # Balls that still arrive within few rollouts.
+                    slow_start=0.8,
+                    slow_start_frames=frames,
+                )
                 half = config.iterations // 2
                 equal &= agree(planned, Path(folder), title, half)
     if not equal:
