@@ -56,11 +56,11 @@ class TrainConfig:
     ppo: PPOConfig = field(default_factory=PPOConfig)
     """Networks and PPO."""
     slow_start: float = 0.4
-    """Share of their speed that balls are thrown with at first, if there is a slow
-    start. Evaluation always throws at the full speed."""
-    slow_start_frames: int = 0
-    """Environment steps over which that share grows to 1; 0: no slow start, as in the
-    paper."""
+    """Share of their speed that balls are thrown with at first. Evaluation always
+    throws at the full speed."""
+    slow_start_frames: int = 12_288_000
+    """Environment steps over which that share grows to 1 (a curriculum); 0: the full
+    speed from the start, as in the paper."""
     seed: int = 0
     """Seed of everything random: throws, starts, networks, actions."""
     total_frames: int = 65_536_000
