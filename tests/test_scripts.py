@@ -19,6 +19,7 @@ import torch
 
 import egoskin
 from egoskin.checkpoint import load_tensors
+from egoskin.runs import TrainConfig
 from egoskin.workers import WorkerPool
 
 ROOT = Path(__file__).parents[1]
@@ -102,6 +103,14 @@ def test_balls_are_slow_at_first(tmp_path: Path, monkeypatch):
     logged = [float(row["episode/ball_speed"]) for row in metrics(tmp_path / "run")]
     assert logged == pytest.approx([0.4, 0.7, 1.0, 1.0])
     assert "balls at 40% of their speed" in done.stdout
+
+
+@pytest.mark.parametrize(
+    "field", [{"slow_start": 0.0}, {"slow_start": 1.5}, {"slow_start_frames": -1}]
+)
+def test_a_slow_start_outside_its_range_is_refused(field: dict):
+    with pytest.raises(ValueError, match=next(iter(field))):
+        TrainConfig(**field)
 
 
 def test_a_resumed_run_equals_one_that_never_stopped(trained: Path, tmp_path: Path):
