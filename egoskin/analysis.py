@@ -24,6 +24,7 @@ from egoskin.approaches import (
     Trace,
     direction_grid,
     direction_paths,
+    farthest,
     surface_paths,
     throw_paths,
     trace,
@@ -277,7 +278,7 @@ def analyse(
         raise ValueError(f"num_throws must be at least 1, got {num_throws}")
     body, ball = StandingRobot(robot), Sphere(radius=throws.radius)
     skin.check_links(robot.links)
-    far = max(every)
+    far = farthest(skin, coverages, ranges)
 
     def follow(what: str, paths: Tensor) -> Trace:
         def tell(name: str, share: float) -> None:

@@ -137,6 +137,22 @@ class Trace:
         return torch.where(self.seen, at_first, 0.0)
 
 
+def farthest(
+    skin: Skin, coverages: Mapping[str, Coverage], ranges: Sequence[float]
+) -> float:
+    """Return how far any sensor sees in any cell [m].
+
+    Args:
+        skin: The sensors.
+        coverages: Coverages by name, for sensors without one of their own.
+        ranges: Ranges, for sensors without one of their own [m].
+    """
+    return max(
+        float(skin.filled(coverage, max(ranges)).reach().max())
+        for coverage in coverages.values()
+    )
+
+
 def _sensors(
     robot: RobotConfig,
     skin: Skin,
@@ -210,9 +226,9 @@ def trace(
         The traces; cells in the order of coverages and, within one, of ranges.
     """
     n, steps, _ = position.shape
-    far = float(np.nanmax([*ranges, *skin.range]))
+    longest = float(np.nanmax([*ranges, *skin.range]))
     # A sensor that stands off the body sees as much farther than the body is near.
-    near = far + body.standoff(skin)
+    near = farthest(skin, coverages, ranges) + body.standoff(skin)
     flat = position.reshape(-1, 3)
     distance = [
         body.distance(part.double().numpy(), ball.radius + near)
@@ -231,7 +247,7 @@ def trace(
     rows = visible.reshape(-1).nonzero()[:, 0]
     num_sensors = torch.zeros(len(coverages), len(ranges), n * steps, dtype=torch.int16)
     for c, (name, coverage) in enumerate(coverages.items()):
-        sensors, own = _sensors(body.config, skin, coverage, far, ball, occlusion)
+        sensors, own = _sensors(body.config, skin, coverage, longest, ball, occlusion)
         limits = [torch.where(own.isnan(), r, own) for r in ranges]
         # One measurement at the longest range serves all ranges.
         for k, chunk in enumerate(rows.split(_CHUNK)):

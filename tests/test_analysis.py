@@ -371,6 +371,16 @@ def test_sensors_of_their_own_kind_and_range_keep_them(body, skin, thrown):
     assert rays.any()
 
 
+def test_what_a_cell_sees_does_not_depend_on_the_others(body, skin):
+    # A depth of 0.5 m at the corner of the view is 0.57 m away.
+    paths, _ = throw_paths(body, ThrowConfig(), 60, 0, 1 / 120)
+    depth = {"depth": Ray(measure="depth")}
+    alone = trace(body, paths, skin, depth, [0.5], BALL).num_sensors[0]
+    beside = trace(body, paths, skin, depth, [0.5, 1.0], BALL).num_sensors[0]
+    assert torch.equal(alone, beside)
+    assert alone.any()
+
+
 def test_nothing_is_seen_after_the_contact(thrown):
     steps = torch.arange(thrown.gap.shape[1])
     after = steps >= thrown.contact[:, None]

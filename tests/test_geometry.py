@@ -67,6 +67,7 @@ def test_poses_of_inactive_objects_are_not_looked_at(skin, random_state, kind):
         ("object_pose", lambda x: x[:, :1], "for 2 objects, 'object_pose' holds 1"),
         ("object_pose", lambda x: x[..., :3], "'object_pose' must hold 7 num.*got 3"),
         ("base_pose", lambda x: x[:, :6], "'base_pose' must hold 7 numbers.*got 6"),
+        ("base_pose", lambda x: x[:, None], r"must be \[\*B, 7\], got \[1, 7\] after"),
     ],
 )
 @every_kind

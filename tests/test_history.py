@@ -77,6 +77,14 @@ def test_hold_last_by_hand():
     assert held == [0, 1, 2, 2, 2, 0, 5, 5]
 
 
+def test_a_flag_of_the_present_is_not_held():
+    signal = torch.tensor([[3.0, 4.0, 1.0], [0.0, 0.0, 0.0], [5.0, 6.0, 1.0]])
+    seen = torch.tensor([[1], [0], [1]]).bool()
+    data = stored([0, 0, 0], signal=signal, object_detected=seen)
+    held = HoldLast(flags=1)(data)["last_signal"].tolist()
+    assert held == [[3, 4, 1], [3, 4, 0], [5, 6, 1]]
+
+
 def test_what_sensors_of_any_kind_detect_is_held():
     # A skin of two kinds has two detections.
     signal = torch.tensor([[1.0], [2], [3]])

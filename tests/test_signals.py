@@ -40,6 +40,14 @@ def test_proximity_refuses_a_range_that_is_not_positive(max_range):
         Proximity(max_range)
 
 
+def test_proximity_takes_one_range_for_each_sensor_or_for_all():
+    distance = torch.tensor([[[1.0, 2.0], [1.0, INF]]])
+    (signal,) = Proximity([2.0, 4.0]).compute(distance)
+    assert signal.tolist() == [[0.5, 1, 0.25, 1]]
+    with pytest.raises(ValueError, match="2 ranges do not fit the 4 sensors of 'dis"):
+        Proximity([2.0, 4.0]).compute(torch.ones(1, 4))
+
+
 def test_binary_is_one_for_any_distance_in_range():
     (signal,) = Binary().compute(torch.tensor([[0.0, 1.9, INF]]))
     assert signal.tolist() == [[1, 1, 0]]

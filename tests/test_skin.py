@@ -147,6 +147,10 @@ def skin_content(*sensors: object) -> dict:
             "normal of sensor 1 has length 2.0000, not 1",
         ),
         (
+            skin_content(SENSOR, {**SENSOR, "position": [3, 120, -40]}),
+            "sensor 1 lies 127 m from the origin of its link: .* in metres",
+        ),
+        (
             skin_content({**SENSOR, "position": [0, 0, float("nan")]}),
             "position holds values that are not finite",
         ),
@@ -197,6 +201,14 @@ def test_a_missing_file_is_refused_with_its_name():
 def test_arrays_of_the_wrong_shape_are_refused(name):
     with pytest.raises(ValueError, match=rf"{name} must be \(1, 3\), got \(2, 3\)"):
         replace(make_skin([0, 0, 1]), **{name: np.zeros((2, 3))})
+
+
+def test_lists_are_taken_for_arrays_and_a_name_for_links_is_refused():
+    lists = {"position": [[0, 0, 1]], "normal": [[0, 0, 1]], "range": [2]}
+    skin = Skin(robot="h1_2", links=("torso_link",), **lists)
+    assert skin.position.tolist() == [[0, 0, 1]]
+    with pytest.raises(ValueError, match="links must be a name for each, got 'base'"):
+        Skin(robot="h1_2", links="base", **lists)
 
 
 def test_an_unknown_link_is_refused_with_the_closest_name():

@@ -103,7 +103,7 @@ class SensorConfig:
     per_object: bool = False
     """One signal for each ball, instead of that of the nearest."""
     validity: bool = False
-    """Append to each signal whether it is one, 1 or 0."""
+    """Append to each signal whether it is one now, 1 or 0."""
     corruption: Literal["none", "time_of_flight", "capacitive", "acoustic"] = "none"
     """Ideal sensors, or a model of real ones (docs/sensor-models.md), of each beam or,
     reduced, of each sensor's closest."""
@@ -341,4 +341,5 @@ class SensorConfig:
         )
         if not options.hold:
             return [position]
-        return [position, HoldLast(["position", *detected], [out_key])]
+        held = HoldLast(["position", *detected], [out_key], flags=int(self.validity))
+        return [position, held]

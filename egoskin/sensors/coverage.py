@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from numbers import Integral
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -23,6 +23,9 @@ class Field:
     around, 90 the outer hemisphere, less a cone."""
     measure: Literal["surface", "centre"] = "surface"
     """Distance to the object's closest point, or to its centre."""
+
+    slant: ClassVar[float] = 1.0
+    """How many times its range a sensor may see."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for an angle that is no cone, or an unknown measure."""
@@ -77,6 +80,11 @@ class Ray:
     def num_beams(self) -> int:
         """Readings of one sensor ``K``, one for each zone."""
         return self.grid[0] * self.grid[1]
+
+    @property
+    def slant(self) -> float:
+        """How many times its range a sensor may see: slanted beams have less depth."""
+        return 1 / self.directions()[..., 2].min() if self.measure == "depth" else 1.0
 
     @property
     def half_extent(self) -> float:

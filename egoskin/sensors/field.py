@@ -32,7 +32,8 @@ class FieldSensor(ProximitySensor):
     ``object_active [*B, O]``. Writes ``distance [*B, S]`` [m], infinite where nothing
     is in range and NaN where the input is, and ``object_detected [*B, O]``, whether
     any sensor detects the object. A sensor inside an object reads 0. Distances are
-    those of the state given: forward kinematics from the joint positions.
+    those of the state given: forward kinematics from the joint positions. (A sensor
+    that measures to the centre reads the distance to it, inside as well.)
 
     A sensor with a half angle below 180 degrees sees an object if the object's
     closest point lies within that angle of the normal.
@@ -78,7 +79,6 @@ class FieldSensor(ProximitySensor):
             chain,
             objects,
             (),
-            1.0,
             body,
             per_object,
             # What the body hides is found for some paths: their number is no constant.

@@ -121,11 +121,10 @@ class ProximitySensor(RowTransform):
     """What field and ray sensors share: keys, checks, the loop over objects.
 
     Args:
-        skin: The sensors; all of the coverage that the subclass computes.
+        skin: The sensors, filled; all of the coverage that the subclass computes.
         chain: Kinematic chain of the robot, rooted at the base.
         objects: Shape of each object, ``O`` of them.
         num_readings: Readings of each sensor: ``()`` or ``(K,)``.
-        slant: How much farther than its range each sensor may see, ``[S]``.
         body: Shapes of the robot that hide what lies behind them; empty for a robot
             that is transparent to its sensors.
         per_object: Whether objects are told apart: readings have a last dimension
@@ -149,7 +148,6 @@ class ProximitySensor(RowTransform):
         chain: pk.Chain,
         objects: Sequence[Shape],
         num_readings: tuple[int, ...],
-        slant: np.ndarray | float,
         body: Sequence[Primitive],
         per_object: bool,
         compile: bool,
@@ -185,7 +183,7 @@ class ProximitySensor(RowTransform):
         # radius, is in range in any pose of the robot [m].
         reach = np.array(self._kinematics.reach())[self._link.numpy()]
         reach += np.linalg.norm(skin.position, axis=-1)
-        self._farthest = float((reach + skin.range * slant).max()) + _SLACK
+        self._farthest = float((reach + skin.reach()).max()) + _SLACK
 
     @property
     def num_joints(self) -> int:
@@ -380,6 +378,14 @@ class ProximitySensor(RowTransform):
     def _check(self, inputs: Sequence[Tensor]) -> None:
         """Raise ValueError for inputs of a wrong shape or type."""
         *numbers, active = inputs
+        shapes = ("7",), ("J",), ("O", "7"), ("O",)
+        for key, tensor, shape in zip(self.in_keys, inputs, shapes, strict=True):
+            if tensor.ndim != 1 + len(shape):
+                raise ValueError(
+                    f"{key!r} must be [*B, {', '.join(shape)}], got "
+                    f"{list(tensor.shape[1:])} after the batch: was the tensordict "
+                    "made with its batch_size?"
+                )
         for key, tensor in zip(self.in_keys[2:], inputs[2:], strict=True):
             if tensor.shape[1] != len(self.objects):
                 raise ValueError(

@@ -86,6 +86,8 @@ class HoldLast(StatefulTransform):
     ``last_signal [*B, F]``, zero until something is detected in the episode.
 
     Args:
+        flags: Number of entries at the end of the signal that tell of the present (a
+            validity flag) and are not held.
         in_keys: Keys of the signal and of the detections (one or more).
         out_keys: Key of the signal seen last.
     """
@@ -94,8 +96,11 @@ class HoldLast(StatefulTransform):
         self,
         in_keys: Sequence[NestedKey] = ("signal", "object_detected"),
         out_keys: Sequence[NestedKey] = ("last_signal",),
+        *,
+        flags: int = 0,
     ) -> None:
         super().__init__(in_keys, out_keys, state_keys=out_keys)
+        self.flags = flags
 
     def start(
         self,
@@ -112,7 +117,9 @@ class HoldLast(StatefulTransform):
         """Return the signal where anything is detected, its last value elsewhere."""
         signal, *detections = inputs
         detected = torch.stack([d.any(-1, keepdim=True) for d in detections]).any(0)
-        return [torch.where(detected, signal, state[0])]
+        held = signal.shape[-1] - self.flags
+        last = torch.where(detected, signal, state[0])[..., :held]
+        return [torch.cat((last, signal[..., held:]), -1)]
 
     def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
         """Return the spec of the signal seen last."""

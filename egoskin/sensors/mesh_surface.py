@@ -111,7 +111,10 @@ def meshes_of_mjcf(path: Path, group: int | None = None) -> dict[str, list[Trime
         ValueError: If MuJoCo cannot load the file, or no geom is a mesh.
     """
     trimesh = _trimesh()
-    model = mujoco.MjModel.from_xml_path(str(path))
+    try:
+        model = mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        raise ValueError(f"{path} is no MuJoCo model: {error}") from error
     meshes: dict[str, list[Trimesh]] = {}
     seen = set()
     for geom in np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH):

@@ -105,14 +105,11 @@ class RaySensor(ProximitySensor):
         # Half angle of the cone about each sensor's beams.
         cos_h = beams[2].amin(-1)[beam_of]
         depth = torch.tensor([r.measure == "depth" for r in rays])
-        # A depth within the range may lie farther along a slanted beam.
-        slant = torch.where(depth, 1 / cos_h, 1.0)
         super().__init__(
             skin,
             chain,
             objects,
             () if reduce == "min" else (self._num_beams,),
-            slant.numpy(),
             body,
             per_object,
             # What the body hides is found for some paths: their number is no constant.
@@ -125,6 +122,7 @@ class RaySensor(ProximitySensor):
         self.register_buffer("_depth", depth if depth.any() else None)
         cone = torch.stack((cos_h, (1 - cos_h**2).sqrt()))[..., None]
         self.register_buffer("_cone", cone)
+        slant = torch.tensor([r.slant for r in rays], dtype=torch.float64)
         self.register_buffer("_reach", self._range * slant[:, None])
         self._margin_kernel: Callable[..., tuple[Tensor, list[View]]]
         self._margin_kernel = self.margins

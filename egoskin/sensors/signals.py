@@ -106,15 +106,24 @@ class Proximity(_Reading):
         self._unlimited = bool(scale.isinf().any())
         self.closeness = closeness
 
+    def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """Return the signal, ``[B, S ...]`` flattened.
+
+        Raises:
+            ValueError: If there are several ranges, but not one for each sensor.
+        """
+        ranges, sensors = len(self._scale), inputs[0].shape[1]
+        if ranges > 1 and ranges != sensors:
+            raise ValueError(
+                f"{ranges} ranges do not fit the {sensors} sensors of "
+                f"{self.in_keys[0]!r}"
+            )
+        return super().compute(*inputs)
+
     def signal(self, distance: Tensor) -> Tensor:
         """Return the signal of measurements [m], ``[B, n]`` each."""
         scale = self._scale.to(distance.dtype)
         if len(scale) > 1:
-            if distance.shape[1] % len(scale):
-                raise ValueError(
-                    f"{len(scale)} ranges do not fit the {distance.shape[1]} "
-                    f"measurements of {self.in_keys[0]!r}"
-                )
             scale = scale.repeat_interleave(distance.shape[1] // len(scale))
         # An infinite distance is nothing (1) whatever the range.
         limited = (distance / scale).clamp(0.0, 1.0)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
@@ -30,6 +31,8 @@ _FIELDS = ("format", "robot", "conventions", "provenance", "types", "sensors")
 _OPTIONAL = ("range", "roll_deg", "radius", "type")
 # Unit normals must be unit to this.
 _UNIT_TOLERANCE = 1e-3
+FARTHEST = 2.0
+"""Farther from its link's origin no sensor of a file sits [m]: the unit is wrong."""
 
 
 def _is_vector(value: object) -> bool:
@@ -95,6 +98,12 @@ def _check_sensor(index: int, sensor: object, types: Mapping[str, Coverage]) -> 
             raise ValueError(
                 f"{where}: {name!r} must be three numbers, got {sensor[name]!r}"
             )
+    away = math.hypot(*sensor["position"])
+    if away > FARTHEST:
+        raise ValueError(
+            f"{where} lies {away:.3g} m from the origin of its link: positions must be "
+            "in metres"
+        )
     for name in ("range", "roll_deg", "radius"):
         if name in sensor and type(sensor[name]) not in (int, float):
             raise ValueError(
@@ -137,7 +146,11 @@ class Skin:
 
     def __post_init__(self) -> None:
         """Fill in defaults, check shapes and values."""
+        if isinstance(self.links, str):
+            raise ValueError(f"links must be a name for each, got {self.links!r}")
         shape, number = (len(self.links), 3), len(self.links)
+        for name in ("position", "normal", "range", "roll_deg", "radius"):
+            object.__setattr__(self, name, np.asarray(getattr(self, name), float))
         defaults = {"range": np.nan, "roll_deg": 0.0, "radius": np.nan}
         for name, default in defaults.items():
             array = getattr(self, name)
@@ -225,6 +238,11 @@ class Skin:
             coverage=tuple(c or coverage for c in self.coverage),
             range=np.where(np.isnan(self.range), max_range, self.range),
         )
+
+    def reach(self) -> np.ndarray:
+        """Return how far each sensor of a `filled` skin sees at most [m], ``[S]``."""
+        slant = [1.0 if c is None else c.slant for c in self.coverage]
+        return self.range * np.array(slant)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the skin as plain JSON values."""

@@ -36,7 +36,7 @@ def _matching(links: Sequence[str], patterns: Sequence[str]) -> Tensor:
     for pattern in patterns:
         if not fnmatch.filter(links, pattern):
             close = difflib.get_close_matches(pattern, links, n=1)
-            hint = f"; did you mean {close[0]!r}?" if close else ""
+            hint = f"; did you mean {close[0]!r}?" if close else "."
             raise ValueError(
                 f"{pattern!r} matches no link{hint} The links are {', '.join(links)}"
             )

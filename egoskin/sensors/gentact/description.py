@@ -124,18 +124,18 @@ def _is_sensor(joint: ElementTree.Element) -> bool:
 
 
 def _read_xacro(xml: Xml, names: Links) -> list[Sensor]:
-    """Sensors of the one macro of a xacro file."""
+    """Sensors of the one macro of a xacro file, or of a file without macros."""
     macros = [
         macro
         for macro in xml.root.iter("xacro:macro")
         if any(e.tag in _SENSOR_TAGS for e in macro.iter())
     ]
-    if len(macros) != 1:
+    if len(macros) > 1:
         raise ValueError(
-            f"{xml.where(macros[1]) if macros else xml.path}: expected one macro with "
-            f"sensors, got {len(macros)}; put each into a file of its own"
+            f"{xml.where(macros[1])}: expected one macro with sensors, got "
+            f"{len(macros)}; put each into a file of its own"
         )
-    (macro,) = macros
+    macro = macros[0] if macros else xml.root
     base, name = np.eye(3), "${parent}"
     offset = np.zeros(3)
     for dermis in macro.iter("xacro:dermis_base_macro"):
@@ -189,8 +189,7 @@ def _read_urdf(
             _framed(
                 xml,
                 joint,
-                # (0, 0, 0) is what converters write for a joint without an axis.
-                normal if normal is not None and normal.any() else None,
+                normal,
                 base,
                 link=link,
                 name=joint.get("name", ""),
@@ -255,12 +254,12 @@ def _framed(
 
     Both are relative to a base frame, which is given in the frame of the link. The
     normal is z of the origin's frame; where it is not, an origin without rpy has just
-    no frame to tell.
+    no frame to tell. A normal of (0, 0, 0) tells nothing: exporters write it for none.
     """
     own, position = xml.frame(element)
     where = xml.where(element)
     x_axis: np.ndarray | None = own[:, 0]
-    if normal is None:
+    if normal is None or not normal.any():
         normal = own[:, 2]
     cosine = own[:, 2] @ normal / max(float(np.linalg.norm(normal)), 1e-9)
     angle = math.degrees(math.acos(min(max(cosine, -1.0), 1.0)))

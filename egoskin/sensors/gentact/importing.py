@@ -14,14 +14,13 @@ from egoskin.robots import Primitive
 from egoskin.sensors.gentact.description import Xml, read_description
 from egoskin.sensors.gentact.source import Export, Links, Sensor
 from egoskin.sensors.gentact.table import read_table
-from egoskin.sensors.skin import Skin
+from egoskin.sensors.skin import FARTHEST, Skin
 from egoskin.surface import distance_to
 
 # Lengths of normals: read as they are; normalised; else refused.
 _UNIT, _ALMOST_UNIT = 1e-5, 0.05
-# Farther from its link's origin [m] no sensor sits, and nearer than the second not
-# every sensor of a skin does: the unit is another.
-_FARTHEST, _NEAREST = 2.0, 0.002
+# Nearer to their links' origins [m] not all sensors of a skin sit: the unit is another.
+_NEAREST = 0.002
 # Step of the numerical gradient [m]; where it is shorter than this there is no one
 # outward direction (it is 1, or 1/sqrt(2) on an edge).
 _STEP, _SHORTEST = 1e-6, 0.5
@@ -130,7 +129,7 @@ def _metres(
     position = unit * np.array([s.position for s in export.sensors])
     length = np.linalg.norm(position, axis=-1)
     worst = int(length.argmax())
-    if length[worst] > _FARTHEST or (
+    if length[worst] > FARTHEST or (
         scale is None and unit != 1.0 and length[worst] < _NEAREST
     ):
         raise ValueError(
