@@ -400,7 +400,10 @@ def test_bench_loop_gives_its_rows(tmp_path: Path):
         "train_field",
         "train_ray_grid",
     ]
-    for name in [*speeds, "memory_field", "memory_ray"]:
+    others = [
+        f"{name}_{kind}" for name in ("memory", "serial") for kind in ("field", "ray")
+    ]
+    for name in [*speeds, *others]:
         assert by_name[name]["value"] > 0
     assert rows[0]["name"] == "raw"
     assert rows[0]["ratio"] == 1.0

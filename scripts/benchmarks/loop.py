@@ -166,7 +166,7 @@ class _Loop:
                 layers["normalisation"] = lambda: None, self._normalise
             else:
                 layers["train_ray_grid"] = again, self._train
-            return [*self._time(layers), memory]
+            return [*self._time(layers), self._serial(), memory]
         finally:
             for each in pools:
                 each.close()
@@ -223,6 +223,40 @@ class _Loop:
 
     def _train(self, root: TensorDictBase) -> None:
         self._ppo.update(collect(self._pool, self._agent, root, self._steps)[0])
+
+    def _serial(self) -> Row:
+        """Return what no other thread or process can do meanwhile, however many.
+
+        That is the CPU time of this process's first thread, but for its looks at the
+        workers; the ratio is to the CPU time of all workers.
+        """
+        pool, serial, ratios = self._pool, [], []
+        wait, waited = pool._wait, 0.0
+
+        def count(*args: Any) -> None:
+            nonlocal waited
+            begin = time.thread_time()
+            wait(*args)
+            waited += time.thread_time() - begin
+
+        pool._wait = count
+        for i in range(self.config.rounds):
+            show(f"round {i + 1}/{self.config.rounds}: serial share")
+            root, waited = self._restore(pool), 0.0
+            alone, others = time.thread_time(), _cpu_time(_processes()[1:])
+            self._train(root)
+            serial.append(time.thread_time() - alone - waited)
+            ratios.append(serial[-1] / (_cpu_time(_processes()[1:]) - others))
+        show("")
+        pool._wait = wait
+        return Row(
+            name=f"serial_{self._coverage}",
+            value=1e6
+            * statistics.median(serial)
+            / (self._steps * self.config.num_envs),
+            unit="us of CPU time per environment step, the first thread alone",
+            ratio=statistics.median(ratios),
+        )
 
     def _normalise(self, _: None) -> None:
         """Take a rollout into the normalisers, as an update does, and back out."""
@@ -282,10 +316,10 @@ class _Loop:
             for name, (prepare, run) in layers.items():
                 show(f"round {i + 1}/{self.config.rounds}: {name}")
                 prepared = prepare()
-                begin, used = time.perf_counter(), _cpu_time()
+                begin, used = time.perf_counter(), _cpu_time(_processes())
                 run(prepared)
                 wall[name].append(1e6 * (time.perf_counter() - begin) / frames)
-                cpu[name].append(1e6 * (_cpu_time() - used) / frames)
+                cpu[name].append(1e6 * (_cpu_time(_processes()) - used) / frames)
         show("")
         raw = wall["raw"]
         rows = [
@@ -310,9 +344,9 @@ def _processes() -> list[psutil.Process]:
     return [psutil.Process(), *psutil.Process().children(recursive=True)]
 
 
-def _cpu_time() -> float:
-    """CPU time of all processes so far [s]."""
-    times = [process.cpu_times() for process in _processes()]
+def _cpu_time(processes: list[psutil.Process]) -> float:
+    """CPU time of processes so far [s]."""
+    times = [process.cpu_times() for process in processes]
     return sum(t.user + t.system for t in times)
 
 
