@@ -122,17 +122,16 @@ class PolicySpec:
 
 
 def sparse_sources(
-    config: EnvConfig, skin: Skin, network: NetworkConfig, compile_kernels: bool = False
+    config: EnvConfig, skin: Skin, compile_kernels: bool = False
 ) -> dict[str, SparseSource]:
     """Return what computes the keys that are better learnt from as sparse rows.
 
     Args:
         config: What the environment is made of.
         skin: The sensors.
-        network: What reads them: a normalised signal is not sparse.
         compile_kernels: Whether to compile the sensors; results are the same.
     """
-    if config.history > 1 or network.normalize == "all":
+    if config.history > 1:
         return {}
     balls = config.task.throws.balls
     robot = config.robot_config

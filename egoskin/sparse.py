@@ -72,6 +72,12 @@ class SparseRows:
             value=self.value.to(device),
         )
 
+    def is_finite(self) -> Tensor:
+        """Return which rows hold only finite values, ``[B]`` bool."""
+        finite = torch.ones(len(self), dtype=torch.bool, device=self.value.device)
+        finite[self._row[~self.value.isfinite()]] = False
+        return finite
+
     def dense(self) -> Tensor:
         """Return the matrix, ``[B, size]``."""
         matrix = self.value.new_full((len(self), self.size), self.default)

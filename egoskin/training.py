@@ -238,8 +238,8 @@ def open_trainer(run: Run, num_threads: int = 1) -> Iterator[Trainer]:
     # It imports while the sources compile.
     start_server()
     skin = Skin.load(run.skin_path)
-    network, compile_kernels = config.ppo.network, bool(config.compile_kernels)
-    sources = sparse_sources(config.env, skin, network, compile_kernels)
+    compile_kernels = bool(config.compile_kernels)
+    sources = sparse_sources(config.env, skin, compile_kernels)
     # Not in a thread while the workers start: torch tells all threads that it compiles.
     for source in sources.values():
         source.warm_up(config.num_envs)

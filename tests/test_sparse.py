@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
-from egoskin.agents.networks import Agent, NetworkConfig
+from egoskin.agents.networks import Agent, NetworkConfig, RunningNorm
 from egoskin.agents.ppo import PPO, PPOConfig, collect
 from egoskin.make import EnvConfig, make_env
 from egoskin.policies import (
@@ -138,31 +138,59 @@ def test_nothing_in_reach_is_no_hit(random_state):
 )
 def test_whatever_is_not_sparse_is_left_to_the_transforms(change):
     config = EnvConfig(sensor=replace(RAYS, **change))
-    assert sparse_sources(config, SKIN, NetworkConfig()) == {}
+    assert sparse_sources(config, SKIN) == {}
 
 
-def test_histories_normalised_signals_and_mixed_skins_are_left_as_well():
+def test_histories_and_mixed_skins_are_left_as_well():
     config = EnvConfig(sensor=RAYS)
-    assert set(sparse_sources(config, SKIN, NetworkConfig())) == {"signal"}
-    assert not sparse_sources(replace(config, history=2), SKIN, NetworkConfig())
-    assert not sparse_sources(config, SKIN, NetworkConfig(normalize="all"))
+    assert set(sparse_sources(config, SKIN)) == {"signal"}
+    assert not sparse_sources(replace(config, history=2), SKIN)
     coverage = (Ray(), Ray(grid=(4, 4)), *SKIN.coverage[2:])
-    assert not sparse_sources(config, replace(SKIN, coverage=coverage), NetworkConfig())
+    assert not sparse_sources(config, replace(SKIN, coverage=coverage))
+
+
+@given(
+    st.integers(0, 2**32 - 1),
+    st.integers(1, 40),
+    st.integers(1, 70),
+    st.sampled_from([0.0, 1.0]),
+)
+def test_sparse_rows_are_normalised_as_the_matrix_is(seed, rows, columns, default):
+    one, other = RunningNorm(1), RunningNorm(1)
+    for part in range(3):
+        matrix = draw(seed + part, rows, columns, default)
+        sparse = rows_of(matrix, default)
+        assert torch.equal(one.sparse(sparse).dense(), one(matrix))
+        one.update(matrix)
+        other.update(sparse)
+        torch.testing.assert_close(other.mean, one.mean)
+        torch.testing.assert_close(other.var, one.var, atol=1e-15, rtol=1e-9)
+        assert other.count == one.count
+
+
+def test_rows_that_are_not_finite_are_found():
+    matrix = draw(0, 30, 20, 1.0)
+    matrix[3, 5] = torch.nan
+    matrix[7, 1] = torch.inf
+    finite = rows_of(matrix, 1.0).is_finite()
+    assert (~finite).nonzero()[:, 0].tolist() == [3, 7]
 
 
 # --- agents -----------------------------------------------------------------------
 
 
-def rollout_of(sparse: bool) -> tuple[Agent, TensorDict, PolicySpec]:
+def rollout_of(
+    sparse: bool, network: NetworkConfig
+) -> tuple[Agent, TensorDict, PolicySpec]:
     """An untrained agent and what it collects while the first balls arrive."""
     config = EnvConfig(sensor=RAYS)
-    sources = sparse_sources(config, SKIN, NetworkConfig()) if sparse else {}
+    sources = sparse_sources(config, SKIN) if sparse else {}
     env = make_env(
         config, SKIN, num_envs=32, num_workers=1, seed=0, sparse=bool(sources)
     )
     try:
         torch.manual_seed(0)
-        spec = PolicySpec.of(config, SKIN, NetworkConfig(), env, sources)
+        spec = PolicySpec.of(config, SKIN, network, env, sources)
         agent = spec.build_agent(sources)
         root = env.reset()
         for _ in range(3):
@@ -172,9 +200,11 @@ def rollout_of(sparse: bool) -> tuple[Agent, TensorDict, PolicySpec]:
     return agent, rollout, spec
 
 
-def test_an_agent_collects_the_same_from_hits_as_from_the_grid():
-    agent, rollout, _ = rollout_of(True)
-    dense_agent, dense, _ = rollout_of(False)
+@pytest.mark.parametrize("normalize", ["body", "all"])
+def test_an_agent_collects_the_same_from_hits_as_from_the_grid(normalize):
+    network = NetworkConfig(normalize=normalize)
+    agent, rollout, _ = rollout_of(True, network)
+    dense_agent, dense, _ = rollout_of(False, network)
     tensors, dense_tensors = agent_tensors(agent), agent_tensors(dense_agent)
     assert tensors.keys() == dense_tensors.keys()
     assert all(torch.equal(tensors[key], dense_tensors[key]) for key in tensors)
@@ -189,7 +219,7 @@ def test_an_agent_collects_the_same_from_hits_as_from_the_grid():
 
 
 def test_an_update_from_hits_is_that_from_the_grid(tmp_path):
-    agent, rollout, spec = rollout_of(True)
+    agent, rollout, spec = rollout_of(True, NetworkConfig())
     rows = rollout["inputs", "signal"]
     dense = rollout.clone()
     del dense["inputs", "signal"]

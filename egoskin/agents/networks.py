@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -35,7 +35,8 @@ class NetworkConfig:
     std_bounds: tuple[float, float] = (0.1, 1.0)
     """The standard deviation never leaves these bounds."""
     normalize: Literal["body", "all"] = "body"
-    """Running normalisation of all but the skin's signals, or of everything."""
+    """Running normalisation of all but the skin's signals, or of everything: of
+    signals by one mean and deviation for all sensors, which keeps what differs."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for sizes and bounds that make no network."""
@@ -56,7 +57,7 @@ class RunningNorm(nn.Module):
     pass: collection and learning see the same input.
 
     Args:
-        size: Number of features.
+        size: Number of features, or 1 for statistics that all features share.
     """
 
     # Normalised values beyond this many standard deviations are cut off.
@@ -72,18 +73,31 @@ class RunningNorm(nn.Module):
         self.register_buffer("var", torch.ones(size, dtype=torch.float64))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return (x - mean) / std, cut off at ``LIMIT``, ``[*B, size]``."""
+        """Return (x - mean) / std, cut off at ``LIMIT``, ``[*B, F]``."""
         shift = self.mean.to(x.dtype)
         scale = (self.var + 1e-8).rsqrt().to(x.dtype)
         return ((x - shift) * scale).clamp(-self.LIMIT, self.LIMIT)
 
+    def sparse(self, rows: SparseRows) -> SparseRows:
+        """Return what `forward` would, of shared statistics, as sparse rows."""
+        default = self(rows.value.new_full((1,), rows.default))
+        return replace(rows, value=self(rows.value), default=float(default))
+
     @torch.no_grad()
-    def update(self, x: Tensor) -> None:
-        """Take a batch of data into the statistics, ``[*B, size]``."""
-        x = x.reshape(-1, x.shape[-1]).double()
-        n, mean = float(len(x)), x.mean(0)
-        # Several times as fast as x.var(0).
-        var = (x - mean).square_().mean(0)
+    def update(self, x: Tensor | SparseRows) -> None:
+        """Take a batch of data into the statistics, ``[*B, F]``."""
+        if isinstance(x, SparseRows):
+            values, n = x.value.double(), float(len(x) * x.size)
+            # All others are the default.
+            rest = n - len(values)
+            mean = ((values.sum() + rest * x.default) / n).reshape(1)
+            deviation = rest * (x.default - mean).square()
+            var = ((values - mean).square().sum() + deviation) / n
+        else:
+            x = x.reshape(-1, len(self.mean)).double()
+            n, mean = float(len(x)), x.mean(0)
+            # Several times as fast as x.var(0).
+            var = (x - mean).square_().mean(0)
         total = self.count + n
         delta = mean - self.mean
         # Chan et al., parallel variance: M2 = M2a + M2b + delta^2 na nb / n.
@@ -205,10 +219,11 @@ class SharedStdNormal(IndependentNormal):
 class Agent(nn.Module):
     """Actor, critic and the normalisers of what they read.
 
-    `encode` makes ``("inputs", key)`` of each key that the networks read, once for
-    both of them and for all passes over a rollout. From the inputs of ``actor_keys``
-    the actor writes ``loc``, ``scale``, ``action``, ``action_log_prob``; from those of
-    ``critic_keys`` the critic writes ``state_value``.
+    `sense` gives what they read, and `encode` makes ``("inputs", key)`` of each key of
+    that, once for both of them and for all passes over a rollout. From the inputs of
+    ``actor_keys`` the actor writes ``loc``, ``scale``, ``action``,
+    ``action_log_prob``; from those of ``critic_keys`` the critic writes
+    ``state_value``.
 
     Args:
         sizes: Number of features of each key.
@@ -236,7 +251,9 @@ class Agent(nn.Module):
             for key in critic_keys
             if config.normalize == "all" or key not in _SIGNAL_KEYS
         ]
-        self.norms = nn.ModuleDict({key: RunningNorm(sizes[key]) for key in normalized})
+        self.norms = nn.ModuleDict(
+            {k: RunningNorm(1 if k in _SIGNAL_KEYS else sizes[k]) for k in normalized}
+        )
 
         def network(keys: Sequence[str], out: int, gain: float) -> KeyedMLP:
             return KeyedMLP([sizes[k] for k in keys], config.hidden, out, gain)
@@ -281,21 +298,41 @@ class Agent(nn.Module):
             )
         )
 
-    def encode(self, tensordict: TensorDictBase) -> TensorDict:
+    def sense(self, tensordict: TensorDictBase) -> TensorDict:
+        """Return the features that the networks read, as they are, by key.
+
+        Args:
+            tensordict: Holds ``read_keys``, ``[B]``.
+        """
+        given = [key for key in self.critic_keys if key not in self.sources]
+        features = TensorDict(
+            {key: tensordict[key] for key in given},
+            batch_size=tensordict.batch_size,
+            device=tensordict.device,
+        )
+        for key, source in self.sources.items():
+            features.set_non_tensor(key, source(tensordict))
+        return features
+
+    def encode(self, features: TensorDictBase) -> TensorDict:
         """Return what the networks read, under ``("inputs", key)``.
 
         Args:
-            tensordict: Holds ``read_keys``, or what the actor needs of them, ``[B]``.
+            features: What `sense` returned, or what the actor needs of it, ``[B]``.
         """
-        inputs = TensorDict(batch_size=tensordict.batch_size, device=tensordict.device)
-        for key in self.critic_keys:
-            if key in self.sources:
-                inputs.set_non_tensor(key, self.sources[key](tensordict))
-                continue
-            value = tensordict.get(key, None)
-            if value is not None:
-                inputs[key] = self.norms[key](value) if key in self.norms else value
-        return TensorDict({"inputs": inputs}, tensordict.batch_size)
+        inputs = TensorDict(batch_size=features.batch_size, device=features.device)
+        for key in (k for k in self.critic_keys if k in features.keys()):
+            value = features[key]
+            if key in self.norms:
+                norm = self.norms[key]
+                assert isinstance(norm, RunningNorm)
+                sparse = isinstance(value, SparseRows)
+                value = norm.sparse(value) if sparse else norm(value)
+            if isinstance(value, SparseRows):
+                inputs.set_non_tensor(key, value)
+            else:
+                inputs[key] = value
+        return TensorDict({"inputs": inputs}, features.batch_size)
 
 
 def input_keys(keys: Sequence[str]) -> list[NestedKey]:

@@ -159,8 +159,8 @@ def collect(
     frames, bootstraps, infos = [], [], []
     noise: Tensor | None = None
     for _ in range(num_steps):
-        read = _read(agent, root, device)
-        frame = agent.encode(read)
+        features = _features(agent, root, device)
+        frame = agent.encode(features)
         agent.actor(frame)
         if noise_correlation:
             noise = _correlate(agent, frame, noise, noise_correlation)
@@ -170,10 +170,11 @@ def collect(
         for key in ("reward", "done", "terminated"):
             frame[key] = after[key].to(device)
         # For the statistics.
-        frames.append(frame.update(read.select(*agent.norms)))
+        frames.append(frame.update(features.select(*agent.norms)))
         bootstraps.append(_timeout_values(agent, after, device))
         infos.append(after.select(*info_keys))
-    following = agent.critic(agent.encode(_read(agent, root, device)))["state_value"]
+    features = _features(agent, root, device)
+    following = agent.critic(agent.encode(features))["state_value"]
     flat = agent.critic(_joined(frames))
     rollout = flat.reshape(num_steps, -1)
     next_value = torch.cat((rollout["state_value"][1:], following[None]))
@@ -183,9 +184,9 @@ def collect(
     return rollout, root, infos
 
 
-def _read(agent: Agent, root: TensorDictBase, device: torch.device) -> TensorDictBase:
-    """Return what the agent reads, ``[N]``, on its device."""
-    return root.select(*agent.read_keys).reshape(-1).to(device)
+def _features(agent: Agent, root: TensorDictBase, device: torch.device) -> TensorDict:
+    """Return what the agent's networks read, ``[N]``, on its device."""
+    return agent.sense(root.select(*agent.read_keys).reshape(-1).to(device))
 
 
 def _correlate(
@@ -235,8 +236,8 @@ def _timeout_values(
     ended = (after["done"] & ~after["terminated"])[:, 0].nonzero()[:, 0]
     if not len(ended):
         return ended.to(device), torch.zeros(0, 1, device=device)
-    terminal = agent.encode(after.select(*agent.read_keys)[ended].to(device))
-    return ended.to(device), agent.critic(terminal)["state_value"]
+    terminal = agent.sense(after.select(*agent.read_keys)[ended].to(device))
+    return ended.to(device), agent.critic(agent.encode(terminal))["state_value"]
 
 
 def add_advantages(
@@ -368,7 +369,10 @@ class PPO:
             assert isinstance(norm, RunningNorm)
             norm.update(data[key])
             if not torch.isfinite(norm.mean + norm.var).all():
-                (bad,) = (~torch.isfinite(data[key]).all(-1)).nonzero(as_tuple=True)
+                value = data[key]
+                sparse = isinstance(value, SparseRows)
+                finite = value.is_finite() if sparse else value.isfinite().all(-1)
+                (bad,) = (~finite).nonzero(as_tuple=True)
                 raise NonFiniteError(f"normaliser of {key!r}", _rows(data, bad))
         metrics = {name: float(value) / count for name, value in sums.items()}
         metrics["explained_variance"] = float(explained)

@@ -143,7 +143,7 @@ class _Loop:
         self._skin = config.env.skin.build(config.env.robot_config)
         self._workers = check_num_workers(config.num_envs, config.num_workers)
         self._sources = sparse_sources(
-            config.env, self._skin, config.ppo.network, pays_to_compile(config.env)
+            config.env, self._skin, pays_to_compile(config.env)
         )
         self._steps = config.ppo.rollout_steps
 
