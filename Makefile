@@ -18,7 +18,7 @@ demo: $(VENV)/run
 		--fps 20 --size 640 360
 
 test: $(VENV)/dev
-	$(BIN)/python -m pytest -m "not slow" $(ARGS)
+	$(BIN)/python -m pytest -m "not slow" -n 2 --dist worksteal $(ARGS)
 
 test-slow: $(VENV)/dev
 	$(BIN)/python -m pytest -m slow $(ARGS)
