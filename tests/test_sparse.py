@@ -51,12 +51,16 @@ def draw(seed: int, rows: int, columns: int, default: float) -> torch.Tensor:
     return matrix
 
 
-@given(
+# Seed, rows, columns, and what almost all entries are.
+every_matrix = given(
     st.integers(0, 2**32 - 1),
     st.integers(1, 40),
     st.integers(1, 70),
     st.sampled_from([0.0, 1.0]),
 )
+
+
+@every_matrix
 def test_a_layer_of_sparse_rows_is_that_of_the_matrix(seed, rows, columns, default):
     matrix = draw(seed, rows, columns, default)
     sparse = rows_of(matrix, default)
@@ -149,12 +153,7 @@ def test_histories_and_mixed_skins_are_left_as_well():
     assert not sparse_sources(config, replace(SKIN, coverage=coverage))
 
 
-@given(
-    st.integers(0, 2**32 - 1),
-    st.integers(1, 40),
-    st.integers(1, 70),
-    st.sampled_from([0.0, 1.0]),
-)
+@every_matrix
 def test_sparse_rows_are_normalised_as_the_matrix_is(seed, rows, columns, default):
     one, other = RunningNorm(1), RunningNorm(1)
     for part in range(3):
