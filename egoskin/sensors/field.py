@@ -105,16 +105,17 @@ class FieldSensor(ProximitySensor):
         for view, shape, on in zip(
             self.views(scene), self.objects, scene.active, strict=True
         ):
-            reading = torch.where(on, self._distance(view, shape), torch.inf)
+            distance = self._distance(view, shape, scene.skin)
+            reading = torch.where(on, distance, torch.inf)
             if self._occluder is not None:
                 reading = self._without_hidden(reading, view, shape, scene)
             readings.append(reading.t().contiguous())
         return torch.stack(readings)
 
-    def _distance(self, view: View, shape: Shape) -> Tensor:
+    def _distance(self, view: View, shape: Shape, skin: dict[str, Tensor]) -> Tensor:
         """Readings of one object [m], ``[S, B]``."""
         # From each sensor to the object's centre, in the sensor's link.
-        x, y, z = v = view.centre[:, self._link] - self._offset.to(view.centre.dtype)
+        x, y, z = v = view.centre[:, self._link] - skin["offset"]
         to_centre = exact_sqrt(x * x + y * y + z * z)
         if isinstance(shape, Sphere):
             # |c| - r: the object's frame differs by a shift alone.
@@ -122,18 +123,18 @@ class FieldSensor(ProximitySensor):
         else:
             distance = shape.signed_distance(*self._in_object(view, v)).clamp(min=0.0)
         if self._cos_half is not None:
-            n = self._axes[2].to(x.dtype)
+            n = skin["axes"][2]
             way = self._to_closest(view, shape, v)
             along = n[0] * way[0] + n[1] * way[1] + n[2] * way[2]
             reach = exact_sqrt(way[0] * way[0] + way[1] * way[1] + way[2] * way[2])
             # cos(angle) < cos(half angle); an object about the sensor is all around.
-            beside = (along < self._cos_half.to(x) * reach) & ~(distance <= 0)
+            beside = (along < skin["cos_half"] * reach) & ~(distance <= 0)
             distance = torch.where(beside, torch.inf, distance)
         if self._to_centre is not None:
             measured = torch.where(distance == torch.inf, distance, to_centre)
             distance = torch.where(self._to_centre, measured, distance)
         # Written so that NaN stays NaN.
-        gone = distance > self._range.to(x.dtype)
+        gone = distance > skin["range"]
         return torch.where(gone, torch.inf, distance)
 
     def _in_object(self, view: View, centre: Tensor) -> list[Tensor]:
@@ -176,7 +177,7 @@ class FieldSensor(ProximitySensor):
         sensor, row = (reading < torch.inf).nonzero().unbind(1)
         if not len(row):
             return reading
-        centre = view.centre[:, self._link] - self._offset.to(reading.dtype)
+        centre = view.centre[:, self._link] - scene.skin["offset"]
         way = self._to_closest(view, shape, centre)
         x, y, z = (w[sensor, row] for w in way)
         reach = (x * x + y * y + z * z).sqrt()

@@ -56,6 +56,8 @@ class Scene(NamedTuple):
     links: tuple[Tensor, Tensor] | None
     """Rotations ``[3, 3, L, B]`` and positions [m] ``[3, L, B]`` of all links in the
     base frame; None for a robot that is transparent to its sensors."""
+    skin: dict[str, Tensor]
+    """Constants of the sensors in the dtype of the inputs: loops do not convert."""
 
 
 class View(NamedTuple):
@@ -173,7 +175,7 @@ class ProximitySensor(RowTransform):
         def constant(name: str, value: object, dtype: torch.dtype) -> None:
             self.register_buffer(name, torch.as_tensor(value, dtype=dtype))
 
-        # Constants are float64; they take the dtype of the inputs when used.
+        # Constants are float64; a scene has them in the dtype of its inputs.
         constant("_link", [links.index(name) for name in skin.links], torch.int64)
         constant("_offset", skin.position.T[:, :, None], torch.float64)
         # Columns of the sensor frames in the link frames, [3 (axis), 3, S, 1].
@@ -205,7 +207,12 @@ class ProximitySensor(RowTransform):
         links = None
         if self._occluder is not None:
             links = stack_frames(self._kinematics.frames_from(*trig), base)
-        return Scene(base, objects, on, *trig, links)
+        skin = {
+            name.removeprefix("_"): value.to(base_pose.dtype).contiguous()
+            for name, value in self.named_buffers()
+            if value.is_floating_point()
+        }
+        return Scene(base, objects, on, *trig, links, skin)
 
     def views(self, scene: Scene) -> list[View]:
         """Return each object as the links see it."""
@@ -307,7 +314,7 @@ class ProximitySensor(RowTransform):
         assert scene.links is not None
         link = self._link[sensor]
         turn, position = (x[..., link, row] for x in scene.links)
-        offset = self._offset[:, sensor, 0].to(reading.dtype)
+        offset = scene.skin["offset"][:, sensor, 0]
 
         def to_base(v: Tensor, of: Tensor | slice = slice(None)) -> list[Tensor]:
             return [r[0, of] * v[0] + r[1, of] * v[1] + r[2, of] * v[2] for r in turn]

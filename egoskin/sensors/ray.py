@@ -143,25 +143,23 @@ class RaySensor(ProximitySensor):
         """
         views = self.views(scene)
         margins = [
-            torch.where(on, self._margin(view, shape), 0.0).t().contiguous()
+            torch.where(on, self._margin(view, shape, scene.skin), 0.0).t().contiguous()
             for view, shape, on in zip(views, self.objects, scene.active, strict=True)
         ]
         return torch.stack(margins), views
 
-    def _margin(self, view: View, shape: Shape) -> Tensor:
+    def _margin(self, view: View, shape: Shape, skin: dict[str, Tensor]) -> Tensor:
         """Margins of one object [m], ``[S, B]``."""
-        x, y, z = self._in_sensor(
-            view.centre[:, self._link] - self._offset.to(view.centre.dtype),
-            self._axes.to(view.centre.dtype),
-        )
+        away = view.centre[:, self._link] - skin["offset"]
+        x, y, z = self._in_sensor(away, skin["axes"])
         if not self._cull:
             # 1, or NaN.
             return 1.0 + 0.0 * x
-        cos_h, sin_h = self._cone.to(x)
+        cos_h, sin_h = skin["cone"]
         bound, flat = shape.bounding_radius, x * x + y * y
         # Outside the range, beside the cone of the beams, or behind the sensor:
         # R + r - |c|, r - (rho cos h - z sin h), z + r.
-        far = self._reach.to(x) + bound - (flat + z * z).sqrt()
+        far = skin["reach"] + bound - (flat + z * z).sqrt()
         beside = bound - (flat.sqrt() * cos_h - z * sin_h)
         margin = torch.minimum(torch.minimum(far, beside), z + bound)
         return (margin + _SLACK).clamp(min=0.0)
@@ -192,12 +190,11 @@ class RaySensor(ProximitySensor):
             Readings [m], ``[n, K]`` or reduced ``[n]``, and the least of each pair,
             ``[n]``.
         """
-        dtype, link = view.centre.dtype, self._link[sensor]
-        axes = self._axes.to(dtype)[:, :, sensor, 0]
-        offset = self._offset.to(dtype)[:, sensor, 0]
+        skin, link = scene.skin, self._link[sensor]
+        axes, offset = skin["axes"][:, :, sensor, 0], skin["offset"][:, sensor, 0]
         away = view.centre[:, link, row] - offset
         centre = self._in_sensor(away, axes)
-        beams = self._beams.to(dtype)
+        beams = skin["beams"]
         if beams.shape[1] > 1:
             beams = beams[:, self._beam_of[sensor]]
         origin, way = [-c[:, None] for c in centre], list(beams)
@@ -220,7 +217,7 @@ class RaySensor(ProximitySensor):
             slanted = self._depth[sensor][:, None]
             distance = torch.where(slanted, distance * beams[2], distance)
         # Written so that NaN stays NaN.
-        gone = distance > self._range.to(dtype)[sensor]
+        gone = distance > skin["range"][sensor]
         distance = torch.where(gone, torch.inf, distance)
         if self._sub_beams > 1:
             distance = distance.unflatten(-1, (-1, self._sub_beams)).amin(-1)
