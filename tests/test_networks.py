@@ -13,6 +13,7 @@ from egoskin.agents.networks import (
     NetworkConfig,
     RunningNorm,
     SharedStdNormal,
+    SignalNorm,
 )
 
 SIZES = {"observation": 6, "signal": 5, "privileged_observation": 4}
@@ -69,8 +70,8 @@ def test_a_forward_pass_leaves_the_normaliser_as_it_is():
     assert torch.equal(agent.norms["observation"].mean, before)
 
 
-def test_networks_read_normalised_inputs_and_signals_as_they_are():
-    agent, batch = make_agent(), make_batch()
+def test_networks_read_what_is_normalised():
+    agent, batch = make_agent(normalize="body"), make_batch()
     agent.norms["observation"].update(5 + 3 * batch["observation"])
     inputs = agent.encode(batch)["inputs"]
     assert set(inputs.keys()) == set(CRITIC)
@@ -80,9 +81,27 @@ def test_networks_read_normalised_inputs_and_signals_as_they_are():
     assert torch.equal(inputs["signal"], batch["signal"])
 
 
-def test_signals_enter_unnormalised_unless_asked():
-    assert set(make_agent().norms) == {"observation", "privileged_observation"}
-    assert set(make_agent(normalize="all").norms) == set(SIZES)
+def test_signals_are_normalised_unless_asked():
+    assert set(make_agent().norms) == set(SIZES)
+    body = make_agent(normalize="body").norms
+    assert set(body) == {"observation", "privileged_observation"}
+
+
+@pytest.mark.parametrize("size", [3, 64, 4096])
+def test_signals_weigh_as_much_however_many_they_are(size: int):
+    sizes = {**SIZES, "signal": size}
+    agent = Agent(sizes, ACTOR, CRITIC, 3, NetworkConfig())
+    generator = torch.Generator().manual_seed(0)
+    # One sensor in twenty sees something; sensors differ.
+    seen = torch.rand(2_000, size, generator=generator) < 0.05
+    near = torch.linspace(0.2, 0.8, size).expand_as(seen)
+    batch = TensorDict({"signal": torch.where(seen, near, 1.0)}, [2_000])
+    agent.norms["signal"].update(batch["signal"])
+    signal = agent.encode(batch)["inputs", "signal"]
+    variance = (signal - signal.mean()).square().mean() * size
+    assert variance == pytest.approx(SignalNorm.WEIGHT, rel=0.05)
+    # What differs still does.
+    assert len(signal.unique()) == size + 1
 
 
 def test_the_actor_does_not_see_what_only_the_critic_is_told():

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
-from egoskin.agents.networks import Agent, NetworkConfig, RunningNorm
+from egoskin.agents.networks import Agent, NetworkConfig, SignalNorm
 from egoskin.agents.ppo import PPO, PPOConfig, collect
 from egoskin.make import EnvConfig, make_env
 from egoskin.policies import (
@@ -155,7 +155,7 @@ def test_histories_and_mixed_skins_are_left_as_well():
 
 @every_matrix
 def test_sparse_rows_are_normalised_as_the_matrix_is(seed, rows, columns, default):
-    one, other = RunningNorm(1), RunningNorm(1)
+    one, other = SignalNorm(columns), SignalNorm(columns)
     for part in range(3):
         matrix = draw(seed + part, rows, columns, default)
         sparse = rows_of(matrix, default)
@@ -239,7 +239,7 @@ def test_an_update_from_hits_is_that_from_the_grid(tmp_path):
     path = tmp_path / "policy.safetensors"
     save_policy(path, agent, spec)
     flat = dense.reshape(-1)
-    flat["signal"] = flat["inputs", "signal"]
+    flat["signal"] = rollout["signal"].dense()
     given = flat["loc"]
     loc = load_policy(path)(flat.select("observation", "signal"))["action"]
     torch.testing.assert_close(loc, given, atol=1e-5, rtol=1e-4)

@@ -20,7 +20,7 @@ from torchrl.modules import IndependentNormal, ProbabilisticActor
 
 from egoskin.sparse import SparseRows, SparseSource
 
-# Keys whose values are a skin's signals; by default they enter as they are.
+# Keys whose values are a skin's signals.
 _SIGNAL_KEYS = ("signal",)
 
 
@@ -34,9 +34,10 @@ class NetworkConfig:
     """Standard deviation of the action at the start."""
     std_bounds: tuple[float, float] = (0.1, 1.0)
     """The standard deviation never leaves these bounds."""
-    normalize: Literal["body", "all"] = "body"
-    """Running normalisation of all but the skin's signals, or of everything: of
-    signals by one mean and deviation for all sensors, which keeps what differs."""
+    normalize: Literal["body", "all"] = "all"
+    """Running normalisation of all but the skin's signals, or of everything. Signals
+    have one mean and deviation for all sensors, which keeps what differs, and weigh
+    as much together, be they three or thousands."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for sizes and bounds that make no network."""
@@ -57,7 +58,7 @@ class RunningNorm(nn.Module):
     pass: collection and learning see the same input.
 
     Args:
-        size: Number of features, or 1 for statistics that all features share.
+        size: Number of features.
     """
 
     # Normalised values beyond this many standard deviations are cut off.
@@ -68,6 +69,7 @@ class RunningNorm(nn.Module):
 
     def __init__(self, size: int) -> None:
         super().__init__()
+        self._gain, self._limit = 1.0, self.LIMIT
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
         self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
         self.register_buffer("var", torch.ones(size, dtype=torch.float64))
@@ -75,29 +77,19 @@ class RunningNorm(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Return (x - mean) / std, cut off at ``LIMIT``, ``[*B, F]``."""
         shift = self.mean.to(x.dtype)
-        scale = (self.var + 1e-8).rsqrt().to(x.dtype)
-        return ((x - shift) * scale).clamp(-self.LIMIT, self.LIMIT)
-
-    def sparse(self, rows: SparseRows) -> SparseRows:
-        """Return what `forward` would, of shared statistics, as sparse rows."""
-        default = self(rows.value.new_full((1,), rows.default))
-        return replace(rows, value=self(rows.value), default=float(default))
+        scale = (self._gain * (self.var + 1e-8).rsqrt()).to(x.dtype)
+        return ((x - shift) * scale).clamp(-self._limit, self._limit)
 
     @torch.no_grad()
-    def update(self, x: Tensor | SparseRows) -> None:
+    def update(self, x: Tensor) -> None:
         """Take a batch of data into the statistics, ``[*B, F]``."""
-        if isinstance(x, SparseRows):
-            values, n = x.value.double(), float(len(x) * x.size)
-            # All others are the default.
-            rest = n - len(values)
-            mean = ((values.sum() + rest * x.default) / n).reshape(1)
-            deviation = rest * (x.default - mean).square()
-            var = ((values - mean).square().sum() + deviation) / n
-        else:
-            x = x.reshape(-1, len(self.mean)).double()
-            n, mean = float(len(x)), x.mean(0)
-            # Several times as fast as x.var(0).
-            var = (x - mean).square_().mean(0)
+        x = x.reshape(-1, len(self.mean)).double()
+        mean = x.mean(0)
+        # Several times as fast as x.var(0).
+        self._merge(float(len(x)), mean, (x - mean).square_().mean(0))
+
+    def _merge(self, n: float, mean: Tensor, var: Tensor) -> None:
+        """Take mean and variance of n more into the statistics."""
         total = self.count + n
         delta = mean - self.mean
         # Chan et al., parallel variance: M2 = M2a + M2b + delta^2 na nb / n.
@@ -105,6 +97,46 @@ class RunningNorm(nn.Module):
         self.mean += delta * n / total
         self.var.copy_(m2 / total)
         self.count.copy_(total)
+
+
+class SignalNorm(RunningNorm):
+    """Normalises a skin's signals by one mean and variance for all sensors.
+
+    What differs between sensors still does, and a sparse grid stays sparse. All
+    signals together have the variance ``WEIGHT``, be they three or thousands.
+
+    Args:
+        features: Number of signals, ``F``.
+    """
+
+    # That of 64 sensors of one number each; the actor knows 48 of its body.
+    WEIGHT = 64.0
+
+    def __init__(self, features: int) -> None:
+        super().__init__(1)
+        self._gain = math.sqrt(self.WEIGHT / features)
+        # What is rare among thousands of beams is far from their mean: it stays.
+        self._limit = self.LIMIT * max(self._gain, 1.0)
+
+    def sparse(self, rows: SparseRows) -> SparseRows:
+        """Return what `forward` would, as sparse rows."""
+        default = self(rows.value.new_full((1,), rows.default))
+        return replace(rows, value=self(rows.value), default=float(default))
+
+    @torch.no_grad()
+    def update(self, x: Tensor | SparseRows) -> None:
+        """Take a batch of data into the statistics, ``[*B, F]``."""
+        if isinstance(x, Tensor):
+            # In parts: a rollout of full grids takes gigabytes in float64.
+            for part in x.reshape(-1, 1).split(2**22):
+                super().update(part)
+            return
+        values, n = x.value.double(), float(len(x) * x.size)
+        # All others are the default.
+        rest = n - len(values)
+        mean = ((values.sum() + rest * x.default) / n).reshape(1)
+        deviation = rest * (x.default - mean).square()
+        self._merge(n, mean, ((values - mean).square().sum() + deviation) / n)
 
 
 class KeyedMLP(nn.Module):
@@ -252,7 +284,12 @@ class Agent(nn.Module):
             if config.normalize == "all" or key not in _SIGNAL_KEYS
         ]
         self.norms = nn.ModuleDict(
-            {k: RunningNorm(1 if k in _SIGNAL_KEYS else sizes[k]) for k in normalized}
+            {
+                key: SignalNorm(sizes[key])
+                if key in _SIGNAL_KEYS
+                else RunningNorm(sizes[key])
+                for key in normalized
+            }
         )
 
         def network(keys: Sequence[str], out: int, gain: float) -> KeyedMLP:
@@ -325,9 +362,11 @@ class Agent(nn.Module):
             value = features[key]
             if key in self.norms:
                 norm = self.norms[key]
-                assert isinstance(norm, RunningNorm)
-                sparse = isinstance(value, SparseRows)
-                value = norm.sparse(value) if sparse else norm(value)
+                if isinstance(value, SparseRows):
+                    assert isinstance(norm, SignalNorm)
+                    value = norm.sparse(value)
+                else:
+                    value = norm(value)
             if isinstance(value, SparseRows):
                 inputs.set_non_tensor(key, value)
             else:
