@@ -4,8 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 ARGS ?=
 # The policy of `make demo`, and an episode of its bank to film.
-POLICY ?= localization
-EPISODE ?= 230
+POLICY ?= field_proximity
+EPISODE ?= 0
 
 .PHONY: train demo test test-slow test-memory verify check bench clean
 
