@@ -81,7 +81,7 @@ def test_networks_read_what_is_normalised():
     assert torch.equal(inputs["signal"], batch["signal"])
 
 
-def test_signals_are_normalised_unless_asked():
+def test_signals_are_normalised_unless_asked_not_to():
     assert set(make_agent().norms) == set(SIZES)
     body = make_agent(normalize="body").norms
     assert set(body) == {"observation", "privileged_observation"}

@@ -75,7 +75,7 @@ class RunningNorm(nn.Module):
         self.register_buffer("var", torch.ones(size, dtype=torch.float64))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return (x - mean) / std, cut off at ``LIMIT``, ``[*B, F]``."""
+        """Return (x - mean) / std, times the gain and cut off, ``[*B, F]``."""
         shift = self.mean.to(x.dtype)
         scale = (self._gain * (self.var + 1e-8).rsqrt()).to(x.dtype)
         return ((x - shift) * scale).clamp(-self._limit, self._limit)
@@ -359,18 +359,13 @@ class Agent(nn.Module):
         """
         inputs = TensorDict(batch_size=features.batch_size, device=features.device)
         for key in (k for k in self.critic_keys if k in features.keys()):
-            value = features[key]
-            if key in self.norms:
-                norm = self.norms[key]
-                if isinstance(value, SparseRows):
-                    assert isinstance(norm, SignalNorm)
-                    value = norm.sparse(value)
-                else:
-                    value = norm(value)
+            value, norm = features[key], self.norms[key] if key in self.norms else None
             if isinstance(value, SparseRows):
+                if isinstance(norm, SignalNorm):
+                    value = norm.sparse(value)
                 inputs.set_non_tensor(key, value)
             else:
-                inputs[key] = value
+                inputs[key] = value if norm is None else norm(value)
         return TensorDict({"inputs": inputs}, features.batch_size)
 
 
