@@ -26,9 +26,9 @@ from egoskin.sensors import Skin
 
 # Ages at which the displacement from the start is read [s].
 _AGES = (1.0, 2.0, 3.0)
-# Bounds of the groups by height aimed at [m] and by speed at arrival [m/s]: about a
-# third of the standard throws in each.
-_HEIGHTS, _SPEEDS = (0.9, 1.2), (5.3, 6.7)
+# Bounds of the groups by height aimed at [m], by speed at arrival [m/s] and by time
+# since the throw before [s]: about a third of the standard throws in each.
+_HEIGHTS, _SPEEDS, _GAPS = (0.9, 1.2), (5.3, 6.7), (1.33, 1.67)
 _QUARTERS = ("front", "left", "back", "right")
 # A point of a foot this close to the floor stands on it [m] (contacts give way a
 # little, so zero is too strict).
@@ -91,7 +91,8 @@ class Behaviour:
     """What a policy does with a bank of throws, within 10 s."""
 
     throws: dict[str, list[Group]]
-    """Groups by direction, height aimed at, speed at arrival, link aimed at."""
+    """Groups by direction, height aimed at, speed at arrival, time since the throw
+    before, link aimed at."""
     displacement: list[Displacement]
     """Way from the start."""
     motion: Motion
@@ -247,6 +248,7 @@ class Watcher:
             "direction": self._split(_quarter(self._draw), _QUARTERS),
             "height aimed at": self._split(*_bands(height, _HEIGHTS, "m")),
             "speed at arrival": self._split(*_bands(speed, _SPEEDS, "m/s")),
+            "since last throw": self._split(*self._gaps()),
         }
         if self._by_link:
             links = [
@@ -257,6 +259,13 @@ class Watcher:
             index = torch.tensor([names.index(link) for link in links])
             result["link aimed at"] = self._split(index, names)
         return result
+
+    def _gaps(self) -> tuple[Tensor, list[str]]:
+        """Return the band of the time since the throw before; first balls are one."""
+        gap = (self._thrown[:, 1:] - self._thrown[:, :-1]) / self._hz
+        band, names = _bands(gap, _GAPS, "s")
+        first = torch.zeros_like(band[:, :1])
+        return torch.cat((first, band + 1), 1), ["first ball", *names]
 
     def _split(self, kind: Tensor, names: Sequence[str]) -> list[Group]:
         """Return the groups of throws of the same kind, ``[N * K]`` int64."""

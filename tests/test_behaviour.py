@@ -58,16 +58,40 @@ def test_groups_of_a_kind_share_out_all_throws(rigid):
     watcher, played, config = rigid
     groups = watcher.groups()
     # No link is aimed at by throws into a box.
-    assert set(groups) == {"direction", "height aimed at", "speed at arrival"}
+    assert list(groups) == [
+        "direction",
+        "height aimed at",
+        "speed at arrival",
+        "since last throw",
+    ]
     limit = round(config.task.success_s * config.task.physics.control_hz)
     wins = LAST - int(((played.steps <= limit) & played.hit).sum())
     later_hits = int(watcher._hit[:, 1:].sum())
     for kind in groups.values():
         assert sum(g.episodes for g in kind) == LAST
         assert sum(g.later_balls for g in kind) == played.arrived[:, 1].sum()
-        assert sum(g.success.mean * g.episodes for g in kind) == pytest.approx(wins)
+        won = (g.success.mean * g.episodes for g in kind if g.success)
+        assert sum(won) == pytest.approx(wins)
         hits = sum(g.later_hits * g.later_balls for g in kind if g.later_balls)
         assert hits == pytest.approx(later_hits)
+
+
+def test_later_balls_are_split_by_the_time_since_the_throw_before(rigid):
+    watcher, _, config = rigid
+    first, *later = watcher.groups()["since last throw"]
+    assert (first.name, first.episodes, first.later_balls) == ("first ball", LAST, 0)
+    assert [g.episodes for g in later] == [0, 0, 0]
+    arrived = watcher._arrived[:, 1:]
+    count = arrived.shape[1]
+    row = torch.arange(LAST).repeat_interleave(count)
+    thrower = Thrower(config.task.throws, H1_2, config.task.physics.timestep)
+    draw = thrower.draw(0, row, row * 0, torch.arange(count).repeat(LAST))
+    # A ball's interval is the time to the next one, in whole control steps.
+    gap = (draw.interval.reshape(LAST, count) * 60).round() / 60
+    short = later[0]
+    assert short.name == "below 1.33 s"
+    # These intervals are 0.9 to 1.3 s: all of them.
+    assert short.later_balls == int((arrived & (gap <= 1.33)).sum()) > 10
 
 
 def test_a_sector_of_throws_is_one_quarter():

@@ -1,0 +1,79 @@
+"""What the body could still do: a search starts where the policy is, and only adds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from egoskin.behaviour import Watcher
+from egoskin.evaluation import play_bank, standard_task
+from egoskin.make import EnvConfig
+from egoskin.planning import Ceiling, SearchConfig, find_ceiling
+from egoskin.policies import Policy, load_policy
+
+THROWS = 16
+SEARCH = SearchConfig(samples=24, iterations=3, stand_s=0.75)
+
+
+@pytest.fixture(scope="module")
+def policy() -> Policy:
+    return load_policy("field_proximity")
+
+
+def task(policy: Policy) -> EnvConfig:
+    """The standard task without a second ball; the first arrives within 2 s."""
+    config = standard_task(policy.env_config)
+    throws = replace(config.task.throws, interval=(1e3, 1e3))
+    return replace(
+        config, task=replace(config.task, throws=throws, episode_length_s=2.0)
+    )
+
+
+def find(policy: Policy, search: SearchConfig = SEARCH, reach: float = 2.0) -> Ceiling:
+    return find_ceiling(
+        policy, task(policy), search, bank_seed=0, throws=THROWS, reach=reach
+    )
+
+
+@pytest.fixture(scope="module")
+def ceiling(policy: Policy) -> Ceiling:
+    return find(policy)
+
+
+def test_the_empty_plan_is_the_policy(policy: Policy, ceiling: Ceiling):
+    config = task(policy)
+    watcher = Watcher(config, 0, THROWS)
+    play_bank(policy, config, policy.skin, bank_seed=0, episodes=THROWS, watch=watcher)
+    hit = watcher._hit[:, 0]
+    # All of them come into range; some hit, some do not.
+    assert torch.equal(ceiling.policy.avoided, ~hit)
+    assert 0 < int(hit.sum()) < THROWS
+
+
+def test_a_search_finds_more_than_the_policy_does_and_loses_nothing(ceiling: Ceiling):
+    own, best = ceiling.policy, ceiling.best
+    assert not (own.avoided & ~best.avoided).any()
+    assert not (own.stood & ~best.stood).any()
+    for outcome in (own, best):
+        assert not (outcome.stood & ~outcome.avoided).any()
+    assert int(best.avoided.sum()) > int(own.avoided.sum())
+
+
+def test_a_search_repeats(policy: Policy):
+    search = SearchConfig(samples=8, iterations=2, stand_s=0.5)
+    one, two = find(policy, search), find(policy, search)
+    assert torch.equal(one.best.avoided, two.best.avoided)
+    assert torch.equal(one.best.stood, two.best.stood)
+
+
+def test_balls_that_never_come_into_reach_are_an_error(policy: Policy):
+    with pytest.raises(ValueError, match="came within 1e-06 m of a sensor"):
+        find(policy, reach=1e-6)
+
+
+@pytest.mark.parametrize("change", [{"samples": 3}, {"hold": 0}, {"stand_s": -1.0}])
+def test_searches_that_cannot_be_are_refused(change: dict):
+    with pytest.raises(ValueError, match=next(iter(change))):
+        SearchConfig(**change)
