@@ -198,6 +198,27 @@ def test_an_evaluation_says_what_the_policy_does_and_at_another_physics_rate(
     assert sum(g["episodes"] for g in groups) == 16
 
 
+def test_a_ceiling_counts_what_policy_and_search_avoid(tmp_path: Path):
+    out = tmp_path / "ceiling.json"
+    search = ("--search.samples", "4", "--search.iterations", "1")
+    # So long that each plan sees its ball arrive, so short that it takes seconds.
+    done = run(
+        "ceiling.py",
+        *("field_proximity", "--throws", "12", "--json", out),
+        *(*search, "--search.stand-s", "0.75"),
+    )
+    assert done.returncode == 0, done.stderr
+    assert "12 first throws of bank 0 that came within 2 m" in done.stdout
+    assert "iteration 1 of 1" in done.stderr
+    rows = json.loads(out.read_text())["by_height_m"]
+    assert sum(row["throws"] for row in rows) == 12
+    avoided = sum(row["policy_avoids"] for row in rows)
+    assert 0 < avoided <= sum(row["search_avoids"] for row in rows)
+    bad = run("ceiling.py", "field_proximity", "--reach", "0")
+    assert bad.returncode == 2
+    assert "reach must be positive" in bad.stderr
+
+
 def test_a_run_is_stored_and_reported_again_when_it_is_longer(
     trained: Path, tmp_path: Path
 ):
