@@ -46,7 +46,8 @@ class SearchConfig:
     spread: float = 1.2
     """Standard deviation of the entries at first, in units of the action."""
     stand_s: float = 1.25
-    """Time after the start of the plan for which the robot must not fall [s]."""
+    """Time after the start of the plan that is watched: longer than the ball takes, and
+    the robot must not fall [s]."""
     seed: int = 0
     """Seed of the plans drawn."""
 
@@ -64,9 +65,9 @@ class Outcome:
     """How throws end, ``[N]`` bool each."""
 
     avoided: Tensor
-    """The ball does not touch the robot."""
+    """The ball does not touch the robot within `SearchConfig.stand_s`."""
     stood: Tensor
-    """Nor does the robot fall within `SearchConfig.stand_s`."""
+    """Nor does the robot fall."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,6 +91,7 @@ class _Start:
     root: TensorDictBase
 
     def repeated(self, times: int) -> _Start:
+        """Return each row several times, one after the other."""
         row = torch.arange(len(self.throw)).repeat_interleave(times)
         return _Start(
             throw=self.throw[row],
