@@ -243,7 +243,7 @@ def _play(
     """Play rows from their starts with a plan ``[M, T, J]`` added to the actions.
 
     Returns:
-        Whether no ball hit, ``[M]`` bool, and steps until the end, ``[M]``.
+        Whether no ball hit, ``[M]`` bool, and steps survived, ``[M]``.
     """
     _task(env).load_simulation_state(start.simulation)
     root = start.root.clone()
@@ -257,7 +257,7 @@ def _play(
         after = cast(TensorDictBase, step["next"])
         ended = running & after["done"][:, 0]
         avoided &= ~(ended & after["hit"][:, 0])
-        age[ended] = number + 1
+        age[ended] = number
         running &= ~ended
     return avoided, age
 

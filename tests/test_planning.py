@@ -9,8 +9,14 @@ import torch
 
 from egoskin.behaviour import Watcher
 from egoskin.evaluation import play_bank, standard_task
-from egoskin.make import EnvConfig
-from egoskin.planning import Ceiling, SearchConfig, find_ceiling
+from egoskin.make import EnvConfig, make_worker_env
+from egoskin.planning import (
+    Ceiling,
+    SearchConfig,
+    _play,
+    _until_in_reach,
+    find_ceiling,
+)
 from egoskin.policies import Policy, load_policy
 
 THROWS = 16
@@ -59,6 +65,20 @@ def test_a_search_finds_more_than_the_policy_does_and_loses_nothing(ceiling: Cei
     for outcome in (own, best):
         assert not (outcome.stood & ~outcome.avoided).any()
     assert int(best.avoided.sum()) > int(own.avoided.sum())
+
+
+def test_the_step_of_a_hit_is_not_survived(policy: Policy):
+    config = task(policy)
+    env = make_worker_env(
+        config, policy.skin, num_envs=THROWS, seed=0, num_threads=1, keep_raw=True
+    )
+    start = _until_in_reach(env, policy, config, reach=2.0)
+    empty = torch.zeros(THROWS, 0, len(config.robot_config.joints))
+    avoided, survived = _play(env, policy, start, empty, steps=60)
+    row = int((~avoided).nonzero()[0])
+    steps = int(survived[row])
+    assert _play(env, policy, start, empty, steps)[0][row]
+    assert not _play(env, policy, start, empty, steps + 1)[0][row]
 
 
 def test_a_search_repeats(policy: Policy):
