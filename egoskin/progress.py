@@ -37,6 +37,8 @@ class ProgressLine:
         )
         if metrics["episode/ball_speed"] < 1:
             text += f"  balls at {metrics['episode/ball_speed']:.0%} of their speed"
+        if metrics["episode/ball_core"] < 1:
+            text += f"  {metrics['episode/ball_core']:.0%} of their radius touches"
         if self._live:
             print(f"\r{text}\x1b[K", end="", flush=True)
         elif now - self._shown >= _FILE_INTERVAL or frames >= self._total:

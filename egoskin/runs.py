@@ -61,6 +61,11 @@ class TrainConfig:
     slow_start_frames: int = 12_288_000
     """Environment steps over which that share grows to 1 (a curriculum); 0: the full
     speed from the start, as in the paper."""
+    core_frames: tuple[int, int] = (6_000_000, 20_480_000)
+    """Environment steps up to which only the centre of a ball touches the robot, and
+    from which on all of it does; a core that grows in between (a curriculum). The
+    sensors always feel the whole ball. (0, 0): all of it from the start, as in the
+    paper."""
     seed: int = 0
     """Seed of everything random: throws, starts, networks, actions."""
     total_frames: int = 65_536_000
@@ -101,6 +106,11 @@ class TrainConfig:
             raise ValueError(
                 f"slow_start_frames must not be negative, got {self.slow_start_frames}"
             )
+        first, last = self.core_frames
+        if not 0 <= first <= last:
+            raise ValueError(
+                f"core_frames must not be negative and must rise, got {first} {last}"
+            )
         if self.learner_threads is not None and self.learner_threads < 1:
             raise ValueError(
                 f"learner_threads must be at least 1, got {self.learner_threads}"
@@ -128,6 +138,13 @@ class TrainConfig:
             return 1.0
         grown = frames / self.slow_start_frames
         return self.slow_start + (1.0 - self.slow_start) * grown
+
+    def ball_core_at(self, frames: int) -> float:
+        """Return the share of a ball's radius that touches after a number of frames."""
+        first, last = self.core_frames
+        if frames >= last:
+            return 1.0
+        return (frames - first) / (last - first) if frames > first else 0.0
 
     def check_machine(self) -> None:
         """Raise ValueError for what this machine lacks: the device, a C++ compiler."""

@@ -77,18 +77,19 @@ class Trainer:
         self.frames = 0
         self.wall_s = 0.0
         self.root: TensorDictBase = TensorDict()
-        self._ball_speed = 1.0
+        self._ball_speed = self._ball_core = 1.0
 
-    def _throw_as_due(self) -> None:
-        """Let balls be thrown as fast as is due by now."""
-        due = self.config.ball_speed_at(self.frames)
-        if due != self._ball_speed:
-            self.env.set_ball_speed(due)
-            self._ball_speed = due
+    def _ease_as_due(self) -> None:
+        """Let balls be as slow, and touch as little, as is due by now."""
+        speed = self.config.ball_speed_at(self.frames)
+        core = self.config.ball_core_at(self.frames)
+        if (speed, core) != (self._ball_speed, self._ball_core):
+            self.env.ease_balls(speed, core)
+            self._ball_speed, self._ball_core = speed, core
 
     def start(self) -> None:
         """Begin a new run: first observations, first policy, first checkpoint."""
-        self._throw_as_due()
+        self._ease_as_due()
         self.root = self.env.reset()
         self.keep_policy()
         self.save()
@@ -101,7 +102,7 @@ class Trainer:
             WorkerError: If a worker ends.
         """
         start = time.perf_counter()
-        self._throw_as_due()
+        self._ease_as_due()
         rollout, self.root, infos = collect(
             self.env,
             self.agent,
@@ -126,6 +127,7 @@ class Trainer:
             "time/steps_per_s": self.config.frames_per_batch / (end - start),
             "time/collect_share": (collected - start) / (end - start),
             "episode/ball_speed": self._ball_speed,
+            "episode/ball_core": self._ball_core,
             **self._episode_metrics(TensorDict.maybe_dense_stack(infos)),
             **{f"ppo/{name}": value for name, value in learned.items()},
         }

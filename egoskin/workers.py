@@ -247,9 +247,9 @@ class WorkerPool(ParallelEnv):
         with self._death_explained():
             return super().reset(tensordict, **kwargs)
 
-    def set_ball_speed(self, share: float) -> None:
-        """Let every worker throw at a share of the speed drawn from now on."""
-        self._ask("set_ball_speed", share)
+    def ease_balls(self, speed: float, core: float) -> None:
+        """Ease the balls of every worker's environment."""
+        self._ask("ease_balls", speed, core)
 
     def _ask(self, method: str, *args: object) -> list:
         """Return what a method of every worker's environment answers."""

@@ -155,6 +155,7 @@ def main(args: list[str]) -> None:
                     # Balls that still arrive within few rollouts.
                     slow_start=0.8,
                     slow_start_frames=frames,
+                    core_frames=(0, frames),
                 )
                 half = config.iterations // 2
                 equal &= agree(planned, Path(folder), title, half)

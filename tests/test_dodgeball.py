@@ -116,13 +116,13 @@ def test_rows_do_not_depend_on_the_number_of_threads(whole_run):
 
 def test_balls_can_be_thrown_more_slowly():
     env, slow = make(8, seed=3), make(8, seed=3)
-    slow.set_ball_speed(0.5)
+    slow.ease_balls(0.5, 1.0)
     root = slow.reset()
     whole = env.reset()["object_lin_vel_w"]
     assert (whole[:, 0].norm(dim=-1) >= 4).all()
     torch.testing.assert_close(root["object_lin_vel_w"], 0.5 * whole)
     # From the next throw on: those in flight fly on.
-    slow.set_ball_speed(1.0)
+    slow.ease_balls(1.0, 1.0)
     steps = run(slow, torch.zeros(120, 8, JOINTS), root)["next"]
     speed = steps["object_lin_vel_w"].norm(dim=-1)
     assert (speed[0, :, 0] < 4).all()

@@ -89,26 +89,38 @@ def test_a_run_folder_holds_what_is_needed_to_understand_it(trained: Path):
     assert names == ["000000000000", f"{4 * BATCH:012d}"]
 
 
-def test_balls_are_slow_at_first(tmp_path: Path, monkeypatch):
-    speeds = []
-    throw = WorkerPool.set_ball_speed
+def test_balls_are_easy_at_first(tmp_path: Path, monkeypatch):
+    eased = []
+    ease = WorkerPool.ease_balls
     monkeypatch.setattr(
-        *(WorkerPool, "set_ball_speed"),
-        lambda pool, share: speeds.append(share) or throw(pool, share),
+        *(WorkerPool, "ease_balls"),
+        lambda pool, *shares: eased.append(shares) or ease(pool, *shares),
     )
-    args = ("--slow-start-frames", 2 * BATCH, "--total-frames", 4 * BATCH)
+    args = ("--slow-start-frames", 2 * BATCH, "--core-frames", BATCH, 3 * BATCH)
+    args += ("--total-frames", 5 * BATCH)
     done = run("ppo.py", *SMALL, "--run-dir", tmp_path / "run", *args)
     assert done.returncode == 0, done.stderr
-    assert speeds == pytest.approx([0.4, 0.7, 1.0])
-    logged = [float(row["episode/ball_speed"]) for row in metrics(tmp_path / "run")]
-    assert logged == pytest.approx([0.4, 0.7, 1.0, 1.0])
-    assert "balls at 40% of their speed" in done.stdout
+    due = [(0.4, 0.0), (0.7, 0.0), (1.0, 0.5), (1.0, 1.0)]
+    assert eased == [pytest.approx(shares) for shares in due]
+    logged = [
+        (float(row["episode/ball_speed"]), float(row["episode/ball_core"]))
+        for row in metrics(tmp_path / "run")
+    ]
+    assert logged == [pytest.approx(shares) for shares in [*due, due[-1]]]
+    assert "balls at 40% of their speed  0% of their radius touches" in done.stdout
 
 
 @pytest.mark.parametrize(
-    "field", [{"slow_start": 0.0}, {"slow_start": 1.5}, {"slow_start_frames": -1}]
+    "field",
+    [
+        {"slow_start": 0.0},
+        {"slow_start": 1.5},
+        {"slow_start_frames": -1},
+        {"core_frames": (-1, 1)},
+        {"core_frames": (2, 1)},
+    ],
 )
-def test_a_slow_start_outside_its_range_is_refused(field: dict):
+def test_an_easy_start_outside_its_range_is_refused(field: dict):
     with pytest.raises(ValueError, match=next(iter(field))):
         TrainConfig(**field)
 

@@ -100,7 +100,7 @@ def test_every_worker_slows_its_balls(skin):
     try:
         whole = pool.reset().reshape(-1)["signal"]
         pool.set_seed(5, static_seed=True)
-        pool.set_ball_speed(0.5)
+        pool.ease_balls(0.5, 1.0)
         half = pool.reset().reshape(-1)["signal"]
     finally:
         pool.close()

@@ -250,12 +250,18 @@ class DodgeballEnv(EnvBase):
             )
         return self._physics
 
-    def set_ball_speed(self, share: float) -> None:
-        """Throw balls at a share of the speed drawn, from the next throw on.
+    def ease_balls(self, speed: float, core: float) -> None:
+        """Make balls easier to dodge, for the start of a training.
 
-        For the start of a training; it is no part of the state.
+        Neither is a part of the state.
+
+        Args:
+            speed: Share of the speed drawn, from the next throw on.
+            core: Share of a ball's radius that touches the robot, from now on; the
+                sensors feel the whole ball all the same.
         """
-        self._ball_speed = share
+        self._ball_speed = speed
+        self.physics.set_object_core(core)
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
