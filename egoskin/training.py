@@ -197,7 +197,7 @@ class Trainer:
         torch.set_rng_state(tensors["random_state"])
         if self.device.type == "cuda":
             torch.cuda.set_rng_state(tensors["random_state_cuda"], self.device)
-        self._throw_as_due()
+        self._ease_as_due()
 
     def dump(self, error: NonFiniteError) -> Path:
         """Write what `scripts/replay.py` needs to meet an error again; return where."""
