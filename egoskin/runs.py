@@ -61,7 +61,7 @@ class TrainConfig:
     slow_start_frames: int = 12_288_000
     """Environment steps over which that share grows to 1 (a curriculum); 0: the full
     speed from the start, as in the paper."""
-    core_frames: tuple[int, int] = (6_000_000, 20_480_000)
+    core_frames: tuple[int, int] = (5_851_429, 20_480_000)
     """Environment steps up to which only the centre of a ball touches the robot, and
     from which on all of it does; a core that grows in between (a curriculum). The
     sensors always feel the whole ball. (0, 0): all of it from the start, as in the
