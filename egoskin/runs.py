@@ -109,7 +109,7 @@ class TrainConfig:
         first, last = self.core_frames
         if not 0 <= first <= last:
             raise ValueError(
-                f"core_frames must not be negative and must not fall, got {first} {last}"
+                f"core_frames must be neither negative nor falling, got {first} {last}"
             )
         if self.learner_threads is not None and self.learner_threads < 1:
             raise ValueError(
