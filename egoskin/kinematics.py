@@ -376,21 +376,27 @@ def quat_to_matrix(quat: Tensor) -> Tensor:
     Returns:
         Rotation matrices, ``[*B, 3, 3]``.
     """
-    w, x, y, z = quat.unbind(-1)
-    return torch.stack(
-        (
-            1 - 2 * (y * y + z * z),
-            2 * (x * y - w * z),
-            2 * (x * z + w * y),
-            2 * (x * y + w * z),
-            1 - 2 * (x * x + z * z),
-            2 * (y * z - w * x),
-            2 * (x * z - w * y),
-            2 * (y * z + w * x),
-            1 - 2 * (x * x + y * y),
-        ),
-        -1,
-    ).unflatten(-1, (3, 3))
+    return torch.stack(quat_to_entries(quat.unbind(-1)), -1).unflatten(-1, (3, 3))
+
+
+def quat_to_entries(quat: Sequence[Tensor]) -> tuple[Tensor, ...]:
+    """Return the nine entries of `quat_to_matrix`, row by row.
+
+    Args:
+        quat: w, x, y, z of unit quaternions, of one shape.
+    """
+    w, x, y, z = quat
+    return (
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - w * z),
+        2 * (x * z + w * y),
+        2 * (x * y + w * z),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x),
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        1 - 2 * (x * x + y * y),
+    )
 
 
 def rotate(quat: Tensor, vector: Tensor) -> Tensor:

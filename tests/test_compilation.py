@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from torch._inductor import cpp_builder, exc
 
 from egoskin.compilation import can_compile, compiled, exact_sqrt
 
@@ -13,8 +14,11 @@ def double(x: torch.Tensor) -> torch.Tensor:
 
 
 def test_without_a_compiler_functions_run_as_they_are_and_say_so(monkeypatch):
-    monkeypatch.setenv("PATH", "")
-    monkeypatch.delenv("CXX", raising=False)
+    def none() -> str:
+        raise exc.InvalidCxxCompiler
+
+    # Torch remembers what it found, whatever PATH says later.
+    monkeypatch.setattr(cpp_builder, "get_cpp_compiler", none)
     can_compile.cache_clear()
     try:
         with pytest.warns(UserWarning, match=r"install g\+\+.*uncompiled"):

@@ -23,7 +23,7 @@ from torchrl.data import Binary as BinarySpec
 from torchrl.data import Composite, TensorSpec, Unbounded
 
 from egoskin.compilation import compiled
-from egoskin.kinematics import LinkKinematics, quat_to_matrix
+from egoskin.kinematics import LinkKinematics, quat_to_entries
 from egoskin.robots import Primitive
 from egoskin.sensors.coverage import Coverage
 from egoskin.sensors.occlusion import Occluder
@@ -116,7 +116,7 @@ def _poison(base_pose: Tensor, joint_pos: Tensor, object_pose: Tensor) -> Tensor
 
 def _matrix(quat: Tensor) -> Tensor:
     """Return rotation matrices ``[3, 3, B]`` of unit quaternions ``[4, B]``."""
-    return quat_to_matrix(quat.t()).permute(1, 2, 0)
+    return torch.stack(quat_to_entries(quat.unbind(0))).unflatten(0, (3, 3))
 
 
 class ProximitySensor(RowTransform):
@@ -232,14 +232,16 @@ class ProximitySensor(RowTransform):
                 # q = R^T (c - p)
                 x, y, z = (c - p for c, p in zip(centre, position, strict=True))
                 columns = zip(*rotation, strict=True)
-                seen.append(torch.stack([a * x + b * y + c * z for a, b, c in columns]))
+                seen.append([a * x + b * y + c * z for a, b, c in columns])
             turn = None
             if not isinstance(shape, Sphere):
                 # Link to base to object: (R_base^T R_object)^T R_link.
                 to_object = product(_matrix(pose[3:]).transpose(0, 1), base)
                 links = stack_frames(frames, scene.base)[0]
                 turn = product(to_object[:, :, None], links)
-            views.append(View(torch.stack(seen, 1), turn))
+            # Stacked at once: in two steps compiled code copies them.
+            along = [place for axis in zip(*seen, strict=True) for place in axis]
+            views.append(View(torch.stack(along).unflatten(0, (3, -1)), turn))
         return views
 
     def frames_b(

@@ -68,7 +68,7 @@ class RaySensor(ProximitySensor):
     _beams: Tensor
     _beam_of: Tensor
     _depth: Tensor | None
-    _cone: Tensor
+    _pyramid: Tensor
     _reach: Tensor
 
     def __init__(
@@ -102,8 +102,10 @@ class RaySensor(ProximitySensor):
         # [3, U, K M] for U different coverages, and which of them each sensor has.
         beams = torch.stack(directions).flatten(1, 2).movedim(-1, 0)
         beam_of = torch.tensor([kinds.index(r) for r in rays])
-        # Half angle of the cone about each sensor's beams.
-        cos_h = beams[2].amin(-1)[beam_of]
+        # Cosine and sine of the half angles of the pyramid about each sensor's beams,
+        # along x and along y.
+        slopes = (beams[:2].abs() / beams[2]).amax(-1)[:, beam_of]
+        angles = slopes.atan()
         depth = torch.tensor([r.measure == "depth" for r in rays])
         super().__init__(
             skin,
@@ -120,8 +122,8 @@ class RaySensor(ProximitySensor):
         self.register_buffer("_beams", beams)
         self.register_buffer("_beam_of", beam_of)
         self.register_buffer("_depth", depth if depth.any() else None)
-        cone = torch.stack((cos_h, (1 - cos_h**2).sqrt()))[..., None]
-        self.register_buffer("_cone", cone)
+        pyramid = torch.stack((angles.cos(), angles.sin()))[..., None]
+        self.register_buffer("_pyramid", pyramid)
         slant = torch.tensor([r.slant for r in rays], dtype=torch.float64)
         self.register_buffer("_reach", self._range * slant[:, None])
         self._margin_kernel: Callable[..., tuple[Tensor, list[View]]]
@@ -155,14 +157,15 @@ class RaySensor(ProximitySensor):
         if not self._cull:
             # 1, or NaN.
             return 1.0 + 0.0 * x
-        cos_h, sin_h = skin["cone"]
-        bound, flat = shape.bounding_radius, x * x + y * y
-        # Outside the range, beside the cone of the beams, or behind the sensor:
-        # R + r - |c|, r - (rho cos h - z sin h), z + r.
-        far = skin["reach"] + bound - (flat + z * z).sqrt()
-        beside = bound - (flat.sqrt() * cos_h - z * sin_h)
-        margin = torch.minimum(torch.minimum(far, beside), z + bound)
-        return (margin + _SLACK).clamp(min=0.0)
+        # Outside the range, behind the sensor, or beyond a side of the pyramid:
+        # R + r - |c|, r + z, r - (|x| cos h - z sin h).
+        cos, sin = skin["pyramid"]
+        far = (x * x + y * y + z * z).sqrt() - skin["reach"]
+        beside = torch.maximum(
+            x.abs() * cos[0] - z * sin[0], y.abs() * cos[1] - z * sin[1]
+        )
+        gap = torch.maximum(torch.maximum(far, beside), -z)
+        return (shape.bounding_radius + _SLACK - gap).clamp(min=0.0)
 
     @staticmethod
     def _in_sensor(v: Tensor, axes: Tensor) -> list[Tensor]:
@@ -226,10 +229,12 @@ class RaySensor(ProximitySensor):
 
     def measure(self, scene: Scene, rows: Tensor | None, out: Tensor) -> Tensor:
         """Write the readings of some rows, and return the least of each object."""
+        # All before the grid is filled, which empties the caches.
+        pairs = list(self._pairs(scene, rows))
         if rows is None:
             out.fill_(torch.inf)
         least = scene.active.new_full(scene.active.shape, torch.inf, dtype=out.dtype)
-        for i, row, place, reading, nearest in self._pairs(scene, rows):
+        for i, row, place, reading, nearest in pairs:
             target = out[i] if self.per_object else out
             # A view, or an error: a copy would lose what is written.
             flat = target.view(-1, *target.shape[2:])
