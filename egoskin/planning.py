@@ -6,7 +6,6 @@ body and the time that was left allow it.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import cast
@@ -72,7 +71,7 @@ class Outcome:
 
 @dataclass(frozen=True, kw_only=True)
 class Ceiling:
-    """What a policy makes of first throws, and what could be made of them."""
+    """What a policy makes of some balls, and what could be made of them."""
 
     height: Tensor
     """Height aimed at, at the standing robot [m], ``[N]``."""
@@ -109,9 +108,10 @@ def find_ceiling(
     bank_seed: int,
     throws: int,
     reach: float,
+    ball: int = 1,
     on_iteration: Callable[[int, Outcome], None] | None = None,
 ) -> Ceiling:
-    """Search the actions with which the first balls of a bank would be avoided.
+    """Search the actions with which the balls of a bank would be avoided.
 
     The policy plays until the ball is within reach of a sensor. From there on a plan, a
     few vectors of actions that last some control steps each, is added to its actions:
@@ -124,21 +124,18 @@ def find_ceiling(
         config: Robot, task (its throws are those of the bank), sensors.
         search: Plans and search.
         bank_seed: Seed of the bank.
-        throws: Number of first throws.
+        throws: Number of episodes of the bank.
         reach: Distance from a sensor to the ball's surface at which plans start [m].
+        ball: Which ball of each episode, from 1; none is thrown after it.
         on_iteration: Called with (iterations done, the best outcome so far).
 
     Returns:
-        What becomes of the throws that came within reach before the robot fell.
+        What becomes of the balls that came within reach before the episode ended or
+        the next was thrown.
 
     Raises:
         ValueError: If there is no such throw.
     """
-    # Only the first ball counts: no other one is thrown.
-    alone = dataclasses.replace(config.task.throws, interval=(1e3, 1e3))
-    config = dataclasses.replace(
-        config, task=dataclasses.replace(config.task, throws=alone)
-    )
 
     def make(rows: int) -> TransformedEnv:
         return make_worker_env(
@@ -150,7 +147,7 @@ def find_ceiling(
             keep_raw=True,
         )
 
-    start = _until_in_reach(make(throws), policy, config, reach)
+    start = _until_in_reach(make(throws), policy, config, reach, ball)
     n, samples = len(start.throw), search.samples
     if n == 0:
         raise ValueError(f"none of {throws} balls came within {reach:g} m of a sensor")
@@ -193,42 +190,50 @@ def find_ceiling(
     thrower = Thrower(config.task.throws, config.robot_config, 1.0)
     zero = torch.zeros_like(start.throw)
     height, _ = thrower.at_standing_robot(
-        thrower.draw(bank_seed, start.throw, zero, zero)
+        thrower.draw(bank_seed, start.throw, zero, zero + ball - 1)
     )
     return Ceiling(height=height, policy=own, best=best)
 
 
 def _until_in_reach(
-    env: TransformedEnv, policy: Policy, config: EnvConfig, reach: float
+    env: TransformedEnv, policy: Policy, config: EnvConfig, reach: float, ball: int = 1
 ) -> _Start:
-    """Play the first throws of a bank; return each one's state when it is in reach."""
+    """Play a bank; return the state of each episode when its n-th ball is in reach."""
     throws = env.batch_size[0]
     sensor = SensorConfig(coverage="field", signal="binary", range=reach)
+    balls = config.task.throws.balls
     transforms = sensor.transforms(
         config.robot_config,
         policy.skin,
-        config.task.throws.balls,
+        balls,
         dt=1 / config.task.physics.control_hz,
     )
     feel = Compose(transforms)
+    # Balls are thrown in turn: that of the others is not felt.
+    mine = torch.arange(len(balls)) == (ball - 1) % len(balls)
     root = env.reset()
     kept = root.clone()
     simulation = _task(env).simulation_state()
     waiting = torch.ones(throws, dtype=torch.bool)
     started = ~waiting
     for _ in range(config.task.episode_steps):
-        felt = feel(root.clone(recurse=False))["signal"].any(-1)
-        now = waiting & felt
-        if now.any():
-            kept[now] = root[now]
-            for key, value in _task(env).simulation_state().items():
-                simulation[key][now] = value[now]
-        started |= now
-        waiting &= ~felt
+        now = _task(env).simulation_state()
+        seen = root.clone(recurse=False)
+        seen["object_active"] = root["object_active"] & mine
+        felt = feel(seen)["signal"].any(-1) & (now["throw"] == ball)
+        begin = waiting & felt
+        if begin.any():
+            kept[begin] = root[begin]
+            for key, value in now.items():
+                simulation[key][begin] = value[begin]
+        started |= begin
+        waiting &= ~felt & (now["throw"] <= ball)
         if not waiting.any():
             break
         step, root = env.step_and_maybe_reset(policy(root))
         waiting &= ~cast(TensorDictBase, step["next"])["done"][:, 0]
+    # Nothing is thrown after it.
+    simulation["next_throw_step"].fill_(torch.iinfo(torch.int32).max)
     throw = started.nonzero()[:, 0]
     return _Start(
         throw=throw,

@@ -1,13 +1,13 @@
 """Ask what the body could still do when a ball is in reach of the skin.
 
 python scripts/ceiling.py field_proximity
-python scripts/ceiling.py runs/NAME --throws 64 --reach 1 --json ceiling.json
+python scripts/ceiling.py runs/NAME --throws 64 --ball 2 --json ceiling.json
 
-Each first throw of a bank is played by a policy until the ball is in reach of a sensor.
-From there on actions are searched that, added to the policy's, avoid the ball, and then
-that it does not fall. What the search finds the body and the warning time allow (it may
-miss what is possible); what the policy misses of it is a matter of learning, or of what
-its sensors do not tell.
+The first ball of each episode of a bank (--ball 2: the second) is played by a policy
+until it is in reach of a sensor. From there on actions are searched that, added to the
+policy's, avoid the ball, and then that it does not fall. What the search finds the body
+and the warning time allow (it may miss what is possible); what the policy misses of it
+is a matter of learning, or of what its sensors do not tell.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ BOUNDS = (0.0, 0.7, 0.9, 1.1, 1.3, 2.0)
 
 @dataclass(frozen=True, kw_only=True)
 class CeilingConfig:
-    """Search the actions with which the first throws of a bank would be avoided."""
+    """Search the actions with which the balls of a bank would be avoided."""
 
     policy: Annotated[Path, tyro.conf.Positional]
     """Run folder (its latest checkpoint), checkpoint, policy file, or the name of a
@@ -42,7 +42,9 @@ class CeilingConfig:
     bank_seed: int = 0
     """Seed of the bank of standard throws."""
     throws: int = 32
-    """First throws of the bank."""
+    """Episodes of the bank."""
+    ball: int = 1
+    """Which ball of each episode; none is thrown after it."""
     reach: float = 2.0
     """Distance from a sensor to the ball's surface at which the search starts [m]."""
     search: SearchConfig = field(default_factory=SearchConfig)
@@ -53,8 +55,11 @@ class CeilingConfig:
     def __post_init__(self) -> None:
         """Raise ValueError for values with which nothing can be searched."""
         check_seed(self.bank_seed, "bank_seed")
-        if self.throws < 1:
-            raise ValueError(f"throws must be at least 1, got {self.throws}")
+        for name in ("throws", "ball"):
+            if getattr(self, name) < 1:
+                raise ValueError(
+                    f"{name} must be at least 1, got {getattr(self, name)}"
+                )
         if not self.reach > 0:
             raise ValueError(f"reach must be positive, got {self.reach}")
         if self.json is not None and not self.json.parent.is_dir():
@@ -126,12 +131,13 @@ def main(args: list[str]) -> None:
         bank_seed=config.bank_seed,
         throws=config.throws,
         reach=config.reach,
+        ball=config.ball,
         on_iteration=show,
     )
     title = (
         f"{config.policy}: {policy.spec.frames:,} frames; "
-        f"{counted(len(result.height), 'first throw')} of bank {config.bank_seed} that "
-        f"came within {config.reach:g} m of a sensor"
+        f"{counted(len(result.height), 'throw')} (ball {config.ball} of the episodes) "
+        f"of bank {config.bank_seed} that came within {config.reach:g} m of a sensor"
     )
     print(table(result, title))
     if config.json is not None:

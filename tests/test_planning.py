@@ -58,6 +58,33 @@ def test_the_empty_plan_is_the_policy(policy: Policy, ceiling: Ceiling):
     assert 0 < int(hit.sum()) < THROWS
 
 
+def test_the_second_ball_comes_at_a_robot_that_has_dodged_the_first(policy: Policy):
+    config = standard_task(policy.env_config)
+    watcher = Watcher(config, 0, THROWS)
+    play_bank(policy, config, policy.skin, bank_seed=0, episodes=THROWS, watch=watcher)
+    env = make_worker_env(
+        config, policy.skin, num_envs=THROWS, seed=0, num_threads=1, keep_raw=True
+    )
+    start = _until_in_reach(env, policy, config, reach=2.0, ball=2)
+    first, second = watcher._hit[start.throw, :2].T
+    assert 0 < len(start.throw) < THROWS
+    assert not first.any()
+    assert (start.simulation["throw"] == 2).all()
+    empty = torch.zeros(len(start.throw), 0, len(config.robot_config.joints))
+    env = make_worker_env(
+        config,
+        policy.skin,
+        num_envs=len(start.throw),
+        seed=0,
+        num_threads=1,
+        keep_raw=True,
+    )
+    env.reset()
+    avoided, _ = _play(env, policy, start, empty, steps=75)
+    assert torch.equal(avoided, ~second)
+    assert 0 < int(second.sum()) < len(second)
+
+
 def test_a_search_finds_more_than_the_policy_does_and_loses_nothing(ceiling: Ceiling):
     own, best = ceiling.policy, ceiling.best
     assert not (own.avoided & ~best.avoided).any()

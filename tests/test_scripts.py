@@ -220,7 +220,7 @@ def test_a_ceiling_counts_what_policy_and_search_avoid(tmp_path: Path):
         *(*search, "--search.stand-s", "0.75"),
     )
     assert done.returncode == 0, done.stderr
-    assert "12 first throws of bank 0 that came within 2 m" in done.stdout
+    assert "12 throws (ball 1 of the episodes) of bank 0 that came" in done.stdout
     assert "iteration 1 of 1" in done.stderr
     rows = json.loads(out.read_text())["by_height_m"]
     assert sum(row["throws"] for row in rows) == 12
