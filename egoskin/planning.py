@@ -28,6 +28,8 @@ _ELITE, _KEPT = 0.1, 0.25
 _LEAST_SPREAD = 0.1
 # Of two plans that end alike the smaller one is better.
 _SIZE_COST = 1e-3
+# A step that no episode reaches.
+_NEVER = 2**31
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,8 +132,7 @@ def find_ceiling(
         on_iteration: Called with (iterations done, the best outcome so far).
 
     Returns:
-        What becomes of the balls that came within reach before the episode ended or
-        the next was thrown.
+        What becomes of the balls that came within reach before the episode ended.
 
     Raises:
         ValueError: If there is no such throw.
@@ -218,22 +219,25 @@ def _until_in_reach(
     started = ~waiting
     for _ in range(config.task.episode_steps):
         now = _task(env).simulation_state()
+        last = now["throw"] == ball
+        if (now["next_throw_step"][last] < _NEVER).any():
+            # Nothing is thrown after it.
+            now["next_throw_step"][last] = _NEVER
+            _task(env).load_simulation_state(now)
         seen = root.clone(recurse=False)
         seen["object_active"] = root["object_active"] & mine
-        felt = feel(seen)["signal"].any(-1) & (now["throw"] == ball)
+        felt = feel(seen)["signal"].any(-1) & last
         begin = waiting & felt
         if begin.any():
             kept[begin] = root[begin]
             for key, value in now.items():
                 simulation[key][begin] = value[begin]
         started |= begin
-        waiting &= ~felt & (now["throw"] <= ball)
+        waiting &= ~felt
         if not waiting.any():
             break
         step, root = env.step_and_maybe_reset(policy(root))
         waiting &= ~cast(TensorDictBase, step["next"])["done"][:, 0]
-    # Nothing is thrown after it.
-    simulation["next_throw_step"].fill_(torch.iinfo(torch.int32).max)
     throw = started.nonzero()[:, 0]
     return _Start(
         throw=throw,

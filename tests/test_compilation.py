@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from torch._inductor import cpp_builder, exc
+from torch._inductor import cpp_builder
 
 from egoskin.compilation import can_compile, compiled, exact_sqrt
 
@@ -14,11 +14,10 @@ def double(x: torch.Tensor) -> torch.Tensor:
 
 
 def test_without_a_compiler_functions_run_as_they_are_and_say_so(monkeypatch):
-    def none() -> str:
-        raise exc.InvalidCxxCompiler
-
-    # Torch remembers what it found, whatever PATH says later.
-    monkeypatch.setattr(cpp_builder, "get_cpp_compiler", none)
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.delenv("CXX", raising=False)
+    # Torch, too, remembers what it found.
+    cpp_builder.cpp_compiler_search.cache_clear()
     can_compile.cache_clear()
     try:
         with pytest.warns(UserWarning, match=r"install g\+\+.*uncompiled"):

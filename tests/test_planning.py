@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torchrl.envs import TransformedEnv
 
 from egoskin.behaviour import Watcher
 from egoskin.evaluation import play_bank, standard_task
@@ -37,6 +38,12 @@ def task(policy: Policy) -> EnvConfig:
     )
 
 
+def make(policy: Policy, config: EnvConfig, rows: int) -> TransformedEnv:
+    return make_worker_env(
+        config, policy.skin, num_envs=rows, seed=0, num_threads=1, keep_raw=True
+    )
+
+
 def find(policy: Policy, search: SearchConfig = SEARCH, reach: float = 2.0) -> Ceiling:
     return find_ceiling(
         policy, task(policy), search, bank_seed=0, throws=THROWS, reach=reach
@@ -62,27 +69,29 @@ def test_the_second_ball_comes_at_a_robot_that_has_dodged_the_first(policy: Poli
     config = standard_task(policy.env_config)
     watcher = Watcher(config, 0, THROWS)
     play_bank(policy, config, policy.skin, bank_seed=0, episodes=THROWS, watch=watcher)
-    env = make_worker_env(
-        config, policy.skin, num_envs=THROWS, seed=0, num_threads=1, keep_raw=True
-    )
+    env = make(policy, config, THROWS)
     start = _until_in_reach(env, policy, config, reach=2.0, ball=2)
     first, second = watcher._hit[start.throw, :2].T
     assert 0 < len(start.throw) < THROWS
     assert not first.any()
     assert (start.simulation["throw"] == 2).all()
     empty = torch.zeros(len(start.throw), 0, len(config.robot_config.joints))
-    env = make_worker_env(
-        config,
-        policy.skin,
-        num_envs=len(start.throw),
-        seed=0,
-        num_threads=1,
-        keep_raw=True,
-    )
+    env = make(policy, config, len(start.throw))
     env.reset()
     avoided, _ = _play(env, policy, start, empty, steps=75)
     assert torch.equal(avoided, ~second)
     assert 0 < int(second.sum()) < len(second)
+
+
+def test_no_ball_is_thrown_after_it(policy: Policy):
+    config = standard_task(policy.env_config)
+    # The next one would be thrown before the first comes into reach.
+    throws = replace(config.task.throws, interval=(0.1, 0.1))
+    config = replace(config, task=replace(config.task, throws=throws))
+    start = _until_in_reach(make(policy, config, THROWS), policy, config, reach=2.0)
+    assert len(start.throw) == THROWS
+    assert (start.simulation["step"] > 6).all()
+    assert (start.simulation["throw"] == 1).all()
 
 
 def test_a_search_finds_more_than_the_policy_does_and_loses_nothing(ceiling: Ceiling):
@@ -96,9 +105,7 @@ def test_a_search_finds_more_than_the_policy_does_and_loses_nothing(ceiling: Cei
 
 def test_the_step_of_a_hit_is_not_survived(policy: Policy):
     config = task(policy)
-    env = make_worker_env(
-        config, policy.skin, num_envs=THROWS, seed=0, num_threads=1, keep_raw=True
-    )
+    env = make(policy, config, THROWS)
     start = _until_in_reach(env, policy, config, reach=2.0)
     empty = torch.zeros(THROWS, 0, len(config.robot_config.joints))
     avoided, survived = _play(env, policy, start, empty, steps=60)
