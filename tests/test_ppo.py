@@ -244,16 +244,51 @@ def test_updates_move_the_mean_action_to_the_best():
     assert metrics["action_std"] < 0.5
 
 
-def test_the_learning_rate_follows_the_divergence_or_stays():
+def test_the_learning_rate_follows_the_divergence_from_update_to_update():
     agent = bandit_agent()
-    ppo = PPO(agent, PPOConfig(desired_kl=1e-9))
-    ppo.update(bandit_rollout(agent))
-    assert ppo.learning_rate == pytest.approx(1e-5)
+    ppo = PPO(agent, PPOConfig(desired_kl=0.001))
+    for _ in range(30):
+        before = ppo.learning_rate
+        metrics = ppo.update(bandit_rollout(agent))
+        factor = ppo.learning_rate / before
+        assert 1 / 1.501 < factor < 1.501
+        assert (factor > 1) == (metrics["kl"] < 0.001)
+    assert 0.0003 < metrics["kl"] < 0.003
+
+
+def test_the_divergence_of_an_update_is_that_of_the_policy_it_leaves():
+    agent = bandit_agent()
+    ppo = PPO(agent, PPOConfig())
+    rollout = bandit_rollout(agent)
+    observation = rollout["inputs", "observation"].clone()
+    kl = ppo.update(rollout)["kl"]
+    with torch.no_grad():
+        new = agent.head(observation)
+    expected = gaussian_kl(rollout["loc"], rollout["scale"], *new).mean()
+    assert kl == pytest.approx(float(expected), rel=1e-4)
+
+
+def test_without_a_desired_divergence_the_learning_rate_stays():
     agent = bandit_agent()
     ppo = PPO(agent, PPOConfig(desired_kl=None))
     metrics = ppo.update(bandit_rollout(agent))
     assert ppo.learning_rate == 1e-3
     assert "kl" not in metrics
+
+
+@pytest.mark.parametrize("own", [None, 0.0123])
+def test_the_critic_has_its_own_learning_rate_or_the_adapted_one(own: float | None):
+    agent = bandit_agent()
+    ppo = PPO(agent, PPOConfig(desired_kl=1e-9, critic_learning_rate=own))
+    ppo.update(bandit_rollout(agent))
+    assert ppo.learning_rate == pytest.approx(1e-3 / 1.5)
+    # Also after it was restored.
+    again = PPO(agent, ppo.config)
+    again.load_state(ppo.state(), ppo.learning_rate)
+    for one in (ppo, again):
+        actor, critic = one.optimizer.param_groups
+        assert actor["lr"] == pytest.approx(1e-3 / 1.5)
+        assert critic["lr"] == pytest.approx(own or 1e-3 / 1.5)
 
 
 def test_gradients_of_actor_and_critic_are_clipped_separately():

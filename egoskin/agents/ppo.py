@@ -25,10 +25,10 @@ from torchrl.objectives.value.functional import generalized_advantage_estimate
 from egoskin.agents.networks import Agent, NetworkConfig, RunningNorm, input_keys
 from egoskin.sparse import SparseRows
 
-# Adaptive learning rate (Unitree's and other humanoid codes): bounds and factor.
+# Adaptive learning rate: bounds, and the largest factor of one update.
 _LR_BOUNDS, _LR_FACTOR = (1e-5, 1e-2), 1.5
-# The divergence is estimated on this many frames of each minibatch.
-_KL_FRAMES = 1024
+# The divergence of an update is estimated on this many frames.
+_KL_FRAMES = 4096
 # More shares of a minibatch than this are smaller than what it costs to call PyTorch.
 _MAX_SHARES = 4
 
@@ -82,9 +82,12 @@ class PPOConfig:
     critic_coeff: float = 1.0
     """Weight of the value loss."""
     learning_rate: float = 1e-3
-    """Adam's learning rate at the start."""
-    desired_kl: float | None = 0.01
-    """Adapt the learning rate to this divergence of an update; None keeps it."""
+    """The actor's learning rate at the start (Adam)."""
+    desired_kl: float | None = 0.02
+    """Adapt it from update to update until one moves the policy by this divergence;
+    None keeps it."""
+    critic_learning_rate: float | None = 1.5e-2
+    """The critic's learning rate; None is the actor's, adapted with it."""
     max_grad_norm: float = 1.0
     """Gradient norm to clip at, for actor and critic separately."""
 
@@ -96,6 +99,7 @@ class PPOConfig:
             "num_mini_batches",
             "clip_epsilon",
             "learning_rate",
+            "critic_learning_rate",
             "max_grad_norm",
             "desired_kl",
             "entropy_frames",
@@ -305,9 +309,12 @@ class PPO:
         self.loss.set_keys(sample_log_prob="action_log_prob")
         self._actor = [p for p in agent.actor.parameters() if p.requires_grad]
         self._critic = [p for p in agent.critic.parameters() if p.requires_grad]
-        self.optimizer = torch.optim.Adam(
-            [*self._actor, *self._critic], lr=config.learning_rate, eps=1e-5, fused=True
-        )
+        own = config.critic_learning_rate
+        groups = [
+            {"params": self._actor, "lr": config.learning_rate},
+            {"params": self._critic, "lr": own or config.learning_rate},
+        ]
+        self.optimizer = torch.optim.Adam(groups, eps=1e-5, fused=True)
         threads = torch.get_num_threads()
         on_cpu = agent.head.log_std.device.type == "cpu"
         self.shares = min(threads, _MAX_SHARES) if on_cpu else 1
@@ -317,8 +324,15 @@ class PPO:
 
     @property
     def learning_rate(self) -> float:
-        """Current learning rate."""
+        """The actor's current learning rate."""
         return self.optimizer.param_groups[0]["lr"]
+
+    @learning_rate.setter
+    def learning_rate(self, rate: float) -> None:
+        actor, critic = self.optimizer.param_groups
+        actor["lr"] = rate
+        if self.config.critic_learning_rate is None:
+            critic["lr"] = rate
 
     def state(self) -> dict[str, Tensor]:
         """Return the state of the optimiser by name."""
@@ -331,8 +345,8 @@ class PPO:
         for name, value in tensors.items():
             index, key = name.split("/")
             content["state"].setdefault(int(index), {})[key] = value
-        content["param_groups"][0]["lr"] = learning_rate
         self.optimizer.load_state_dict(content)
+        self.learning_rate = learning_rate
 
     def update(self, rollout: TensorDict, frames: int = 0) -> dict[str, float]:
         """Improve the agent on a rollout, then take it into the normalisers.
@@ -365,6 +379,10 @@ class PPO:
                 for name, value in self.step(batch, index).items():
                     sums[name] = sums.get(name, 0.0) + value
                 count += 1
+        metrics = {name: float(value) / count for name, value in sums.items()}
+        if config.desired_kl is not None:
+            metrics["kl"] = self._divergence(batch)
+            self._adapt_learning_rate(metrics["kl"], config.desired_kl)
         for key, norm in self.agent.norms.items():
             assert isinstance(norm, RunningNorm)
             norm.update(data[key])
@@ -374,7 +392,6 @@ class PPO:
                 finite = value.is_finite() if sparse else value.isfinite().all(-1)
                 (bad,) = (~finite).nonzero(as_tuple=True)
                 raise NonFiniteError(f"normaliser of {key!r}", _rows(data, bad))
-        metrics = {name: float(value) / count for name, value in sums.items()}
         metrics["explained_variance"] = float(explained)
         metrics["learning_rate"] = self.learning_rate
         metrics["action_std"] = float(self.agent.head.log_std.detach().exp().mean())
@@ -409,8 +426,6 @@ class PPO:
         metrics = {name: mean(r[1][name] for r in results) for name in results[0][1]}
         for parameter, *parts in zip(parameters, *(r[0] for r in results), strict=True):
             parameter.grad = mean(parts)
-        if self.config.desired_kl is not None:
-            self._adapt_learning_rate(metrics["kl"])
         limit = self.config.max_grad_norm
         actor_norm = nn.utils.clip_grad_norm_(self._actor, limit)
         critic_norm = nn.utils.clip_grad_norm_(self._critic, limit)
@@ -449,29 +464,27 @@ class PPO:
             "entropy": losses["entropy"],
             "clip_fraction": losses["clip_fraction"],
         }
-        if self.config.desired_kl is not None:
-            part = index[: _KL_FRAMES // self.shares]
-            metrics["kl"] = self._divergence(data, part)
         return gradients, metrics
 
     @torch.no_grad()
-    def _divergence(self, data: TensorDictBase, index: Tensor) -> Tensor:
-        """Return that of the policy from the one that collected some rows."""
-        part = _rows(data.select("inputs", "loc", "scale"), index)
+    def _divergence(self, data: TensorDictBase) -> float:
+        """Return that of the policy from the one that collected some data."""
+        part = data.select("inputs", "loc", "scale")
+        every = max(1, len(part) // _KL_FRAMES)
+        part = _rows(part, torch.arange(0, len(part), every, device=part.device))
         new = self.agent.head(*(part[key] for key in input_keys(self.agent.actor_keys)))
-        return gaussian_kl(part["loc"], part["scale"], *new).mean()
+        return float(gaussian_kl(part["loc"], part["scale"], *new).mean())
 
-    def _adapt_learning_rate(self, kl: Tensor) -> None:
-        """Adapt the learning rate to a divergence."""
-        desired, (low, high) = self.config.desired_kl, _LR_BOUNDS
-        assert desired is not None
-        rate = self.learning_rate
-        if kl > 2 * desired:
-            rate = max(rate / _LR_FACTOR, low)
-        elif kl < desired / 2:
-            rate = min(rate * _LR_FACTOR, high)
-        for group in self.optimizer.param_groups:
-            group["lr"] = rate
+    def _adapt_learning_rate(self, kl: float, desired: float) -> None:
+        """Adapt the learning rate to the divergence of an update.
+
+        Once for each update: adapted at each minibatch, as others do, it overshoots
+        where the policy is sensitive, and swings by factors of a thousand.
+        """
+        # The divergence goes with the square of the step.
+        factor = (desired / max(kl, 1e-12)) ** 0.5
+        rate = self.learning_rate * min(max(factor, 1 / _LR_FACTOR), _LR_FACTOR)
+        self.learning_rate = min(max(rate, _LR_BOUNDS[0]), _LR_BOUNDS[1])
 
 
 def gaussian_kl(loc0: Tensor, scale0: Tensor, loc1: Tensor, scale1: Tensor) -> Tensor:
