@@ -247,13 +247,14 @@ def test_updates_move_the_mean_action_to_the_best():
 def test_the_learning_rate_follows_the_divergence_from_update_to_update():
     agent = bandit_agent()
     ppo = PPO(agent, PPOConfig(desired_kl=0.001))
+    divergences = []
     for _ in range(30):
         before = ppo.learning_rate
-        metrics = ppo.update(bandit_rollout(agent))
+        divergences.append(ppo.update(bandit_rollout(agent))["kl"])
         factor = ppo.learning_rate / before
         assert 1 / 1.501 < factor < 1.501
-        assert (factor > 1) == (metrics["kl"] < 0.001)
-    assert 0.0003 < metrics["kl"] < 0.003
+        assert (factor > 1) == (divergences[-1] < 0.001)
+    assert 0.0005 < sum(divergences[10:]) / 20 < 0.002
 
 
 def test_the_divergence_of_an_update_is_that_of_the_policy_it_leaves():
@@ -276,19 +277,15 @@ def test_without_a_desired_divergence_the_learning_rate_stays():
     assert "kl" not in metrics
 
 
-@pytest.mark.parametrize("own", [None, 0.0123])
-def test_the_critic_has_its_own_learning_rate_or_the_adapted_one(own: float | None):
+def test_an_adapted_learning_rate_is_restored():
     agent = bandit_agent()
-    ppo = PPO(agent, PPOConfig(desired_kl=1e-9, critic_learning_rate=own))
+    ppo = PPO(agent, PPOConfig(desired_kl=1e-9))
     ppo.update(bandit_rollout(agent))
-    assert ppo.learning_rate == pytest.approx(1e-3 / 1.5)
-    # Also after it was restored.
     again = PPO(agent, ppo.config)
     again.load_state(ppo.state(), ppo.learning_rate)
     for one in (ppo, again):
-        actor, critic = one.optimizer.param_groups
-        assert actor["lr"] == pytest.approx(1e-3 / 1.5)
-        assert critic["lr"] == pytest.approx(own or 1e-3 / 1.5)
+        rates = [group["lr"] for group in one.optimizer.param_groups]
+        assert rates == pytest.approx([1e-3 / 1.5])
 
 
 def test_gradients_of_actor_and_critic_are_clipped_separately():

@@ -82,12 +82,10 @@ class PPOConfig:
     critic_coeff: float = 1.0
     """Weight of the value loss."""
     learning_rate: float = 1e-3
-    """The actor's learning rate at the start (Adam)."""
+    """Adam's learning rate at the start."""
     desired_kl: float | None = 0.02
     """Adapt it from update to update until one moves the policy by this divergence;
     None keeps it."""
-    critic_learning_rate: float | None = 1.5e-2
-    """The critic's learning rate; None is the actor's, adapted with it."""
     max_grad_norm: float = 1.0
     """Gradient norm to clip at, for actor and critic separately."""
 
@@ -99,7 +97,6 @@ class PPOConfig:
             "num_mini_batches",
             "clip_epsilon",
             "learning_rate",
-            "critic_learning_rate",
             "max_grad_norm",
             "desired_kl",
             "entropy_frames",
@@ -309,12 +306,9 @@ class PPO:
         self.loss.set_keys(sample_log_prob="action_log_prob")
         self._actor = [p for p in agent.actor.parameters() if p.requires_grad]
         self._critic = [p for p in agent.critic.parameters() if p.requires_grad]
-        own = config.critic_learning_rate
-        groups = [
-            {"params": self._actor, "lr": config.learning_rate},
-            {"params": self._critic, "lr": own or config.learning_rate},
-        ]
-        self.optimizer = torch.optim.Adam(groups, eps=1e-5, fused=True)
+        self.optimizer = torch.optim.Adam(
+            [*self._actor, *self._critic], lr=config.learning_rate, eps=1e-5, fused=True
+        )
         threads = torch.get_num_threads()
         on_cpu = agent.head.log_std.device.type == "cpu"
         self.shares = min(threads, _MAX_SHARES) if on_cpu else 1
@@ -324,15 +318,13 @@ class PPO:
 
     @property
     def learning_rate(self) -> float:
-        """The actor's current learning rate."""
+        """Current learning rate."""
         return self.optimizer.param_groups[0]["lr"]
 
     @learning_rate.setter
     def learning_rate(self, rate: float) -> None:
-        actor, critic = self.optimizer.param_groups
-        actor["lr"] = rate
-        if self.config.critic_learning_rate is None:
-            critic["lr"] = rate
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate
 
     def state(self) -> dict[str, Tensor]:
         """Return the state of the optimiser by name."""
@@ -381,7 +373,8 @@ class PPO:
                 count += 1
         metrics = {name: float(value) / count for name, value in sums.items()}
         if config.desired_kl is not None:
-            metrics["kl"] = self._divergence(batch)
+            some = torch.randperm(len(batch))[:_KL_FRAMES].to(batch.device or "cpu")
+            metrics["kl"] = self._divergence(batch, some)
             self._adapt_learning_rate(metrics["kl"], config.desired_kl)
         for key, norm in self.agent.norms.items():
             assert isinstance(norm, RunningNorm)
@@ -467,11 +460,9 @@ class PPO:
         return gradients, metrics
 
     @torch.no_grad()
-    def _divergence(self, data: TensorDictBase) -> float:
-        """Return that of the policy from the one that collected some data."""
-        part = data.select("inputs", "loc", "scale")
-        every = max(1, len(part) // _KL_FRAMES)
-        part = _rows(part, torch.arange(0, len(part), every, device=part.device))
+    def _divergence(self, data: TensorDictBase, index: Tensor) -> float:
+        """Return that of the policy from the one that collected some rows."""
+        part = _rows(data.select("inputs", "loc", "scale"), index)
         new = self.agent.head(*(part[key] for key in input_keys(self.agent.actor_keys)))
         return float(gaussian_kl(part["loc"], part["scale"], *new).mean())
 
