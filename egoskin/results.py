@@ -415,6 +415,8 @@ def _metres(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f} m"
 
 
+_OTHER = "Other recipes"
+
 _HEAD = """# Results
 
 Written by `python scripts/results.py write` from [results](../results/README.md); what
@@ -441,6 +443,11 @@ def report(runs: Sequence[StoredRun], pictures: dict[str, str], notes: str) -> s
     for title, group in sections(runs).items():
         parts.append(f"## {title}\n\n![Learning curves]({pictures[title]})\n")
         parts.append(table(group) + "\n")
+        if title == _OTHER:
+            parts.append("What of them is not the default:\n")
+            names = recipe_names(runs).items()
+            parts += [f"* recipe {name}: `{recipe}`" for recipe, name in names]
+            parts.append("")
     rigid = max(run.evaluation["rigid_success"] for run in runs)
     parts.append(
         "The robot held rigid in its default pose succeeds in at most "
@@ -469,12 +476,25 @@ def report(runs: Sequence[StoredRun], pictures: dict[str, str], notes: str) -> s
     return "\n".join([*parts, *lines]) + "\n"
 
 
+def recipe_names(runs: Sequence[StoredRun]) -> dict[str, str]:
+    """Return a short name for each recipe that is not the default: A, B, ..."""
+    recipes = dict.fromkeys(recipe for recipe, _ in cells(runs) if recipe)
+    return {recipe: _letters(i) for i, recipe in enumerate(recipes)}
+
+
+def _letters(number: int) -> str:
+    """Return A to Z, then AA to AZ, and so on."""
+    more, last = divmod(number, 26)
+    return (_letters(more - 1) if more else "") + chr(ord("A") + last)
+
+
 def sections(runs: Sequence[StoredRun]) -> dict[str, dict[str, list[StoredRun]]]:
     """Return the cells of the report by the title of their section."""
+    names = recipe_names(runs)
     result: dict[str, dict[str, list[StoredRun]]] = {}
     for (recipe, cell), group in cells(runs).items():
-        title = "Other recipes" if recipe else "The default recipe"
-        name = f"{cell}; {recipe}" if recipe else cell
+        title = _OTHER if recipe else "The default recipe"
+        name = f"{cell}; recipe {names[recipe]}" if recipe else cell
         result.setdefault(title, {})[name] = group
     return result
 

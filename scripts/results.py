@@ -14,7 +14,6 @@ import egoskin  # noqa: F401  (before torch: it says how torch's threads wait)
 import dataclasses
 import json
 import sys
-import textwrap
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -56,8 +55,6 @@ from egoskin.results import (
 )
 from egoskin.runs import Run
 
-# Characters in a line of a legend: a recipe may differ in many settings.
-_LEGEND_WIDTH = 64
 # Okabe and Ito's colours, told apart by colour-blind readers as well.
 _COLOURS = (
     "#000000",
@@ -175,7 +172,7 @@ def _json(content: object) -> bytes:
 
 def draw(cells: dict[str, list[StoredRun]], out: Path) -> None:
     """Write a picture of the learning curves of cells, in the paper's form."""
-    figure, axes = plt.subplots(figsize=(7.2, 4.2), layout="constrained")
+    figure, axes = plt.subplots(figsize=(7.2, 5.0), layout="constrained")
     for i, (name, runs) in enumerate(cells.items()):
         _draw_cell(axes, name, runs, i)
     hz = next(iter(cells.values()))[0].config.env.task.physics.control_hz
@@ -196,7 +193,7 @@ def draw(cells: dict[str, list[StoredRun]], out: Path) -> None:
     axes.grid(color="0.9", linewidth=0.8)
     axes.set_axisbelow(True)
     axes.spines["right"].set_visible(False)
-    axes.legend(loc="upper left", frameon=False, fontsize=9)
+    figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=8)
     figure.savefig(out, dpi=160, metadata={"Software": None})
     plt.close(figure)
 
@@ -206,7 +203,7 @@ def _draw_cell(axes: Axes, name: str, runs: list[StoredRun], number: int) -> Non
     seen = curve(runs)
     colour = _COLOURS[number % len(_COLOURS)]
     dash = _DASHES[number // len(_COLOURS) % len(_DASHES)]
-    label = textwrap.fill(f"{name} ({counted(len(runs), 'seed')})", _LEGEND_WIDTH)
+    label = f"{name} ({counted(len(runs), 'seed')})"
     axes.plot(
         seen.hours, seen.mean, color=colour, linestyle=dash, linewidth=1.6, label=label
     )

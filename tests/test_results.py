@@ -19,6 +19,7 @@ from egoskin.results import (
     interquartile_mean,
     interquartile_range,
     load_runs,
+    recipe_names,
     record,
     report,
     same_but_length,
@@ -115,7 +116,8 @@ def test_seeds_of_one_configuration_are_a_cell(tmp_path: Path):
         (("ppo.gamma=0.9", "field proximity, 2 m"), ["f"]),
     ]
     titles = {t: list(g) for t, g in sections(load_runs(tmp_path)).items()}
-    assert titles["Other recipes"] == ["field proximity, 2 m; ppo.gamma=0.9"]
+    assert titles["Other recipes"] == ["field proximity, 2 m; recipe A"]
+    assert recipe_names(load_runs(tmp_path)) == {"ppo.gamma=0.9": "A"}
     assert len(titles["The default recipe"]) == 4
 
 
