@@ -232,8 +232,7 @@ def make_env(
                 compile_kernels=compile_kernels,
             )
             for i in range(workers)
-        ],
-        compiles=compile_kernels,
+        ]
     )
 
 

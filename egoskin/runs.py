@@ -85,8 +85,8 @@ class TrainConfig:
     checkpoint_interval: float = 60.0
     """A checkpoint is at most this old [s]."""
     compile_kernels: bool | None = None
-    """Compile the sensors, for the same results, in up to a minute at the first start;
-    None: ray sensors, whose time counts, where there is a C++ compiler."""
+    """Compute the sensors in C++, compiled in seconds at the first start on a machine,
+    with the same results; None: where there is a C++ compiler."""
     resume: Path | None = None
     """Run folder to go on with; only --total-frames may be changed, to a later end."""
 
@@ -176,11 +176,6 @@ class TrainConfig:
         return device
 
 
-def pays_to_compile(config: EnvConfig) -> bool:
-    """Whether compiled sensors are worth their compilation: rays, with a compiler."""
-    return config.sensor.coverage == "ray" and can_compile()
-
-
 # What a run's stored configuration leaves out: it says how a run was called.
 _CALL_FIELDS = ("run_dir", "resume")
 
@@ -259,9 +254,7 @@ class Run:
                 f"by --resume {path}"
             )
         if config.compile_kernels is None:
-            config = dataclasses.replace(
-                config, compile_kernels=pays_to_compile(config.env)
-            )
+            config = dataclasses.replace(config, compile_kernels=can_compile())
         (path / "policies").mkdir(parents=True)
         run = cls(path, config)
         skin.save(run.skin_path)

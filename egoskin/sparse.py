@@ -135,10 +135,6 @@ class SparseSource(Protocol):
         """Return the rows of a tensordict, ``[B]``."""
         ...
 
-    def warm_up(self, batch: int) -> None:
-        """Do what the first call, of this many rows, would do besides."""
-        ...
-
 
 def offsets_of(counts: Tensor) -> Tensor:
     """Return where groups of these sizes begin, and the end, ``[n + 1]``."""

@@ -237,14 +237,11 @@ def open_trainer(run: Run, num_threads: int = 1) -> Iterator[Trainer]:
         num_threads: Physics threads of each worker; results do not depend on it.
     """
     config = run.config
-    # It imports while the sources compile.
+    # It imports while the rest is made.
     start_server()
     skin = Skin.load(run.skin_path)
     compile_kernels = bool(config.compile_kernels)
     sources = sparse_sources(config.env, skin, compile_kernels)
-    # Not in a thread while the workers start: torch tells all threads that it compiles.
-    for source in sources.values():
-        source.warm_up(config.num_envs)
     env = make_env(
         config.env,
         skin,

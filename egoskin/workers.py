@@ -43,9 +43,6 @@ from egoskin.watchdog import Watch
 # How long the parent sleeps between looks at its workers: at least this [s], and this
 # share of the time it has waited. It adds as much to a step, and costs no CPU.
 _POLL, _POLL_SHARE = 2e-4, 0.01
-# The reset and the first steps of a worker that compiles [commands], and how long it
-# may take for each: compilers of several workers share the cores [s].
-_COMPILE_COMMANDS, _COMPILE_LIMIT = 4, 600.0
 # The server tells of a death soon after the channel of the dead closes [s].
 _DEATH_NOTICE = 5.0
 
@@ -205,15 +202,10 @@ class WorkerPool(ParallelEnv):
 
     Args:
         builders: What builds the transformed environment of each worker.
-        compiles: Whether the workers compile kernels in their first steps, so that
-            these may take minutes.
     """
 
-    def __init__(
-        self, builders: Sequence[Callable[[], EnvBase]], *, compiles: bool = False
-    ) -> None:
+    def __init__(self, builders: Sequence[Callable[[], EnvBase]]) -> None:
         self._reports = Path(tempfile.mkdtemp(dir=_temporary_folder()))
-        self._compiles = compiles
         keep_freed_memory()
         threads = torch.get_num_threads()
         super().__init__(
@@ -270,7 +262,6 @@ class WorkerPool(ParallelEnv):
         """Start the workers; raise if one cannot."""
         start_server()
         self._reports.mkdir(exist_ok=True)
-        self._compile_commands = _COMPILE_COMMANDS if self._compiles else 0
         started = Event()
         self._workers, self._hung = [], {}
         watch = Thread(target=self._watch_start, args=(started,), daemon=True)
@@ -308,9 +299,6 @@ class WorkerPool(ParallelEnv):
 
     def _wait(self, workers: Iterable[int], answered: Callable[[int], bool]) -> None:
         """Sleep until the workers have answered a command; raise if one cannot."""
-        limit = watchdog.LIMIT
-        if self._compile_commands:
-            limit, self._compile_commands = _COMPILE_LIMIT, self._compile_commands - 1
         watches = {worker: Watch(self._workers[worker].pid) for worker in workers}
         begin = looked = time.monotonic()
         while watches := {i: w for i, w in watches.items() if not answered(i)}:
@@ -321,7 +309,7 @@ class WorkerPool(ParallelEnv):
                     if not self._workers[worker].is_alive() and not answered(worker):
                         self._fail(worker, self._death(worker))
                     watch.look()
-                    if watch.hangs(limit):
+                    if watch.hangs(watchdog.LIMIT):
                         self._fail(worker, f"hung: {watch.describe()}")
             time.sleep(min(max(_POLL, _POLL_SHARE * (now - begin)), watchdog.INTERVAL))
 

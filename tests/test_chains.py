@@ -259,39 +259,6 @@ def humanoid() -> LinkKinematics:
     return LinkKinematics(chain, chain.get_link_names())
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_entries_and_poses_agree(humanoid, dtype):
-    generator = torch.Generator().manual_seed(0)
-    joint_pos = torch.randn(40, 17, generator=generator, dtype=dtype)
-    position, rotation = humanoid.poses_b(joint_pos)
-
-    def tensor(entries) -> torch.Tensor:
-        full = [torch.as_tensor(e, dtype=dtype).expand(40) for e in entries]
-        return torch.stack(full, -1)
-
-    for i, (rows, origin) in enumerate(humanoid.link_frames(joint_pos)):
-        atol = TOLERANCE[dtype]
-        torch.testing.assert_close(tensor(origin), position[:, i], atol=atol, rtol=0)
-        for j, row in enumerate(rows):
-            expected = rotation[:, i, j]
-            torch.testing.assert_close(tensor(row), expected, atol=atol, rtol=0)
-
-
-def test_frames_need_no_more_than_sines_cosines_and_positions(humanoid):
-    joint_pos = torch.randn(5, 17, generator=torch.Generator().manual_seed(0))
-    sin, cos, joints = humanoid.trig(joint_pos)
-    assert torch.equal(joints, joint_pos.t())
-    torch.testing.assert_close(sin * sin + cos * cos, torch.ones(17, 5))
-    # A half turn of the first joint flips its sine and cosine and nothing else.
-    half_turn = joint_pos.clone()
-    half_turn[:, 0] += torch.pi
-    sin[0], cos[0] = -sin[0], -cos[0]
-    flipped = humanoid.frames_from(sin, cos, joints)
-    for one, other in zip(flipped, humanoid.link_frames(half_turn), strict=True):
-        for a, b in zip(one[1], other[1], strict=True):
-            torch.testing.assert_close(a, b, atol=1e-6, rtol=0)
-
-
 def test_the_wrong_number_of_joints_is_refused(humanoid):
     with pytest.raises(ValueError, match=r"must be \[B, 17\].* got \[5, 24\]"):
         humanoid.link_frames(torch.zeros(5, 24))

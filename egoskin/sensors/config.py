@@ -250,16 +250,11 @@ class SensorConfig:
         if dense or mixed or not rays:
             return None
 
-        def sensor(compile_kernels: bool) -> RaySensor:
-            keys = ("distance", "object_detected")
-            made = self._sensor(robot, skin, objects, keys, compile_kernels)
-            assert isinstance(made, RaySensor)
-            return made
-
-        plain = sensor(False)
-        compiled = sensor(True) if compile_kernels else plain
+        keys = ("distance", "object_detected")
+        sensor = self._sensor(robot, skin, objects, keys, compile_kernels)
+        assert isinstance(sensor, RaySensor)
         reading = self._signal(skin.select([0]), "distance", "signal")
-        return SparseRays(compiled, plain, reading)
+        return SparseRays(sensor, reading)
 
     def _groups(self, skin: Skin) -> dict[str, list[int]]:
         """Return the sensors of each kind, by the suffix of their keys.

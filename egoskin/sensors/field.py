@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import pytorch_kinematics as pk
 import torch
 from tensordict import NestedKey
 from torch import Tensor
 
-from egoskin.compilation import compiled, exact_sqrt
+from egoskin.compilation import exact_sqrt
 from egoskin.robots import Primitive
 from egoskin.sensors.coverage import Field
 from egoskin.sensors.geometry import (
@@ -47,7 +47,8 @@ class FieldSensor(ProximitySensor):
         body: The robot's shapes, to hide what lies behind them: an object is seen if
             the straight path to its closest point is free. Empty: transparent.
         per_object: Write ``distance [*B, S, O]``, objects told apart.
-        compile: Compile the kernel of a transparent robot; results are the same.
+        compile: Use C++ kernels for balls and a transparent robot; results are the
+            same.
         in_keys: Keys of the four inputs, in the order above.
         out_keys: Keys of the two outputs, in the order above.
 
@@ -81,8 +82,6 @@ class FieldSensor(ProximitySensor):
             (),
             body,
             per_object,
-            # What the body hides is found for some paths: their number is no constant.
-            compile and not body,
             in_keys,
             out_keys,
         )
@@ -95,9 +94,12 @@ class FieldSensor(ProximitySensor):
             to_centre = torch.tensor([[f.measure == "centre"] for f in fields])
         self.register_buffer("_cos_half", cos_half)
         self.register_buffer("_to_centre", to_centre)
-        self._kernel: Callable[..., Tensor] = self.distances
-        if self._compile:
-            self._kernel = compiled(self.distances)
+        if compile:
+            self._use_kernels(
+                "field",
+                cos_half=None if cos_half is None else cos_half.numpy(),
+                to_centre=None if to_centre is None else to_centre.numpy(),
+            )
 
     def distances(self, scene: Scene) -> Tensor:
         """Return readings of each object [m], ``[O, B, S]``."""
@@ -157,17 +159,13 @@ class FieldSensor(ProximitySensor):
         columns = view.turn[:, :, self._link].transpose(0, 1)
         return [c[0] * x + c[1] * y + c[2] * z for c in columns]
 
-    def measure(self, scene: Scene, rows: Tensor | None, out: Tensor) -> Tensor:
+    def measure(self, scene: Scene, rows: Tensor, out: Tensor) -> Tensor:
         """Write the readings of some rows, and return the least of each object."""
-        # Minima within the kernel would cost more.
-        readings = self._kernel(scene)
+        readings = self.distances(scene)
         nearest = readings
         if not self.per_object:
             nearest = functools.reduce(torch.minimum, readings)
-        if rows is None:
-            out.copy_(nearest)
-        else:
-            out[..., rows, :] = nearest
+        out[..., rows, :] = nearest
         return readings.amin(-1)
 
     def _without_hidden(

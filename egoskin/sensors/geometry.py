@@ -1,8 +1,9 @@
 """Where sensors and objects are relative to each other: what all coverages share.
 
-Kernels work on a structure of arrays with the batch last (``[S, B]``), in the order of
-the skin, and use only +, -, x, /, `sincos` and `exact_sqrt` (`egoskin.compilation`): a
-row's result has the same bits whatever rows are computed with it, compiled or not.
+All is computed as a structure of arrays with the batch last (``[S, B]``), in the order
+of the skin, by +, -, x, /, `sincos` and `exact_sqrt` (`egoskin.compilation`) alone: a
+row's result has the same bits whatever rows are computed with it, here or, for balls
+and a transparent robot, in C++ (`egoskin/sensors/kernels.cpp`).
 
 Contract: a reading of infinity means that nothing is in range; NaN in the input gives
 a reading of NaN, never one of nothing.
@@ -10,9 +11,10 @@ a reading of NaN, never one of nothing.
 
 from __future__ import annotations
 
+import warnings
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import pytorch_kinematics as pk
@@ -22,10 +24,11 @@ from torch import Tensor
 from torchrl.data import Binary as BinarySpec
 from torchrl.data import Composite, TensorSpec, Unbounded
 
-from egoskin.compilation import compiled
+from egoskin.compilation import can_compile
 from egoskin.kinematics import LinkKinematics, quat_to_entries
 from egoskin.robots import Primitive
 from egoskin.sensors.coverage import Coverage
+from egoskin.sensors.kernels import Kernels
 from egoskin.sensors.occlusion import Occluder
 from egoskin.sensors.skin import Skin
 from egoskin.shapes import Shape, Sphere
@@ -39,7 +42,7 @@ STATE_KEYS = ("base_pose", "joint_pos", "object_pose", "object_active")
 
 
 class Scene(NamedTuple):
-    """What kernels compute from, the batch last and contiguous: vectors are loaded."""
+    """What is computed from, the batch last."""
 
     base: Tensor
     """Pose of the base in the world, ``[7, B]``."""
@@ -47,15 +50,9 @@ class Scene(NamedTuple):
     """Poses of the objects in the world, ``[O, 7, B]``; all NaN where any input is."""
     active: Tensor
     """Which objects are in play, ``[O, B]`` bool."""
-    sin: Tensor
-    """Sines of the joint positions that matter, ``[U, B]``."""
-    cos: Tensor
-    """Their cosines, ``[U, B]``."""
-    joints: Tensor
-    """These joint positions, ``[U, B]``."""
-    links: tuple[Tensor, Tensor] | None
-    """Rotations ``[3, 3, L, B]`` and positions [m] ``[3, L, B]`` of all links in the
-    base frame; None for a robot that is transparent to its sensors."""
+    links: tuple[Tensor, Tensor]
+    """Rotations ``[3, 3, L, B]`` and positions [m] ``[3, L, B]`` of the links in the
+    base frame."""
     skin: dict[str, Tensor]
     """Constants of the sensors in the dtype of the inputs: loops do not convert."""
 
@@ -68,21 +65,6 @@ class View(NamedTuple):
     turn: Tensor | None
     """Rotation from the link frames into the object's, ``[3, 3, L, B]``; None for a
     sphere, which has no orientation."""
-
-
-def stack_frames(frames: list, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Return link frames as tensors: rotation ``[3, 3, L, B]``, position ``[3, L, B]``.
-
-    Args:
-        frames: What `LinkKinematics.link_frames` returned.
-        like: ``[..., B]``: tells batch, dtype and device, also where all frames are
-            constants of the robot.
-    """
-    entries = [e for r, p in frames for e in (*r[0], *r[1], *r[2], *p)]
-    batch = like.shape[-1:]
-    full = [e if isinstance(e, Tensor) else like.new_full(batch, e) for e in entries]
-    stacked = torch.stack(full).unflatten(0, (len(frames), 12)).transpose(0, 1)
-    return stacked[:9].unflatten(0, (3, 3)), stacked[9:]
 
 
 def product(a: Tensor, b: Tensor) -> Tensor:
@@ -105,6 +87,12 @@ def product(a: Tensor, b: Tensor) -> Tensor:
     )  # fmt: skip
 
 
+def _turned_back(rotation: Tensor, vector: Tensor) -> Tensor:
+    """Return R^T v, ``[3, *B]``, of ``[3, 3, *B]`` and ``[3, *B]``."""
+    x, y, z = vector
+    return rotation[0] * x + rotation[1] * y + rotation[2] * z
+
+
 def _poison(base_pose: Tensor, joint_pos: Tensor, object_pose: Tensor) -> Tensor:
     """Return 0 or, for NaN in the row or in the object, NaN, ``[B, O]``: 0 NaN = NaN.
 
@@ -112,6 +100,23 @@ def _poison(base_pose: Tensor, joint_pos: Tensor, object_pose: Tensor) -> Tensor
     """
     row = 0.0 * (joint_pos.sum(-1) + base_pose.sum(-1))
     return row[:, None] + 0.0 * object_pose.sum(-1)
+
+
+def _writable(out: Tensor | None, shape: Sequence[int], like: Tensor) -> Tensor:
+    """Return what is written to, or a new tensor.
+
+    Raises:
+        ValueError: If it does not fit.
+    """
+    if out is None:
+        return like.new_empty(shape)
+    fits = out.shape == torch.Size(shape) and out.is_contiguous()
+    if not fits or (out.dtype, out.device) != (like.dtype, like.device):
+        raise ValueError(
+            f"out must be {list(shape)}, contiguous, {like.dtype} on {like.device}; "
+            f"got {list(out.shape)}, {out.dtype} on {out.device}"
+        )
+    return out
 
 
 def _matrix(quat: Tensor) -> Tensor:
@@ -131,7 +136,6 @@ class ProximitySensor(RowTransform):
             that is transparent to its sensors.
         per_object: Whether objects are told apart: readings have a last dimension
             ``O``, instead of those of the nearest object.
-        compile: Whether the kernels are compiled.
         in_keys: Keys of base pose, joint positions, object poses, active flags.
         out_keys: Keys of readings and detections.
 
@@ -152,7 +156,6 @@ class ProximitySensor(RowTransform):
         num_readings: tuple[int, ...],
         body: Sequence[Primitive],
         per_object: bool,
-        compile: bool,
         in_keys: Sequence[NestedKey],
         out_keys: Sequence[NestedKey],
     ) -> None:
@@ -161,10 +164,7 @@ class ProximitySensor(RowTransform):
         if not objects:
             raise ValueError("a proximity sensor needs at least one object to sense")
         self.num_sensors, self.objects = len(skin), tuple(objects)
-        self.per_object, self._compile = per_object, compile
-        self._prepare: Callable[..., Scene] = self.scene
-        if compile:
-            self._prepare = compiled(self.scene)
+        self.per_object = per_object
         self.readings = torch.Size((len(skin), *num_readings))
         links = list(dict.fromkeys(skin.links))
         self._num_links = len(links)
@@ -186,6 +186,35 @@ class ProximitySensor(RowTransform):
         reach = np.array(self._kinematics.reach())[self._link.numpy()]
         reach += np.linalg.norm(skin.position, axis=-1)
         self._farthest = float((reach + skin.reach()).max()) + _SLACK
+        self._kernels: Kernels | None = None
+
+    def _use_kernels(self, kind: Literal["field", "ray"], **constants: Any) -> None:
+        """Use C++ kernels from now on, where they can compute this.
+
+        Args:
+            kind: Coverage of the sensors.
+            constants: What `Kernels` is to know of it.
+        """
+        balls = [shape for shape in self.objects if isinstance(shape, Sphere)]
+        if self._occluder is not None or len(balls) < len(self.objects):
+            return
+        if not can_compile():
+            # Python shows one warning from one place once.
+            warnings.warn(
+                "no C++ compiler was found (install g++): sensor kernels run "
+                "uncompiled, with the same results",
+                stacklevel=3,
+            )
+            return
+        own = {
+            "sensors": self.num_sensors,
+            "apart": self.per_object,
+            "link": self._link.numpy(),
+            "offset": self._offset[..., 0].t().numpy(),
+            "axes": self._axes[..., 0].permute(2, 0, 1).numpy(),
+            "range": self._range.numpy(),
+        }
+        self._kernels = Kernels(kind, self._kinematics, balls, {**own, **constants})
 
     @property
     def num_joints(self) -> int:
@@ -195,95 +224,71 @@ class ProximitySensor(RowTransform):
     def scene(
         self, base_pose: Tensor, joint_pos: Tensor, object_pose: Tensor, active: Tensor
     ) -> Scene:
-        """Return what the kernels compute from, given the four inputs.
-
-        Compiled apart from them: otherwise their loops would load with strides, one
-        number at a time.
-        """
+        """Return what is computed from, given the four inputs."""
         poison = _poison(base_pose, joint_pos, object_pose)
         objects = (object_pose + poison[..., None]).permute(1, 2, 0).contiguous()
-        base, on = base_pose.t().contiguous(), active.t().contiguous()
-        trig = self._kinematics.trig(joint_pos)
-        links = None
-        if self._occluder is not None:
-            links = stack_frames(self._kinematics.frames_from(*trig), base)
         skin = {
             name.removeprefix("_"): value.to(base_pose.dtype).contiguous()
             for name, value in self.named_buffers()
             if value.is_floating_point()
         }
-        return Scene(base, objects, on, *trig, links, skin)
+        links = self._kinematics.link_frames(joint_pos)
+        return Scene(
+            base_pose.t().contiguous(), objects, active.t().contiguous(), links, skin
+        )
 
     def views(self, scene: Scene) -> list[View]:
         """Return each object as the links see it."""
-        trig = scene.sin, scene.cos, scene.joints
-        frames = self._kinematics.frames_from(*trig)[: self._num_links]
+        rotation, position = (x[..., : self._num_links, :] for x in scene.links)
         base = _matrix(scene.base[3:])
         views = []
         for pose, shape in zip(scene.objects.unbind(0), self.objects, strict=True):
-            # R^T d, written out: torch's cross product fuses sums, compiled code does
-            # not.
-            x, y, z = pose[:3] - scene.base[:3]
-            centre = [
-                base[0, i] * x + base[1, i] * y + base[2, i] * z for i in range(3)
-            ]
-            seen = []
-            for rotation, position in frames:
-                # q = R^T (c - p)
-                x, y, z = (c - p for c, p in zip(centre, position, strict=True))
-                columns = zip(*rotation, strict=True)
-                seen.append([a * x + b * y + c * z for a, b, c in columns])
+            # R^T d, written out: torch's cross product fuses sums.
+            centre = _turned_back(base, pose[:3] - scene.base[:3])
+            seen = _turned_back(rotation, centre[:, None] - position)
             turn = None
             if not isinstance(shape, Sphere):
                 # Link to base to object: (R_base^T R_object)^T R_link.
                 to_object = product(_matrix(pose[3:]).transpose(0, 1), base)
-                links = stack_frames(frames, scene.base)[0]
-                turn = product(to_object[:, :, None], links)
-            # Stacked at once: in two steps compiled code copies them.
-            along = [place for axis in zip(*seen, strict=True) for place in axis]
-            views.append(View(torch.stack(along).unflatten(0, (3, -1)), turn))
+                turn = product(to_object[:, :, None], rotation)
+            views.append(View(seen, turn))
         return views
 
-    def frames_b(
-        self, sin: Tensor, cos: Tensor, joints: Tensor
-    ) -> tuple[list[Tensor], list[list[Tensor]]]:
-        """Return the sensor frames in the base frame, entry by entry.
-
-        Args:
-            sin: Sines of the joint positions that matter, ``[U, B]``.
-            cos: Their cosines, ``[U, B]``.
-            joints: These joint positions, ``[U, B]``.
-
-        Returns:
-            Position [m], three of ``[S, B]``, and the rows of the rotation, 3 x 3 of
-            ``[S, B]``; its columns are the axes of the sensor frames.
-        """
-        frames = self._kinematics.frames_from(sin, cos, joints)
-        turn, origin = stack_frames(frames[: self._num_links], joints)
-        offset = self._offset.to(turn.dtype)
-        axes = self._axes.to(turn.dtype)
-        position, rotation = [], []
-        for row, along in zip(turn, origin, strict=True):
-            x, y, z = row[:, self._link]
-            # p + R o
-            shift = x * offset[0] + y * offset[1] + z * offset[2]
-            position.append(along[self._link] + shift)
-            rotation.append([x * a[0] + y * a[1] + z * a[2] for a in axes])
-        return position, rotation
-
-    def poses_b(self, joint_pos: Tensor) -> tuple[Tensor, Tensor]:
+    def poses_b(
+        self, joint_pos: Tensor, out: tuple[Tensor, Tensor] | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Return the sensors' positions and rotations in the base frame.
 
         Args:
             joint_pos: Joint positions, ``[B, J]``.
+            out: Where to write the two, contiguous. New tensors by default.
 
         Returns:
             Position [m] ``[B, S, 3]`` and rotation ``[B, S, 3, 3]``, whose columns
             are the axes of the sensor frames.
+
+        Raises:
+            ValueError: If J is not the robot's number of joints, or what is to be
+                written does not fit.
         """
-        position, rotation = self.frames_b(*self._kinematics.trig(joint_pos))
-        rows = [torch.stack(row, -1).transpose(0, 1) for row in rotation]
-        return torch.stack(position, -1).transpose(0, 1), torch.stack(rows, -2)
+        self._kinematics.check(joint_pos)
+        shape = (len(joint_pos), self.num_sensors, 3)
+        position, rotation = out or (None, None)
+        position = _writable(position, shape, joint_pos)
+        rotation = _writable(rotation, (*shape, 3), joint_pos)
+        out = position, rotation
+        if self._kernels is not None and Kernels.can(joint_pos, *out):
+            self._kernels.poses(joint_pos, *out)
+            return out
+        rotation, position = self._kinematics.link_frames(joint_pos)
+        offset = self._offset.to(joint_pos)
+        # p + R o, and the axes turned likewise
+        x, y, z = rotation[:, :, self._link].unbind(1)
+        shift = x * offset[0] + y * offset[1] + z * offset[2]
+        axes = [x * a[0] + y * a[1] + z * a[2] for a in self._axes.to(joint_pos)]
+        out[0].copy_((position[:, self._link] + shift).permute(2, 1, 0))
+        out[1].copy_(torch.stack(axes, 1).permute(3, 2, 0, 1))
+        return out
 
     def hide(
         self,
@@ -313,7 +318,6 @@ class ProximitySensor(RowTransform):
             ``[n, K]``, infinite where blocked.
         """
         assert self._occluder is not None
-        assert scene.links is not None
         link = self._link[sensor]
         turn, position = (x[..., link, row] for x in scene.links)
         offset = scene.skin["offset"][:, sensor, 0]
@@ -339,13 +343,14 @@ class ProximitySensor(RowTransform):
         return torch.where(hidden, torch.inf, reading)
 
     @abstractmethod
-    def measure(self, scene: Scene, rows: Tensor | None, out: Tensor) -> Tensor:
+    def measure(self, scene: Scene, rows: Tensor, out: Tensor) -> Tensor:
         """Write the readings of some rows, and return the least of each object.
+
+        All other readings are infinite already.
 
         Args:
             scene: The rows, ``n`` of them.
-            rows: Index of each of them, ``[n]``, all others being infinite already;
-                None if they are all.
+            rows: Index of each of them, ``[n]``.
             out: Readings [m], ``[B, S, ...]`` or, told apart, ``[O, B, S, ...]``.
 
         Returns:
@@ -362,23 +367,23 @@ class ProximitySensor(RowTransform):
 
         Raises:
             ValueError: If the number of objects is not that of the sensor, a pose has
-                not seven numbers, or the inputs are not of one floating type and bool.
+                not seven numbers, there is not one position for each joint, the
+                inputs are not of one floating type and bool, or what is to be written
+                does not fit.
         """
         self._check(inputs)
+        self._kinematics.check(inputs[1])
         batch, objects = inputs[3].shape
-        if out is None:
-            each = (objects,) if self.per_object else ()
-            out = inputs[0].new_empty((*each, batch, *self.readings))
-        if self._compile:
-            # Compiled, all rows together cost less than to find those that matter.
-            least = self.measure(self._prepare(*inputs), None, out)
-            detected = least.t() != torch.inf
+        each = (objects,) if self.per_object else ()
+        out = _writable(out, (*each, batch, *self.readings), inputs[0])
+        detected = torch.zeros(inputs[3].shape, dtype=torch.bool, device=out.device)
+        if self._kernels is not None and Kernels.can(*inputs[:3]):
+            self._kernels.measure(inputs, out, detected)
         else:
             rows = self._rows_in_reach(*inputs)
             out.fill_(torch.inf)
-            detected = torch.zeros_like(inputs[3])
             if len(rows):
-                scene = self._prepare(*(x[rows] for x in inputs))
+                scene = self.scene(*(x[rows] for x in inputs))
                 least = self.measure(scene, rows, out)
                 # A reading of NaN may be anything: the object counts as seen.
                 detected[rows] = least.t() != torch.inf
@@ -394,6 +399,10 @@ class ProximitySensor(RowTransform):
                     f"{key!r} must be [*B, {', '.join(shape)}], got "
                     f"{list(tensor.shape[1:])} after the batch: was the tensordict "
                     "made with its batch_size?"
+                )
+            if len(tensor) != len(active):
+                raise ValueError(
+                    f"{key!r} has {len(tensor)} rows, {self.in_keys[3]!r} {len(active)}"
                 )
         for key, tensor in zip(self.in_keys[2:], inputs[2:], strict=True):
             if tensor.shape[1] != len(self.objects):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Literal
 
 import numpy as np
@@ -11,7 +11,6 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
-from egoskin.compilation import compiled
 from egoskin.robots import Primitive
 from egoskin.sensors.coverage import Ray
 from egoskin.sensors.geometry import (
@@ -22,6 +21,7 @@ from egoskin.sensors.geometry import (
     checked,
     product,
 )
+from egoskin.sensors.kernels import VECTOR, Kernels
 from egoskin.sensors.signals import Binary, Proximity
 from egoskin.sensors.skin import Skin
 from egoskin.shapes import Shape, first_hit
@@ -56,7 +56,8 @@ class RaySensor(ProximitySensor):
         body: The robot's shapes, to hide what lies behind them; empty: transparent.
         per_object: Objects told apart in a last dimension ``O``.
         cull: Skip pairs that cannot hit; results are the same.
-        compile: Compile the kernels of a transparent robot; results are the same.
+        compile: Use C++ kernels for balls and a transparent robot; results are the
+            same.
         in_keys: Keys of the four inputs, in the order above.
         out_keys: Keys of the two outputs, in the order above.
 
@@ -114,8 +115,6 @@ class RaySensor(ProximitySensor):
             () if reduce == "min" else (self._num_beams,),
             body,
             per_object,
-            # What the body hides is found for some paths: their number is no constant.
-            compile and not body,
             in_keys,
             out_keys,
         )
@@ -126,15 +125,24 @@ class RaySensor(ProximitySensor):
         self.register_buffer("_pyramid", pyramid)
         slant = torch.tensor([r.slant for r in rays], dtype=torch.float64)
         self.register_buffer("_reach", self._range * slant[:, None])
-        self._margin_kernel: Callable[..., tuple[Tensor, list[View]]]
-        self._margin_kernel = self.margins
-        self._kernel: Callable[..., tuple[Tensor, Tensor]] = self.read
-        if self._compile:
-            self._margin_kernel = compiled(self.margins)
-            self._kernel = compiled(self.read, dynamic=True)
-        # Temporaries of an uncompiled kernel should stay in the cache.
-        small = max(1, _CHUNK // self._beams.shape[-1])
-        self._chunk = 2**31 if self._compile else small
+        # Temporaries should stay in the cache.
+        self._chunk = max(1, _CHUNK // self._beams.shape[-1])
+        if compile:
+            bounds = [_SLACK + shape.bounding_radius for shape in objects]
+            self._use_kernels(
+                "ray",
+                beams=self._num_beams,
+                sub_beams=self._sub_beams,
+                cull=cull,
+                reduce=reduce == "min",
+                bound=np.array(bounds),
+                reach=self._reach.numpy(),
+                pyramid=pyramid.permute(2, 0, 1, 3).numpy(),
+                # Whole vectors; what is added repeats the last direction.
+                directions=_padded(beams.transpose(0, 1).numpy()),
+                grid=beam_of.numpy(),
+                depth=depth.numpy() if depth.any() else None,
+            )
 
     def margins(self, scene: Scene) -> tuple[Tensor, list[View]]:
         """Return by how much each sensor may see each object.
@@ -227,14 +235,10 @@ class RaySensor(ProximitySensor):
         least = distance.amin(-1)
         return (least if self.reduce == "min" else distance), least
 
-    def measure(self, scene: Scene, rows: Tensor | None, out: Tensor) -> Tensor:
+    def measure(self, scene: Scene, rows: Tensor, out: Tensor) -> Tensor:
         """Write the readings of some rows, and return the least of each object."""
-        # All before the grid is filled, which empties the caches.
-        pairs = list(self._pairs(scene, rows))
-        if rows is None:
-            out.fill_(torch.inf)
         least = scene.active.new_full(scene.active.shape, torch.inf, dtype=out.dtype)
-        for i, row, place, reading, nearest in pairs:
+        for i, row, place, reading, nearest in self._pairs(scene, rows):
             target = out[i] if self.per_object else out
             # A view, or an error: a copy would lose what is written.
             flat = target.view(-1, *target.shape[2:])
@@ -245,23 +249,19 @@ class RaySensor(ProximitySensor):
         return least
 
     def _pairs(
-        self, scene: Scene, rows: Tensor | None
+        self, scene: Scene, rows: Tensor
     ) -> Iterator[tuple[int, Tensor, Tensor, Tensor, Tensor]]:
         """Yield object, rows, places, readings and their least, of what may be hit.
 
         Rows count within the scene; a place is that of a sensor in ``[B S]``.
         """
-        margins, views = self._margin_kernel(scene)
+        margins, views = self.margins(scene)
         for i, (view, shape) in enumerate(zip(views, self.objects, strict=True)):
             # Whatever is not 0 may be hit, NaN too.
-            pairs = _nonzero(margins[i])
-            # Nothing wanted would still be a part, and compiled for its own sake.
-            for part in pairs.split(self._chunk) if len(pairs) else ():
+            for part in _nonzero(margins[i]).split(self._chunk):
                 row, sensor = part // self.num_sensors, part % self.num_sensors
-                place = part
-                if rows is not None:
-                    place = rows[row] * self.num_sensors + sensor
-                yield i, row, place, *self._kernel(scene, view, sensor, row, shape)
+                place = rows[row] * self.num_sensors + sensor
+                yield i, row, place, *self.read(scene, view, sensor, row, shape)
 
     def hits(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Return what is hit, without the grid: a thousandth of its numbers.
@@ -273,11 +273,13 @@ class RaySensor(ProximitySensor):
             Place in the flattened readings ``[B, S, K]`` of each beam that hits
             anything, ascending ``[n]`` int64, and its reading [m], ``[n]``.
         """
-        rows = None if self._compile else self._rows_in_reach(*inputs)
+        if self._kernels is not None and Kernels.can(*inputs[:3]):
+            return self._kernels.hits(inputs)
         places, readings = [torch.empty(0, dtype=torch.int64)], [inputs[0].new_empty(0)]
-        if rows is not None and not len(rows):
+        rows = self._rows_in_reach(*inputs)
+        if not len(rows):
             return places[0], readings[0]
-        scene = self._prepare(*(x if rows is None else x[rows] for x in inputs))
+        scene = self.scene(*(x[rows] for x in inputs))
         for _, _, place, reading, _ in self._pairs(scene, rows):
             # NaN is no miss.
             hit = _nonzero(reading != torch.inf)
@@ -301,49 +303,36 @@ class SparseRays:
     agents that learn from thousands of beams.
 
     Args:
-        sensor: Sensors with all their beams, objects not told apart; compiled or not.
-        plain: The same uncompiled, for batches of another size than the first.
+        sensor: Sensors with all their beams, objects not told apart.
         reading: What makes the signal of a distance, the same for every sensor.
     """
 
-    def __init__(
-        self, sensor: RaySensor, plain: RaySensor, reading: Proximity | Binary
-    ) -> None:
-        self._sensor, self._plain, self._reading = sensor, plain, reading
-        self._batch: int | None = None
+    def __init__(self, sensor: RaySensor, reading: Proximity | Binary) -> None:
+        self._sensor, self._reading = sensor, reading
         self.size = sensor.readings.numel()
         self.in_keys = [str(key) for key in sensor.in_keys]
-
-    @torch.no_grad()
-    def warm_up(self, batch: int) -> None:
-        """Compile for batches of a size, as the first call would do."""
-        if self._sensor is not self._plain:
-            # In the middle of the objects: there are pairs to compute.
-            pose = torch.eye(7)[3].expand(batch, 7)
-            objects = pose[:, None].expand(-1, len(self._sensor.objects), -1)
-            active = torch.ones(objects.shape[:2], dtype=torch.bool)
-            joints = torch.zeros(batch, self._sensor.num_joints)
-            self._sensor.hits(pose, joints, objects, active)
-        self._batch = batch
 
     @torch.no_grad()
     def __call__(self, tensordict: TensorDictBase) -> SparseRows:
         """Return the signal of each row ``[B]``, on the device of the tensordict."""
         given = [tensordict.get(key) for key in self.in_keys]
         state = [x.cpu() for x in given]
-        batch = len(state[0])
-        if self._batch is None:
-            self._batch = batch
-        sensor = self._sensor if batch == self._batch else self._plain
-        place, distance = sensor.hits(*state)
+        place, distance = self._sensor.hits(*state)
         nothing = self._reading.signal(distance.new_full((1, 1), torch.inf))
+        counts = torch.bincount(place // self.size, minlength=len(state[0]))
         return SparseRows(
-            offsets=offsets_of(torch.bincount(place // self.size, minlength=batch)),
+            offsets=offsets_of(counts),
             column=place % self.size,
             value=self._reading.signal(distance[None])[0],
             size=self.size,
             default=float(nothing),
         ).to(given[0].device)
+
+
+def _padded(directions: np.ndarray) -> np.ndarray:
+    """Return ``[..., n]`` with n made a multiple of the kernels' vectors."""
+    extra = -directions.shape[-1] % VECTOR
+    return np.pad(directions, [(0, 0)] * (directions.ndim - 1) + [(0, extra)], "edge")
 
 
 def _nonzero(x: Tensor) -> Tensor:

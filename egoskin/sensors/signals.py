@@ -126,7 +126,7 @@ class Proximity(_Reading):
         if len(scale) > 1:
             scale = scale.repeat_interleave(distance.shape[1] // len(scale))
         # An infinite distance is nothing (1) whatever the range.
-        limited = (distance / scale).clamp(0.0, 1.0)
+        limited = (distance / scale).clamp_(0.0, 1.0)
         if self._unlimited:
             # 1 - 1 / (1 + d) is 1 for an infinite distance, where d / (1 + d) is NaN.
             unlimited = 1.0 - _HALF_DISTANCE / (_HALF_DISTANCE + distance)

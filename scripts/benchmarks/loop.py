@@ -22,6 +22,7 @@ from benchmarks.report import Row, show
 from egoskin.agents.networks import RunningNorm
 from egoskin.agents.ppo import PPO, PPOConfig, collect
 from egoskin.checkpoint import part
+from egoskin.compilation import can_compile
 from egoskin.envs.dodgeball import DodgeballEnv
 from egoskin.envs.physics import Physics
 from egoskin.make import (
@@ -32,7 +33,6 @@ from egoskin.make import (
     save_env_state,
 )
 from egoskin.policies import PolicySpec, sparse_sources
-from egoskin.runs import pays_to_compile
 from egoskin.workers import WorkerPool
 
 
@@ -142,9 +142,7 @@ class _Loop:
         self.config, self._coverage = config, coverage
         self._skin = config.env.skin.build(config.env.robot_config)
         self._workers = check_num_workers(config.num_envs, config.num_workers)
-        self._sources = sparse_sources(
-            config.env, self._skin, pays_to_compile(config.env)
-        )
+        self._sources = sparse_sources(config.env, self._skin, can_compile())
         self._steps = config.ppo.rollout_steps
 
     def rows(self) -> list[Row]:
@@ -181,6 +179,7 @@ class _Loop:
             seed=config.seed,
             bare=bare,
             sparse=bool(self._sources),
+            compile_kernels=can_compile(),
         )
 
     def _train_and_record(self) -> Row:

@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from benchmarks.report import Row, show
-from egoskin.compilation import compiled
 from egoskin.make import EnvConfig, make_worker_env
 from egoskin.robots import H1_2
 from egoskin.sensors import FieldSensor, Proximity, RaySensor, Skin
@@ -148,6 +147,7 @@ def _measure(config: SensorBench) -> list[Row]:
     close = [_close(s, plain, config.seed) for s in states]
     one_close = [_one_ball(s) for s in close]
     grid = torch.empty(n, len(skin), 64)
+    poses = torch.empty(n, len(skin), 3), torch.empty(n, len(skin), 3, 3)
     frames_bytes, field_bytes = n * len(skin) * 48, n * len(skin) * 24
     grid_bytes = grid.numel() * 4
     # Row: result's bytes, states, and what is timed.
@@ -155,16 +155,13 @@ def _measure(config: SensorBench) -> list[Row]:
     proximity = Proximity(_RANGE)
 
     for suffix, fast in (("", True), ("_eager", False)):
-        trig, kernel = plain._kinematics.trig, plain.frames_b
-        if fast:
-            trig, kernel = compiled(trig), compiled(kernel)
         field = FieldSensor(*args, [ball], _RANGE, compile=fast)
         ray = RaySensor(*args, [ball], _RANGE, compile=fast)
         ray_two = RaySensor(*args, [ball, ball], _RANGE, compile=fast)
         ray_min = RaySensor(*args, [ball], _RANGE, reduce="min", compile=fast)
 
-        def frames(state: State, trig: Any = trig, kernel: Any = kernel) -> Any:
-            return kernel(*trig(state[1]))
+        def frames(state: State, sensor: FieldSensor = field) -> Any:
+            return sensor.poses_b(state[1], out=poses)
 
         def signal(state: State, sensor: FieldSensor = field) -> Any:
             return proximity.compute(sensor.compute(*state)[0])
@@ -201,7 +198,7 @@ def _row(
     rounds: int,
 ) -> Row:
     """Time a job and, in turn with it, the writing of as many bytes."""
-    show(f"{name} (the first call compiles: up to a minute)")
+    show(name)
     buffer = torch.empty(size // 4)
     for state in states:
         run(state)

@@ -1,0 +1,591 @@
+// The sensor kernels for balls and a transparent robot: what geometry.py, field.py and
+// ray.py compute, fused, row block by row block, so that all but the result stays in
+// the cache. kernels.py builds and calls this; the PyTorch code is the reference.
+//
+// Contract: every number has the bits that the PyTorch code gives it (but for the sign
+// of a zero). So the order of sums is that of the Python code, and nothing may be
+// contracted or reassociated: compile with -ffp-contract=off, never with -ffast-math.
+//
+// Only float32 and float64 kernels of plain C linkage are exported; all pointers are
+// to contiguous arrays unless a stride is given.
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <limits>
+#include <type_traits>
+#include <vector>
+
+extern "C" {
+
+// What does not change from call to call. Numbers behind `const void*` are of the
+// kernel's type; matrices are row-major.
+struct Tables {
+  int64_t joints, steps, links, sensors, objects;
+  int64_t beams, sub_beams;    // of each sensor, and of each beam; 0 for a field
+  int64_t cull, reduce, apart; // flags: skip what cannot hit, minimum, per object
+  const int64_t *joint;        // of each step; -1: none               [steps]
+  const int64_t *parent;       // frame that a step starts from        [steps]
+  const int64_t *frame;        // of each link; 0 is the base          [links]
+  const int64_t *link;         // of each sensor                       [sensors]
+  const void *constant, *by_cos, *by_sin; // rotation of a step        [steps, 3, 3]
+  const void *shift, *slide;   // its translation                      [steps, 3]
+  const void *offset;          // of the sensor in its link            [sensors, 3]
+  const void *axes;            // of the sensor frame, one a row       [sensors, 3, 3]
+  const void *range;           //                                      [sensors]
+  const void *radius, *squared, *bound; // of each object              [objects]
+  // Field.
+  const void *cos_half;        // null: every sensor sees all around   [sensors]
+  const uint8_t *to_centre;    // null: all measure to the surface     [sensors]
+  // Ray.
+  const void *reach;           // farthest that a beam may hit         [sensors]
+  const void *pyramid;         // cosines, then sines of the half angles [sensors, 4]
+  const void *directions;      // of each kind of grid        [grids, 3, beams * sub]
+  const int64_t *grid;         // of each sensor                       [sensors]
+  const uint8_t *depth;        // null: all measure along the beam     [sensors]
+};
+
+// Rows of base pose, joint positions, object poses and active flags, and how far apart.
+struct Inputs {
+  int64_t rows;
+  const void *data[4];
+  int64_t stride[4];
+};
+}
+
+namespace {
+
+// Rows of a block: one vector of them is one AVX-512 register of float32.
+constexpr int W = 16;
+
+template <class T> struct Vector;
+template <> struct Vector<float> {
+  typedef float Type __attribute__((vector_size(W * sizeof(float))));
+};
+template <> struct Vector<double> {
+  typedef double Type __attribute__((vector_size(W * sizeof(double))));
+};
+template <class T> using V = typename Vector<T>::Type;
+
+template <class T> V<T> sqrt_of(V<T> x) {
+  for (int i = 0; i < W; i++) x[i] = std::sqrt(x[i]);
+  return x;
+}
+
+template <class T> V<T> floor_of(V<T> x) {
+  for (int i = 0; i < W; i++) x[i] = std::floor(x[i]);
+  return x;
+}
+
+template <class T> V<T> round_of(V<T> x) {
+  for (int i = 0; i < W; i++) x[i] = std::nearbyint(x[i]);
+  return x;
+}
+
+template <class T> V<T> filled(T x) { return V<T>{} + x; }
+
+// A mask is -1 or 0 in each lane.
+template <class T> using Mask = decltype(V<T>{} < V<T>{});
+
+template <class T> bool any(const Mask<T> &mask) {
+  uint64_t words[sizeof(mask) / 8], found = 0;
+  std::memcpy(words, &mask, sizeof(mask));
+  for (uint64_t word : words) found |= word;
+  return found;
+}
+
+// The lesser; NaN if one is.
+template <class T> V<T> least(V<T> a, V<T> b) {
+  V<T> low = b < a ? b : a;
+  return b != b ? b : low;
+}
+
+template <class T> T least_of(T a, T b) { return b < a || b != b ? b : a; }
+
+// Vectors of a number of each row become rows of numbers: W x W, in halves of halves.
+template <class T> void transpose(V<T> (&x)[W]) {
+#pragma GCC unroll 4
+  for (int half = W / 2; half; half /= 2) {
+    Mask<T> low, high;
+    for (int i = 0; i < W; i++) {
+      low[i] = i & half ? W + i - half : i;
+      high[i] = i & half ? W + i : i + half;
+    }
+#pragma GCC unroll 16
+    for (int i = 0; i < W; i++) {
+      if (i & half) continue;
+      V<T> a = x[i], b = x[i + half];
+#ifdef __clang__
+      for (int j = 0; j < W; j++) {
+        x[i][j] = j & half ? b[j - half] : a[j];
+        x[i + half][j] = j & half ? b[j] : a[j + half];
+      }
+#else
+      x[i] = __builtin_shuffle(a, b, low);
+      x[i + half] = __builtin_shuffle(a, b, high);
+#endif
+    }
+  }
+}
+
+// Writes `count` numbers of each row, `stride` apart: vector i holds all numbers i.
+template <class T>
+void write_rows(const V<T> *numbers, int64_t count, int64_t rows, T *out,
+                int64_t stride) {
+  int64_t i = 0;
+  for (; i + W <= count; i += W) {
+    V<T> tile[W];
+    std::copy_n(numbers + i, W, tile);
+    transpose<T>(tile);
+    for (int64_t row = 0; row < rows; row++)
+      std::memcpy(out + row * stride + i, &tile[row], sizeof(tile[row]));
+  }
+  for (; i < count; i++)
+    for (int64_t row = 0; row < rows; row++) out[row * stride + i] = numbers[i][row];
+}
+
+// sincos of compilation.py.
+template <class T> void sincos(V<T> x, V<T> &sine, V<T> &cosine) {
+  constexpr int terms = sizeof(T) == 8 ? 9 : 5;
+  V<T> n = round_of<T>(x * T(2 / 3.141592653589793));
+  V<T> r = ((x - n * T(1.5703125)) - n * T(4.837512969970703125e-4)) -
+           n * T(7.54978995489188216e-8);
+  V<T> z = r * r, s{}, c{};
+  double factorial[2 * terms + 1] = {1};
+  for (int i = 1; i <= 2 * terms; i++) factorial[i] = factorial[i - 1] * i;
+  for (int i = terms - 1; i > 0; i--) {
+    double sign = i % 2 ? -1 : 1;
+    s = (s + T(sign / factorial[2 * i + 1])) * z;
+    c = (c + T(-sign / factorial[2 * i + 2])) * z;
+  }
+  s = r + r * s;
+  c = z * (c - T(0.5)) + T(1);
+  V<T> half = floor_of<T>(n * T(0.5));
+  V<T> sign = filled<T>(1) - (half - floor_of<T>(half * T(0.5)) * T(2)) * T(2);
+  auto swapped = n - half * T(2) > T(0.5);
+  sine = (swapped ? c : s) * sign;
+  cosine = (swapped ? -s : c) * sign;
+}
+
+template <class T> struct Frame {
+  V<T> r[3][3], p[3];
+};
+
+// What is known of a block of rows.
+template <class T> struct Block {
+  explicit Block(const Tables &t)
+      : turns(t.steps), frames(t.steps + 1), centre(t.objects * t.links), active(t.objects) {}
+
+  struct Turn {
+    V<T> joint, sine, cosine;
+  };
+  std::vector<Turn> turns;      // of each step
+  std::vector<Frame<T>> frames; // in the base frame; the base first
+  bool finite = true;           // whether no input of any row is NaN or infinite
+  struct Point {
+    V<T> x[3];
+  };
+  std::vector<Point> centre; // of each object in each link's frame
+  std::vector<V<T>> active;  // 1 or 0
+};
+
+template <class T> const T *as(const void *pointer) {
+  return static_cast<const T *>(pointer);
+}
+
+enum Input { BASE, JOINT_POS, OBJECT_POSE, ACTIVE };
+
+// A block's part of the inputs; rows behind the last repeat it.
+struct Rows {
+  Rows(const Inputs &in, int64_t first) : in(in) {
+    for (int input = 0; input < 4; input++)
+      for (int i = 0; i < W; i++)
+        offset[input][i] = std::min(first + i, in.rows - 1) * in.stride[input];
+  }
+
+  // One number of each row.
+  template <class T, class N = T> V<T> column(Input input, int64_t at) const {
+    const N *data = as<N>(in.data[input]) + at;
+    V<T> x;
+    for (int i = 0; i < W; i++) x[i] = data[offset[input][i]];
+    return x;
+  }
+
+  // 0 or, if one of the numbers of a row is NaN or infinite, NaN.
+  template <class T> V<T> poison(Input input, int64_t first, int64_t count) const {
+    V<T> sum{};
+    for (int64_t i = first; i < first + count; i++) sum += column<T>(input, i) * T(0);
+    return sum;
+  }
+
+  const Inputs &in;
+  int64_t offset[4][W];
+};
+
+// Whether all numbers are neither NaN nor infinite, as most are: by their exponents.
+template <class T> bool finite(const Inputs &in, Input input, int64_t count) {
+  using Bits = std::conditional_t<sizeof(T) == 8, uint64_t, uint32_t>;
+  const T infinity = std::numeric_limits<T>::infinity();
+  Bits exponent, found = 0;
+  std::memcpy(&exponent, &infinity, sizeof(T));
+  // Rows without a gap are one.
+  const bool dense = in.stride[input] == count;
+  const int64_t length = dense ? in.rows * count : count;
+  for (int64_t row = 0; row < (dense ? 1 : in.rows); row++) {
+    const Bits *data = as<Bits>(in.data[input]) + row * in.stride[input];
+    for (int64_t i = 0; i < length; i++)
+      found |= (data[i] & exponent) == exponent ? Bits(1) : Bits(0);
+  }
+  return !found;
+}
+
+template <class T> bool finite(const Tables &t, const Inputs &in) {
+  return finite<T>(in, BASE, 7) && finite<T>(in, JOINT_POS, t.joints) &&
+         finite<T>(in, OBJECT_POSE, 7 * t.objects);
+}
+
+// LinkKinematics: the frames of all steps.
+template <class T>
+void place_frames(const Tables &t, const Rows &rows, Block<T> &block) {
+  Frame<T> &base = block.frames[0];
+  for (int i = 0; i < 3; i++) {
+    for (int j = 0; j < 3; j++) base.r[i][j] = filled<T>(i == j);
+    base.p[i] = filled<T>(0);
+  }
+  // First of all steps: none waits for another.
+  for (int64_t step = 0; step < t.steps; step++) {
+    auto &[q, s, c] = block.turns[step];
+    q = t.joint[step] < 0 ? V<T>{} : rows.column<T>(JOINT_POS, t.joint[step]);
+    sincos<T>(q, s, c);
+  }
+  for (int64_t step = 0; step < t.steps; step++) {
+    const Frame<T> &from = block.frames[t.parent[step]];
+    Frame<T> &to = block.frames[step + 1];
+    const auto &[q, s, c] = block.turns[step];
+    V<T> turn[3][3], way[3];
+    for (int i = 0; i < 3; i++) {
+      for (int j = 0; j < 3; j++) {
+        int64_t at = 9 * step + 3 * i + j;
+        turn[i][j] = (c * as<T>(t.by_cos)[at] + as<T>(t.constant)[at]) +
+                     s * as<T>(t.by_sin)[at];
+      }
+      way[i] = q * as<T>(t.slide)[3 * step + i] + as<T>(t.shift)[3 * step + i];
+    }
+    for (int i = 0; i < 3; i++) {
+      const V<T> *r = from.r[i];
+      for (int j = 0; j < 3; j++)
+        to.r[i][j] = r[0] * turn[0][j] + r[1] * turn[1][j] + r[2] * turn[2][j];
+      to.p[i] = from.p[i] + ((r[0] * way[0] + r[1] * way[1]) + r[2] * way[2]);
+    }
+  }
+}
+
+// ProximitySensor.views: where the links see the objects. NaN in a row is everywhere.
+template <class T>
+void place_objects(const Tables &t, const Rows &rows, Block<T> &block) {
+  V<T> base[7], poison{};
+  for (int j = 0; j < 7; j++) base[j] = rows.column<T>(BASE, j);
+  if (!block.finite)
+    poison = rows.poison<T>(JOINT_POS, 0, t.joints) + rows.poison<T>(BASE, 0, 7);
+  V<T> w = base[3], x = base[4], y = base[5], z = base[6], one = filled<T>(1);
+  V<T> turn[3][3] = {
+      {one - (y * y + z * z) * T(2), (x * y - w * z) * T(2), (x * z + w * y) * T(2)},
+      {(x * y + w * z) * T(2), one - (x * x + z * z) * T(2), (y * z - w * x) * T(2)},
+      {(x * z - w * y) * T(2), (y * z + w * x) * T(2), one - (x * x + y * y) * T(2)}};
+  for (int64_t object = 0; object < t.objects; object++) {
+    V<T> d[3], centre[3];
+    for (int i = 0; i < 3; i++)
+      d[i] = rows.column<T>(OBJECT_POSE, 7 * object + i) - base[i];
+    if (!block.finite) {
+      V<T> own = poison + rows.poison<T>(OBJECT_POSE, 7 * object, 7);
+      for (auto &x : d) x += own;
+    }
+    for (int i = 0; i < 3; i++)
+      centre[i] = turn[0][i] * d[0] + turn[1][i] * d[1] + turn[2][i] * d[2];
+    for (int64_t link = 0; link < t.links; link++) {
+      const Frame<T> &frame = block.frames[t.frame[link]];
+      for (int i = 0; i < 3; i++) d[i] = centre[i] - frame.p[i];
+      auto &seen = block.centre[object * t.links + link].x;
+      for (int i = 0; i < 3; i++)
+        seen[i] = frame.r[0][i] * d[0] + frame.r[1][i] * d[1] + frame.r[2][i] * d[2];
+    }
+    block.active[object] = rows.column<T, uint8_t>(ACTIVE, object);
+  }
+}
+
+// From a sensor to an object's centre, in the sensor's link.
+template <class T>
+void to_centre(const Tables &t, const Block<T> &block, int64_t object, int64_t sensor,
+               V<T> (&away)[3]) {
+  const auto &centre = block.centre[object * t.links + t.link[sensor]].x;
+  for (int i = 0; i < 3; i++)
+    away[i] = centre[i] - as<T>(t.offset)[3 * sensor + i];
+}
+
+// FieldSensor.
+template <class T>
+void field(const Tables &t, const Inputs &in, T *out, uint8_t *detected) {
+  const T inf = std::numeric_limits<T>::infinity();
+  Block<T> block(t);
+  block.finite = finite<T>(t, in);
+  std::vector<V<T>> nearest(t.sensors);
+  for (int64_t row = 0; row < in.rows; row += W) {
+    int64_t count = std::min<int64_t>(W, in.rows - row);
+    const Rows rows(in, row);
+    place_frames<T>(t, rows, block);
+    place_objects<T>(t, rows, block);
+    for (int64_t object = 0; object < t.objects; object++) {
+      auto on = block.active[object] != T(0);
+      auto found = on & ~on;
+      bool first = t.apart || object == 0;
+      for (int64_t sensor = 0; sensor < t.sensors; sensor++) {
+        V<T> v[3];
+        to_centre<T>(t, block, object, sensor, v);
+        V<T> reach = sqrt_of<T>(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]);
+        V<T> distance = reach - as<T>(t.radius)[object];
+        distance = distance < T(0) ? filled<T>(0) : distance;
+        if (t.cos_half) {
+          const T *n = as<T>(t.axes) + 9 * sensor + 6;
+          V<T> along = v[0] * n[0] + v[1] * n[1] + v[2] * n[2];
+          auto beside = (along < reach * as<T>(t.cos_half)[sensor]) &
+                        ~(distance <= T(0));
+          distance = beside ? filled<T>(inf) : distance;
+        }
+        if (t.to_centre && t.to_centre[sensor])
+          distance = distance == inf ? distance : reach;
+        auto gone = (distance > as<T>(t.range)[sensor]) | ~on;
+        distance = gone ? filled<T>(inf) : distance;
+        found |= distance != inf;
+        nearest[sensor] = first ? distance : least<T>(nearest[sensor], distance);
+      }
+      for (int64_t i = 0; i < count; i++)
+        detected[(row + i) * t.objects + object] = found[i] != 0;
+      if (t.apart)
+        write_rows<T>(nearest.data(), t.sensors, count,
+                      out + (object * in.rows + row) * t.sensors, t.sensors);
+    }
+    if (!t.apart) 
+      write_rows<T>(nearest.data(), t.sensors, count, out + row * t.sensors, t.sensors);
+  }
+}
+
+// ProximitySensor.poses_b: position [rows, sensors, 3], rotation [rows, sensors, 3, 3].
+template <class T>
+void poses(const Tables &t, const Inputs &in, T *position, T *rotation) {
+  Block<T> block(t);
+  for (int64_t row = 0; row < in.rows; row += W) {
+    int64_t count = std::min<int64_t>(W, in.rows - row);
+    place_frames<T>(t, Rows(in, row), block);
+    // As many sensors as make whole vectors of a row.
+    for (int64_t first = 0; first < t.sensors; first += W) {
+      int64_t some = std::min<int64_t>(W, t.sensors - first);
+      V<T> p[W][3], r[W][3][3];
+      for (int64_t i = 0; i < some; i++) {
+        int64_t sensor = first + i;
+        const Frame<T> &link = block.frames[t.frame[t.link[sensor]]];
+        const T *o = as<T>(t.offset) + 3 * sensor, *axes = as<T>(t.axes) + 9 * sensor;
+        for (int j = 0; j < 3; j++) {
+          const V<T> *a = link.r[j];
+          p[i][j] = link.p[j] + (a[0] * o[0] + a[1] * o[1] + a[2] * o[2]);
+          for (int k = 0; k < 3; k++) {
+            const T *b = axes + 3 * k;
+            r[i][j][k] = a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+          }
+        }
+      }
+      int64_t place = row * t.sensors + first;
+      write_rows<T>(&p[0][0], 3 * some, count, position + 3 * place, 3 * t.sensors);
+      write_rows<T>(&r[0][0][0], 9 * some, count, rotation + 9 * place, 9 * t.sensors);
+    }
+  }
+}
+
+// A sensor and an object that it may see from one row of the block, and where.
+template <class T> struct Pair {
+  int64_t sensor, object;
+  T centre[3]; // in the sensor's frame
+};
+
+// RaySensor.margins: which pairs may hit; NaN may.
+template <class T>
+void find_pairs(const Tables &t, const Block<T> &block, int64_t count,
+                std::vector<Pair<T>> (&pairs)[W]) {
+  for (auto &of_row : pairs) of_row.clear();
+  for (int64_t sensor = 0; sensor < t.sensors; sensor++) {
+    const T *axes = as<T>(t.axes) + 9 * sensor;
+    const T *cos = as<T>(t.pyramid) + 4 * sensor, *sin = cos + 2;
+    for (int64_t object = 0; object < t.objects; object++) {
+      V<T> v[3], c[3];
+      to_centre<T>(t, block, object, sensor, v);
+      for (int i = 0; i < 3; i++)
+        c[i] = v[0] * axes[3 * i] + v[1] * axes[3 * i + 1] + v[2] * axes[3 * i + 2];
+      // Outside the range, behind the sensor, or beyond a side of the pyramid.
+      V<T> far = sqrt_of<T>(c[0] * c[0] + c[1] * c[1] + c[2] * c[2]) -
+                 as<T>(t.reach)[sensor];
+      V<T> x = c[0] < T(0) ? -c[0] : c[0], y = c[1] < T(0) ? -c[1] : c[1];
+      V<T> bound = filled<T>(as<T>(t.bound)[object]);
+      auto out = (far >= bound) | (x * cos[0] - c[2] * sin[0] >= bound) |
+                 (y * cos[1] - c[2] * sin[1] >= bound) | (-c[2] >= bound);
+      if (!t.cull) out = out & ~out;
+      out = out | (block.active[object] == T(0));
+      if (!any<T>(~out)) continue;
+      for (int64_t i = 0; i < count; i++)
+        if (!out[i])
+          pairs[i].push_back({sensor, object, {c[0][i], c[1][i], c[2][i]}});
+    }
+  }
+}
+
+// RaySensor.read: what the beams of a pair measure; returns the least. `out` has room
+// for whole vectors of sub-beams.
+template <class T> T read_beams(const Tables &t, const Pair<T> &pair, V<T> *out) {
+  const T inf = std::numeric_limits<T>::infinity();
+  const int64_t sensor = pair.sensor, vectors = (t.beams * t.sub_beams + W - 1) / W;
+  const T *directions = as<T>(t.directions) + 3 * W * vectors * t.grid[sensor];
+  const T px = -pair.centre[0], py = -pair.centre[1], pz = -pair.centre[2];
+  const T squared = as<T>(t.squared)[pair.object], range = as<T>(t.range)[sensor];
+  const bool depth = t.depth && t.depth[sensor];
+  V<T> nearest = filled<T>(inf);
+  for (int64_t i = 0; i < vectors; i++) {
+    // _ball_interval and first_hit of shapes.py
+    V<T> d[3];
+    for (int j = 0; j < 3; j++)
+      std::memcpy(&d[j], directions + (j * vectors + i) * W, sizeof(d[j]));
+    V<T> along = -(px * d[0] + py * d[1] + pz * d[2]);
+    V<T> qx = px + along * d[0], qy = py + along * d[1], qz = pz + along * d[2];
+    V<T> inside = squared - (qx * qx + qy * qy + qz * qz);
+    V<T> half = sqrt_of<T>(inside);
+    V<T> distance = along - half, leave = along + half;
+    distance = distance < T(0) ? filled<T>(0) : distance;
+    distance = (inside < T(0)) | (leave < T(0)) ? filled<T>(inf) : distance;
+    distance = depth ? distance * d[2] : distance;
+    distance = distance > range ? filled<T>(inf) : distance;
+    out[i] = distance;
+    nearest = least<T>(nearest, distance);
+  }
+  T *reading = reinterpret_cast<T *>(out);
+  if (t.sub_beams > 1)
+    for (int64_t beam = 0; beam < t.beams; beam++) {
+      T first = reading[beam * t.sub_beams];
+      for (int64_t i = 1; i < t.sub_beams; i++)
+        first = least_of(first, reading[beam * t.sub_beams + i]);
+      reading[beam] = first;
+    }
+  T found = nearest[0];
+  for (int i = 1; i < W; i++) found = least_of(found, nearest[i]);
+  return found;
+}
+
+// What a sensor reads of one object, or of the nearest.
+template <class T, class Deliver>
+void each_reading(const Tables &t, const std::vector<Pair<T>> &pairs, V<T> *read,
+                  V<T> *other, uint8_t *detected, Deliver deliver) {
+  const T inf = std::numeric_limits<T>::infinity();
+  const int64_t vectors = (t.beams + W - 1) / W;
+  for (size_t i = 0; i < pairs.size();) {
+    const Pair<T> &pair = pairs[i];
+    T nearest = read_beams<T>(t, pair, read);
+    detected[pair.object] |= nearest != inf;
+    for (i++; !t.apart && i < pairs.size() && pairs[i].sensor == pair.sensor; i++) {
+      T own = read_beams<T>(t, pairs[i], other);
+      detected[pairs[i].object] |= own != inf;
+      nearest = least_of(nearest, own);
+      for (int64_t k = 0; k < vectors; k++) read[k] = least<T>(read[k], other[k]);
+    }
+    if (nearest != inf) deliver(pair, reinterpret_cast<const T *>(read), nearest);
+  }
+}
+
+// RaySensor: the block's rows, and then each of its readings that is not infinite.
+template <class T, class Begin, class Deliver>
+void rays(const Tables &t, const Inputs &in, uint8_t *detected, Begin begin,
+          Deliver deliver) {
+  Block<T> block(t);
+  std::vector<Pair<T>> pairs[W];
+  const int64_t vectors = (t.beams * t.sub_beams + W - 1) / W;
+  std::vector<V<T>> buffer(2 * vectors);
+  block.finite = finite<T>(t, in);
+  std::fill_n(detected, in.rows * t.objects, uint8_t(0));
+  for (int64_t row = 0; row < in.rows; row += W) {
+    int64_t count = std::min<int64_t>(W, in.rows - row);
+    const Rows rows(in, row);
+    place_frames<T>(t, rows, block);
+    place_objects<T>(t, rows, block);
+    find_pairs<T>(t, block, count, pairs);
+    begin(row, count);
+    for (int64_t i = row; i < row + count; i++)
+      each_reading<T>(t, pairs[i - row], buffer.data(), buffer.data() + vectors,
+                      detected + i * t.objects,
+                      [&](const Pair<T> &pair, const T *reading, T nearest) {
+                        deliver(i, pair, reading, nearest);
+                      });
+  }
+}
+
+// The grid, or of each sensor the least.
+template <class T>
+void ray(const Tables &t, const Inputs &in, T *out, uint8_t *detected) {
+  const T inf = std::numeric_limits<T>::infinity();
+  const int64_t beams = t.reduce ? 1 : t.beams, size = t.sensors * beams;
+  rays<T>(
+      t, in, detected,
+      [&](int64_t row, int64_t count) {
+        for (int64_t object = 0; object < (t.apart ? t.objects : 1); object++)
+          std::fill_n(out + (object * in.rows + row) * size, count * size, inf);
+      },
+      [&](int64_t row, const Pair<T> &pair, const T *reading, T nearest) {
+        int64_t at = (t.apart ? pair.object * in.rows : 0) + row;
+        T *place = out + at * size + pair.sensor * beams;
+        if (t.reduce)
+          *place = nearest;
+        else
+          std::copy_n(reading, beams, place);
+      });
+}
+
+// RaySensor.hits: places in the grid, ascending, and readings; returns their number,
+// of which at most `capacity` are written.
+template <class T>
+int64_t hits(const Tables &t, const Inputs &in, int64_t capacity, int64_t *place,
+             T *reading) {
+  const T inf = std::numeric_limits<T>::infinity();
+  std::vector<uint8_t> detected(in.rows * t.objects);
+  int64_t found = 0;
+  rays<T>(
+      t, in, detected.data(), [](int64_t, int64_t) {},
+      [&](int64_t row, const Pair<T> &pair, const T *read, T) {
+        for (int64_t k = 0; k < t.beams; k++) {
+          if (read[k] == inf) continue;
+          if (found < capacity) {
+            place[found] = (row * t.sensors + pair.sensor) * t.beams + k;
+            reading[found] = read[k];
+          }
+          found++;
+        }
+      });
+  return found;
+}
+
+} // namespace
+
+#define EXPORT(T, NAME)                                                                \
+  extern "C" void field_##NAME(const Tables *t, const Inputs *in, T *out,              \
+                               uint8_t *detected) {                                    \
+    field<T>(*t, *in, out, detected);                                                  \
+  }                                                                                    \
+  extern "C" void ray_##NAME(const Tables *t, const Inputs *in, T *out,                \
+                             uint8_t *detected) {                                      \
+    ray<T>(*t, *in, out, detected);                                                    \
+  }                                                                                    \
+  extern "C" int64_t hits_##NAME(const Tables *t, const Inputs *in, int64_t capacity,  \
+                                 int64_t *place, T *reading) {                         \
+    return hits<T>(*t, *in, capacity, place, reading);                                 \
+  }                                                                                    \
+  extern "C" void poses_##NAME(const Tables *t, const Inputs *in, T *position,         \
+                               T *rotation) {                                          \
+    poses<T>(*t, *in, position, rotation);                                             \
+  }
+
+EXPORT(float, float32)
+EXPORT(double, float64)
