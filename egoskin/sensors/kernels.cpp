@@ -87,12 +87,16 @@ template <class T> V<T> filled(T x) { return V<T>{} + x; }
 
 // A mask is -1 or 0 in each lane.
 template <class T> using Mask = decltype(V<T>{} < V<T>{});
+typedef int8_t Bytes __attribute__((vector_size(W)));
 
-template <class T> bool any(const Mask<T> &mask) {
-  uint64_t words[sizeof(mask) / 8], found = 0;
-  std::memcpy(words, &mask, sizeof(mask));
-  for (uint64_t word : words) found |= word;
-  return found;
+template <class T> Bytes bytes(Mask<T> mask) {
+  return __builtin_convertvector(mask, Bytes);
+}
+
+bool any(Bytes mask) {
+  uint64_t halves[2];
+  std::memcpy(halves, &mask, W);
+  return halves[0] | halves[1];
 }
 
 // The lesser; NaN if one is.
@@ -102,6 +106,15 @@ template <class T> V<T> least(V<T> a, V<T> b) {
 }
 
 template <class T> T least_of(T a, T b) { return b < a || b != b ? b : a; }
+
+template <class T> T least_of(V<T> x) {
+  T lanes[W];
+  std::memcpy(lanes, &x, sizeof(x));
+#pragma GCC unroll 4
+  for (int half = W / 2; half; half /= 2)
+    for (int i = 0; i < half; i++) lanes[i] = least_of(lanes[i], lanes[i + half]);
+  return lanes[0];
+}
 
 // Vectors of a number of each row become rows of numbers: W x W, in halves of halves.
 template <class T> void transpose(V<T> (&x)[W]) {
@@ -421,17 +434,18 @@ void find_pairs(const Tables &t, const Block<T> &block, int64_t count,
       for (int i = 0; i < 3; i++)
         c[i] = v[0] * axes[3 * i] + v[1] * axes[3 * i + 1] + v[2] * axes[3 * i + 2];
       // Outside the range, behind the sensor, or beyond a side of the pyramid.
-      V<T> far = sqrt_of<T>(c[0] * c[0] + c[1] * c[1] + c[2] * c[2]) -
-                 as<T>(t.reach)[sensor];
+      const T farthest = as<T>(t.reach)[sensor] + as<T>(t.bound)[object];
+      V<T> far = c[0] * c[0] + c[1] * c[1] + c[2] * c[2];
       V<T> x = c[0] < T(0) ? -c[0] : c[0], y = c[1] < T(0) ? -c[1] : c[1];
       V<T> bound = filled<T>(as<T>(t.bound)[object]);
-      auto out = (far >= bound) | (x * cos[0] - c[2] * sin[0] >= bound) |
+      auto out = (far >= farthest * farthest) | (x * cos[0] - c[2] * sin[0] >= bound) |
                  (y * cos[1] - c[2] * sin[1] >= bound) | (-c[2] >= bound);
       if (!t.cull) out = out & ~out;
       out = out | (block.active[object] == T(0));
-      if (!any<T>(~out)) continue;
+      const Bytes seen = bytes<T>(~out);
+      if (!any(seen)) continue;
       for (int64_t i = 0; i < count; i++)
-        if (!out[i])
+        if (seen[i])
           pairs[i].push_back({sensor, object, {c[0][i], c[1][i], c[2][i]}});
     }
   }
@@ -446,13 +460,21 @@ template <class T> T read_beams(const Tables &t, const Pair<T> &pair, V<T> *out)
   const T px = -pair.centre[0], py = -pair.centre[1], pz = -pair.centre[2];
   const T squared = as<T>(t.squared)[pair.object], range = as<T>(t.range)[sensor];
   const bool depth = t.depth && t.depth[sensor];
+  // A beam farther from the centre's direction than the ball's rim, or away from it,
+  // misses: most do. (p.d)^2 < p^2 - r^2, but for rounding.
+  const T away = px * px + py * py + pz * pz;
+  const T rim = t.cull ? away - squared - away * T(1e-4) : -inf;
   V<T> nearest = filled<T>(inf);
   for (int64_t i = 0; i < vectors; i++) {
-    // _ball_interval and first_hit of shapes.py
     V<T> d[3];
     for (int j = 0; j < 3; j++)
       std::memcpy(&d[j], directions + (j * vectors + i) * W, sizeof(d[j]));
     V<T> along = -(px * d[0] + py * d[1] + pz * d[2]);
+    if (!any(bytes<T>(~(along * along < rim)))) {
+      out[i] = filled<T>(inf);
+      continue;
+    }
+    // _ball_interval and first_hit of shapes.py
     V<T> qx = px + along * d[0], qy = py + along * d[1], qz = pz + along * d[2];
     V<T> inside = squared - (qx * qx + qy * qy + qz * qz);
     V<T> half = sqrt_of<T>(inside);
@@ -472,9 +494,7 @@ template <class T> T read_beams(const Tables &t, const Pair<T> &pair, V<T> *out)
         first = least_of(first, reading[beam * t.sub_beams + i]);
       reading[beam] = first;
     }
-  T found = nearest[0];
-  for (int i = 1; i < W; i++) found = least_of(found, nearest[i]);
-  return found;
+  return least_of<T>(nearest);
 }
 
 // What a sensor reads of one object, or of the nearest.
