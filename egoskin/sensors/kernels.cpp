@@ -93,6 +93,16 @@ template <class T> Bytes bytes(Mask<T> mask) {
   return __builtin_convertvector(mask, Bytes);
 }
 
+// A bit for each lane: of eight bytes that are -1 or 0, a product gathers the bits.
+// Byte 0 is the lowest (little-endian).
+uint32_t bits(Bytes mask) {
+  uint64_t halves[2];
+  std::memcpy(halves, &mask, W);
+  for (auto &half : halves)
+    half = (half & 0x8040201008040201) * 0x0101010101010101 >> 56;
+  return halves[0] | halves[1] << 8;
+}
+
 bool any(Bytes mask) {
   uint64_t halves[2];
   std::memcpy(halves, &mask, W);
@@ -424,6 +434,7 @@ template <class T> struct Pair {
 template <class T>
 void find_pairs(const Tables &t, const Block<T> &block, int64_t count,
                 std::vector<Pair<T>> (&pairs)[W]) {
+  const uint32_t rows = (1u << count) - 1;
   for (auto &of_row : pairs) of_row.clear();
   for (int64_t sensor = 0; sensor < t.sensors; sensor++) {
     const T *axes = as<T>(t.axes) + 9 * sensor;
@@ -444,9 +455,10 @@ void find_pairs(const Tables &t, const Block<T> &block, int64_t count,
       out = out | (block.active[object] == T(0));
       const Bytes seen = bytes<T>(~out);
       if (!any(seen)) continue;
-      for (int64_t i = 0; i < count; i++)
-        if (seen[i])
-          pairs[i].push_back({sensor, object, {c[0][i], c[1][i], c[2][i]}});
+      for (uint32_t left = bits(seen) & rows; left; left &= left - 1) {
+        const int i = __builtin_ctz(left);
+        pairs[i].push_back({sensor, object, {c[0][i], c[1][i], c[2][i]}});
+      }
     }
   }
 }
