@@ -14,6 +14,7 @@
 #include <cstdint>
 #include <cstring>
 #include <limits>
+#include <numeric>
 #include <type_traits>
 #include <vector>
 
@@ -115,14 +116,16 @@ template <class T> V<T> least(V<T> a, V<T> b) {
   return b != b ? b : low;
 }
 
-template <class T> T least_of(T a, T b) { return b < a || b != b ? b : a; }
+template <class T> T lesser(T a, T b) { return b < a || b != b ? b : a; }
 
+// The least of lanes of which none is NaN, without a branch.
 template <class T> T least_of(V<T> x) {
   T lanes[W];
   std::memcpy(lanes, &x, sizeof(x));
 #pragma GCC unroll 4
   for (int half = W / 2; half; half /= 2)
-    for (int i = 0; i < half; i++) lanes[i] = least_of(lanes[i], lanes[i + half]);
+    for (int i = 0; i < half; i++)
+      lanes[i] = lanes[i + half] < lanes[i] ? lanes[i + half] : lanes[i];
   return lanes[0];
 }
 
@@ -472,20 +475,13 @@ template <class T> T read_beams(const Tables &t, const Pair<T> &pair, V<T> *out)
   const T px = -pair.centre[0], py = -pair.centre[1], pz = -pair.centre[2];
   const T squared = as<T>(t.squared)[pair.object], range = as<T>(t.range)[sensor];
   const bool depth = t.depth && t.depth[sensor];
-  // A beam farther from the centre's direction than the ball's rim, or away from it,
-  // misses: most do. (p.d)^2 < p^2 - r^2, but for rounding.
   const T away = px * px + py * py + pz * pz;
-  const T rim = t.cull ? away - squared - away * T(1e-4) : -inf;
   V<T> nearest = filled<T>(inf);
   for (int64_t i = 0; i < vectors; i++) {
     V<T> d[3];
     for (int j = 0; j < 3; j++)
       std::memcpy(&d[j], directions + (j * vectors + i) * W, sizeof(d[j]));
     V<T> along = -(px * d[0] + py * d[1] + pz * d[2]);
-    if (!any(bytes<T>(~(along * along < rim)))) {
-      out[i] = filled<T>(inf);
-      continue;
-    }
     // _ball_interval and first_hit of shapes.py
     V<T> qx = px + along * d[0], qy = py + along * d[1], qz = pz + along * d[2];
     V<T> inside = squared - (qx * qx + qy * qy + qz * qz);
@@ -496,17 +492,19 @@ template <class T> T read_beams(const Tables &t, const Pair<T> &pair, V<T> *out)
     distance = depth ? distance * d[2] : distance;
     distance = distance > range ? filled<T>(inf) : distance;
     out[i] = distance;
-    nearest = least<T>(nearest, distance);
+    nearest = distance < nearest ? distance : nearest;
   }
   T *reading = reinterpret_cast<T *>(out);
   if (t.sub_beams > 1)
     for (int64_t beam = 0; beam < t.beams; beam++) {
       T first = reading[beam * t.sub_beams];
       for (int64_t i = 1; i < t.sub_beams; i++)
-        first = least_of(first, reading[beam * t.sub_beams + i]);
+        first = lesser(first, reading[beam * t.sub_beams + i]);
       reading[beam] = first;
     }
-  return least_of<T>(nearest);
+  // Only where the centre is NaN or infinite may a reading be NaN.
+  if (away - away == T(0)) return least_of<T>(nearest);
+  return std::accumulate(reading, reading + t.beams, inf, lesser<T>);
 }
 
 // What a sensor reads of one object, or of the nearest.
@@ -522,7 +520,7 @@ void each_reading(const Tables &t, const std::vector<Pair<T>> &pairs, V<T> *read
     for (i++; !t.apart && i < pairs.size() && pairs[i].sensor == pair.sensor; i++) {
       T own = read_beams<T>(t, pairs[i], other);
       detected[pairs[i].object] |= own != inf;
-      nearest = least_of(nearest, own);
+      nearest = lesser(nearest, own);
       for (int64_t k = 0; k < vectors; k++) read[k] = least<T>(read[k], other[k]);
     }
     if (nearest != inf) deliver(pair, reinterpret_cast<const T *>(read), nearest);

@@ -17,6 +17,7 @@ from egoskin.make import EnvConfig, make_worker_env
 from egoskin.robots import H1_2
 from egoskin.sensors import FieldSensor, Proximity, RaySensor, Skin
 from egoskin.shapes import Sphere
+from egoskin.workers import keep_freed_memory
 
 # States are taken this often along the rollout [control steps]: balls are in flight.
 _STRIDE = 8
@@ -128,6 +129,7 @@ def _reference(sensor: FieldSensor, skin: Skin) -> Callable[[Tensor], Any]:
 
 def sensor_rows(config: SensorBench) -> list[Row]:
     """Return the rows of the sensor benchmark."""
+    keep_freed_memory()  # as a training does
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
