@@ -35,10 +35,13 @@ class ProgressLine:
             f"success {metrics['episode/success']:6.1%}  "
             f"reward {metrics['reward/mean']:+.4f}"
         )
-        if metrics["episode/ball_speed"] < 1:
-            text += f"  balls at {metrics['episode/ball_speed']:.0%} of their speed"
-        if metrics["episode/ball_core"] < 1:
-            text += f"  {metrics['episode/ball_core']:.0%} of their radius touches"
+        for name, what in (
+            ("ball_speed", "ball speed"),
+            ("ball_core", "what of a ball touches"),
+            ("drift_price", "price of drift"),
+        ):
+            if metrics[f"ease/{name}"] < 1:
+                text += f"  {what} {metrics[f'ease/{name}']:.0%}"
         if self._live:
             print(f"\r{text}\x1b[K", end="", flush=True)
         elif now - self._shown >= _FILE_INTERVAL or frames >= self._total:

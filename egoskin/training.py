@@ -21,6 +21,7 @@ from egoskin.agents.networks import Agent
 from egoskin.agents.ppo import PPO, NonFiniteError, collect
 from egoskin.checkpoint import part, prefixed, save_tensors
 from egoskin.cli import to_plain
+from egoskin.envs.dodgeball import Ease
 from egoskin.envs.rewards import TERMS
 from egoskin.make import load_env_state, make_env, save_env_state
 from egoskin.policies import (
@@ -77,15 +78,14 @@ class Trainer:
         self.frames = 0
         self.wall_s = 0.0
         self.root: TensorDictBase = TensorDict()
-        self._ball_speed = self._ball_core = 1.0
+        self._ease = Ease()
 
     def _ease_as_due(self) -> None:
-        """Let balls be as slow, and touch as little, as is due by now."""
-        speed = self.config.ball_speed_at(self.frames)
-        core = self.config.ball_core_at(self.frames)
-        if (speed, core) != (self._ball_speed, self._ball_core):
-            self.env.ease_balls(speed, core)
-            self._ball_speed, self._ball_core = speed, core
+        """Let the task be as easy as is due by now."""
+        due = self.config.ease_at(self.frames)
+        if due != self._ease:
+            self.env.ease(due)
+            self._ease = due
 
     def start(self) -> None:
         """Begin a new run: first observations, first policy, first checkpoint."""
@@ -126,8 +126,7 @@ class Trainer:
             "time/wall_s": self.wall_s,
             "time/steps_per_s": self.config.frames_per_batch / (end - start),
             "time/collect_share": (collected - start) / (end - start),
-            "episode/ball_speed": self._ball_speed,
-            "episode/ball_core": self._ball_core,
+            **{f"ease/{k}": v for k, v in dataclasses.asdict(self._ease).items()},
             **self._episode_metrics(TensorDict.maybe_dense_stack(infos)),
             **{f"ppo/{name}": value for name, value in learned.items()},
         }

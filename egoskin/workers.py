@@ -239,9 +239,9 @@ class WorkerPool(ParallelEnv):
         with self._death_explained():
             return super().reset(tensordict, **kwargs)
 
-    def ease_balls(self, speed: float, core: float) -> None:
-        """Ease the balls of every worker's environment."""
-        self._ask("ease_balls", speed, core)
+    def ease(self, ease: object) -> None:
+        """Make the task of every worker's environment easier."""
+        self._ask("ease", ease)
 
     def _ask(self, method: str, *args: object) -> list:
         """Return what a method of every worker's environment answers."""

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import astuple, fields
 from pathlib import Path
 
 import pytest
@@ -19,6 +20,7 @@ import torch
 
 import egoskin
 from egoskin.checkpoint import load_tensors
+from egoskin.envs.dodgeball import Ease
 from egoskin.runs import TrainConfig
 from egoskin.workers import WorkerPool
 
@@ -89,25 +91,26 @@ def test_a_run_folder_holds_what_is_needed_to_understand_it(trained: Path):
     assert names == ["000000000000", f"{4 * BATCH:012d}"]
 
 
-def test_balls_are_easy_at_first(tmp_path: Path, monkeypatch):
+def test_the_task_is_easy_at_first(tmp_path: Path, monkeypatch):
     eased = []
-    ease = WorkerPool.ease_balls
+    ease = WorkerPool.ease
     monkeypatch.setattr(
-        *(WorkerPool, "ease_balls"),
-        lambda pool, *shares: eased.append(shares) or ease(pool, *shares),
+        *(WorkerPool, "ease"),
+        lambda pool, share: eased.append(astuple(share)) or ease(pool, share),
     )
     args = ("--slow-start-frames", 2 * BATCH, "--core-frames", BATCH, 3 * BATCH)
-    args += ("--total-frames", 5 * BATCH)
+    args += ("--drift-frames", 0, 3 * BATCH, "--total-frames", 5 * BATCH)
     done = run("ppo.py", *SMALL, "--run-dir", tmp_path / "run", *args)
     assert done.returncode == 0, done.stderr
-    due = [(0.4, 0.0), (0.7, 0.0), (1.0, 0.5), (1.0, 1.0)]
+    due = [(0.4, 0.0, 0.1), (0.7, 0.0, 0.4), (1.0, 0.5, 0.7), (1.0, 1.0, 1.0)]
     assert eased == [pytest.approx(shares) for shares in due]
     logged = [
-        (float(row["episode/ball_speed"]), float(row["episode/ball_core"]))
+        tuple(float(row[f"ease/{field.name}"]) for field in fields(Ease))
         for row in metrics(tmp_path / "run")
     ]
     assert logged == [pytest.approx(shares) for shares in [*due, due[-1]]]
-    assert "balls at 40% of their speed  0% of their radius touches" in done.stdout
+    eased = "ball speed 40%  what of a ball touches 0%  price of drift 10%"
+    assert eased in done.stdout
 
 
 @pytest.mark.parametrize(
@@ -118,6 +121,9 @@ def test_balls_are_easy_at_first(tmp_path: Path, monkeypatch):
         {"slow_start_frames": -1},
         {"core_frames": (-1, 1)},
         {"core_frames": (2, 1)},
+        {"drift_start": -0.1},
+        {"drift_start": 1.1},
+        {"drift_frames": (2, 1)},
     ],
 )
 def test_an_easy_start_outside_its_range_is_refused(field: dict):
