@@ -401,9 +401,9 @@ class Run:
 
 def _grown(frames: int, first: int, last: int, start: float = 0.0) -> float:
     """Return a share that is `start` up to a number of frames and 1 from another on."""
-    if frames >= last:
-        return 1.0
-    return start + (1.0 - start) * max(frames - first, 0) / (last - first)
+    if not first < frames < last:
+        return 1.0 if frames >= last else start
+    return start + (1.0 - start) * (frames - first) / (last - first)
 
 
 def _version(package: str) -> str | None:

@@ -113,6 +113,13 @@ def test_the_task_is_easy_at_first(tmp_path: Path, monkeypatch):
     assert eased in done.stdout
 
 
+def test_what_grows_may_grow_at_once():
+    config = TrainConfig(core_frames=(5, 5), drift_frames=(7, 7), slow_start_frames=0)
+    assert astuple(config.ease_at(4)) == (1.0, 0.0, 0.1)
+    assert astuple(config.ease_at(5)) == (1.0, 1.0, 0.1)
+    assert astuple(config.ease_at(7)) == (1.0, 1.0, 1.0)
+
+
 @pytest.mark.parametrize(
     "field",
     [
