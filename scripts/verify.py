@@ -152,10 +152,11 @@ def main(args: list[str]) -> None:
                 planned = dataclasses.replace(
                     base,
                     total_frames=frames,
-                    # Balls that still arrive within few rollouts.
+                    # A task that grows harder, with balls that arrive within few rollouts.
                     slow_start=0.8,
                     slow_start_frames=frames,
                     core_frames=(0, frames),
+                    drift_frames=(0, frames),
                 )
                 half = config.iterations // 2
                 equal &= agree(planned, Path(folder), title, half)
