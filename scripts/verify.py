@@ -152,7 +152,7 @@ def main(args: list[str]) -> None:
                 planned = dataclasses.replace(
                     base,
                     total_frames=frames,
-                    # A task that grows harder, with balls that arrive within few rollouts.
+                    # A task that grows harder, with balls that soon arrive.
                     slow_start=0.8,
                     slow_start_frames=frames,
                     core_frames=(0, frames),
