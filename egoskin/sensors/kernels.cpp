@@ -391,7 +391,7 @@ void field(const Tables &t, const Inputs &in, T *out, uint8_t *detected) {
         write_rows<T>(nearest.data(), t.sensors, count,
                       out + (object * in.rows + row) * t.sensors, t.sensors);
     }
-    if (!t.apart) 
+    if (!t.apart)
       write_rows<T>(nearest.data(), t.sensors, count, out + row * t.sensors, t.sensors);
   }
 }
