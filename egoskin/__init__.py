@@ -1,8 +1,8 @@
 """egoskin: which proximity skin makes avoidance easy to learn?
 
 TensorDict keys, by who writes them. ``*B`` batch, ``J`` joints, ``L`` links, ``O``
-objects, ``S`` sensors; suffix ``_w`` world frame, ``_b`` base frame; quaternions are
-(w, x, y, z).
+objects, ``S`` sensors; suffix ``_w`` world frame, ``_b`` base frame; unit
+quaternions (w, x, y, z).
 
 =========================== ============= ============================= ==============
 key                         shape         content                       read by

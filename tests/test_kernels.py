@@ -218,3 +218,8 @@ def test_compiled_by_torch_a_sensor_measures_the_same(skin, random_state):
     scene = sensor.scene(*(state[key] for key in KEYS))
     compiled = torch.compile(sensor.distances, fullgraph=True)
     assert_same_bits([compiled(scene)], [sensor.distances(scene)])
+    # The whole of it breaks into graphs where the number of hits decides a shape.
+    inputs = [state[key] for key in KEYS]
+    for reduce in ("none", "min"):
+        ray = RaySensor(some, H1_2.chain, BALLS[:1], 2.0, reduce=reduce)
+        assert_same_bits(torch.compile(ray.compute)(*inputs), ray.compute(*inputs))

@@ -193,6 +193,14 @@ def test_triangles_are_sampled_uniformly():
     assert ((u < 0.5) & (v < 0.5)).mean() == pytest.approx(1 / 2, abs=0.03)
 
 
+def test_meshes_in_millimetres_are_told_of_before_a_file_is_written():
+    torso = box((300, 200, 500))
+    with pytest.raises(
+        ValueError, match=r"lie \d+ m from .*meshes of torso_link in me"
+    ):
+        place_sensors(H1_2, 8, links=["torso_link"], meshes={"torso_link": [torso]})
+
+
 # --- reading meshes -------------------------------------------------------------
 
 

@@ -42,8 +42,8 @@ def draw_skin(skin: Skin, rng) -> Skin:
     ]
     return replace(
         skin,
-        # The file rounds them to 1e-6.
-        normal=skin.normal / np.linalg.norm(skin.normal, axis=-1, keepdims=True),
+        # A file may round its normals to three digits.
+        normal=skin.normal.round(3),
         coverage=tuple(rays[i] for i in rng.integers(len(rays), size=len(skin))),
         range=np.exp(rng.uniform(math.log(0.1), math.log(4), len(skin))),
         roll_deg=rng.uniform(-180, 180, len(skin)),

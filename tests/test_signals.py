@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from egoskin.sensors import Binary, Localization, Proximity
+from egoskin.sensors.signals import SkinOrder
 
 INF = math.inf
 HALF = 0.5**0.5
@@ -54,11 +55,38 @@ def test_binary_is_one_for_any_distance_in_range():
     assert signal.dtype == torch.float32
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_measurement_beyond_the_range_of_its_sensor_finds_nothing(dtype):
+    # Of a false positive, or by noise; the range exactly met is in range.
+    distance = torch.tensor([[0.2, 0.21, INF, math.nan], [0.3, 5, 1e9, 0]], dtype=dtype)
+    ranges = [0.2, 0.2, INF, INF]
+    found = torch.tensor([[1, 0, 0, math.nan], [0, 0, 1, 1]], dtype=dtype)
+    (binary,) = Binary(ranges).compute(distance)
+    torch.testing.assert_close(binary, found, rtol=0, atol=0, equal_nan=True)
+    (signal,) = Proximity(ranges, validity=True).compute(distance)
+    torch.testing.assert_close(signal[:, 4:], found, rtol=0, atol=0, equal_nan=True)
+    assert signal[:, :2].tolist() == [[1, 1], [1, 1]]
+
+
+def test_signals_of_groups_come_in_the_order_of_the_skin():
+    # Sensors 0 and 3 have one reading, 1 and 2 have two; then what is valid.
+    order = SkinOrder(
+        [[0, 3], [1, 2]], validity=True, in_keys=["a", "b"], out_keys=["signal"]
+    )
+    one = torch.tensor([[0, 30, 100, 130]])
+    two = torch.tensor([[10, 11, 20, 21, 110, 111, 120, 121]])
+    (signal,) = order.compute(one, two)
+    assert signal.tolist() == [[0, 10, 11, 20, 21, 30, 100, 110, 111, 120, 121, 130]]
+
+
 def localize(base_pose, centres, detected) -> list[float]:
     pose = torch.zeros(1, len(centres), 7, dtype=torch.float64)
     pose[0, :, :3] = torch.tensor(centres)
     (signal,) = Localization().compute(
-        torch.tensor([base_pose], dtype=torch.float64), pose, torch.tensor([detected])
+        torch.tensor([base_pose], dtype=torch.float64),
+        pose,
+        torch.zeros(1, 4, dtype=torch.float64),
+        torch.tensor([detected]),
     )
     return signal[0].tolist()
 
@@ -96,3 +124,19 @@ def test_localization_gives_the_detected_ball_nearest_to_the_base():
 def test_localization_ignores_an_undetected_ball_wherever_it_is():
     balls = [(0.0, 3, 0), (0.0, 0, 1000)]
     assert localize(UPRIGHT, balls, [True, False]) == [0, 3, 0]
+
+
+@pytest.mark.parametrize("slots", ["nearest", "all"])
+def test_localization_in_a_row_of_nan_is_nan_and_so_is_its_validity(slots):
+    pose = torch.tensor([[[1.0, 0, 0, 1, 0, 0, 0]]]).expand(3, -1, -1)
+    base = torch.tensor([UPRIGHT]).repeat(3, 1)
+    joints = torch.zeros(3, 4)
+    base[0, 1], joints[1, 2] = math.nan, math.nan
+    detected = torch.ones(3, 1, dtype=torch.bool)
+    localization = Localization(slots=slots, validity=True)
+    (signal,) = localization.compute(base, pose, joints, detected)
+    assert signal[:2].isnan().all()
+    assert signal[2].tolist() == [1, 0, 0, 1]
+    # What is not detected says nothing of where it is.
+    (signal,) = localization.compute(base, pose, joints, ~detected)
+    assert signal.tolist() == [[0] * 4] * 3

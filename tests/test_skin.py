@@ -43,7 +43,7 @@ def test_sensor_frames_are_right_handed_with_z_along_the_normal(normal):
     (frame,) = make_skin(normal).rotation()
     np.testing.assert_allclose(frame.T @ frame, np.eye(3), atol=1e-9)
     assert np.linalg.det(frame) == pytest.approx(1)
-    np.testing.assert_array_equal(frame[:, 2], normal)
+    np.testing.assert_allclose(frame[:, 2], normal, atol=1e-15)
     # x = normalise(z_link x n): horizontal in the link frame, unless n is parallel.
     if np.hypot(*normal[:2]) > 1e-3:
         across = np.array([-normal[1], normal[0], 0]) / np.hypot(*normal[:2])
@@ -64,12 +64,46 @@ def test_sensor_frames_by_hand(normal, x, y):
     np.testing.assert_allclose(frame, np.array([x, y, normal]).T, atol=1e-12)
 
 
+@given(UNIT, st.floats(0.9991, 1.0009))
+def test_frames_are_orthonormal_whatever_digits_the_normals_have(normal, length):
+    (frame,) = make_skin(length * normal).rotation()
+    (exact,) = make_skin(normal).rotation()
+    np.testing.assert_allclose(frame, exact, atol=1e-9)
+
+
 @given(st.floats(-1e-5, 1e-5), st.floats(-1e-5, 1e-5))
 def test_frames_stay_orthonormal_where_the_convention_switches(a, b):
     normal = np.array([a, b, 1.0])
     (frame,) = make_skin(normal / np.linalg.norm(normal)).rotation()
     np.testing.assert_allclose(frame.T @ frame, np.eye(3), atol=1e-9)
     assert np.linalg.det(frame) == pytest.approx(1)
+
+
+def test_a_misplaced_skin_is_off_by_the_deviations_given():
+    rng = np.random.default_rng(0)
+    normal = rng.standard_normal((4000, 3))
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    skin = make_skin(normal, roll_deg=rng.uniform(-180, 180, 4000))
+    moved = skin.misplaced(0.002, 3.0, seed=1)
+    assert (moved.position - skin.position).std() == pytest.approx(0.002, rel=0.03)
+    turn = moved.rotation() @ skin.rotation().transpose(0, 2, 1)
+    # The turn as a vector, from the antisymmetric part: sin(angle) k.
+    vector = np.stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], -1) - np.stack(
+        [turn[:, 1, 2], turn[:, 2, 0], turn[:, 0, 1]], -1
+    )
+    np.testing.assert_allclose(np.degrees(vector / 2).std(0), [3.0] * 3, rtol=0.05)
+    again = skin.misplaced(0.002, 3.0, seed=1)
+    np.testing.assert_array_equal(again.normal, moved.normal)
+    assert moved.provenance["misplaced"]["seed"] == 1
+
+
+def test_a_skin_misplaced_by_nothing_has_its_own_frames():
+    skin = make_skin([[1, 0, 0], [0.6, 0, 0.8], [0, 0, 1]], roll_deg=[0, 30, -100])
+    still = skin.misplaced(0.0, 0.0, seed=0)
+    np.testing.assert_allclose(still.rotation(), skin.rotation(), atol=1e-12)
+    for wrong in (-0.1, np.inf, np.nan):
+        with pytest.raises(ValueError, match="angle_std_deg must be finite"):
+            skin.misplaced(0.0, wrong, seed=0)
 
 
 # --- file -----------------------------------------------------------------------

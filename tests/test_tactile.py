@@ -335,3 +335,22 @@ def test_the_label_so_far_of_stored_data_by_hand():
     )
     label = ContactFree(["torso", "foot"], ["torso"])(data)["contact_free"]
     assert torch.equal(label, columns("xx..xx")[0, :, None])
+
+
+@pytest.mark.parametrize("width", [1, 3, 5])
+def test_contacts_of_other_links_are_refused(width):
+    state = TensorDict(
+        tactile=torch.zeros(2, 3, width, dtype=torch.bool),
+        reward=torch.zeros(2, 3, 1),
+        terminated=torch.zeros(2, 3, 1, dtype=torch.bool),
+        done=torch.zeros(2, 3, 1, dtype=torch.bool),
+        is_init=torch.zeros(2, 3, 1, dtype=torch.bool),
+        batch_size=[2, 3],
+    )
+    for transform in (
+        ContactPenalty(LINKS, {"*": 1.0}),
+        ContactTermination(LINKS),
+        ContactFree(LINKS),
+    ):
+        with pytest.raises(ValueError, match=f"holds {width} contacts .* for 4 links"):
+            transform(state)

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 from tensordict import TensorDictBase
-from torchrl.envs import CatTensors, Transform
+from torchrl.envs import Transform
 
 from egoskin.robots import RobotConfig
 from egoskin.sensors.corruption import Corruption
@@ -21,7 +21,7 @@ from egoskin.sensors.history import HoldLast
 from egoskin.sensors.placement import place_sensors
 from egoskin.sensors.presets import PRESETS
 from egoskin.sensors.ray import RaySensor, SparseRays
-from egoskin.sensors.signals import Binary, Localization, Proximity
+from egoskin.sensors.signals import Binary, Localization, Proximity, SkinOrder
 from egoskin.sensors.skin import Skin
 from egoskin.shapes import Shape
 
@@ -177,6 +177,9 @@ class SensorConfig:
     ) -> list[Transform]:
         """Return the transforms that write the signal (none without a skin).
 
+        It holds the readings of the skin's first sensor, of its second and so on, of
+        whatever kinds they are; then, if asked for, their validity.
+
         Args:
             robot: The robot.
             skin: The sensors.
@@ -222,7 +225,14 @@ class SensorConfig:
         if self.signal == "localization":
             transforms += self._localization(robot, detected, out_key)
         elif len(groups) > 1:
-            transforms.append(CatTensors(signals, out_key, sort=False, del_keys=False))
+            transforms.append(
+                SkinOrder(
+                    list(groups.values()),
+                    validity=self.validity,
+                    in_keys=signals,
+                    out_keys=[out_key],
+                )
+            )
         return transforms
 
     def sparse_rays(
@@ -306,10 +316,12 @@ class SensorConfig:
     def _signal(self, skin: Skin, in_key: str, out_key: str) -> Proximity | Binary:
         """Return the signal of some sensors' readings."""
         keys: dict[str, Any] = {"in_keys": [in_key], "out_keys": [out_key]}
+        # A corrupted reading may be one of something beyond the range.
+        ranges = skin.range.tolist()
         if self.signal == "binary":
-            return Binary(**keys)
+            return Binary(ranges, **keys)
         return Proximity(
-            skin.range.tolist(),
+            ranges,
             closeness=self.signal == "closeness",
             validity=self.validity,
             **keys,
@@ -320,18 +332,14 @@ class SensorConfig:
     ) -> list[Transform]:
         """Return the position of what is detected."""
         options = self.localization
-        in_keys = ["base_pose", "object_pose", *detected]
-        centre = None
-        if options.frame == "torso":
-            centre = (robot.chain, "torso_link")
-            in_keys.append("joint_pos")
+        torso = (robot.chain, "torso_link")
         position = Localization(
             scale=self.range if options.over_range else 1.0,
             slots="all" if self.per_object else "nearest",
             yaw_only=options.frame == "yaw",
-            centre=centre,
+            centre=torso if options.frame == "torso" else None,
             validity=self.validity,
-            in_keys=in_keys,
+            in_keys=["base_pose", "object_pose", "joint_pos", *detected],
             out_keys=["position" if options.hold else out_key],
         )
         if not options.hold:

@@ -15,7 +15,7 @@ import numpy as np
 
 from egoskin.robots import RobotConfig, resolve
 from egoskin.sensors.mesh_surface import Meshes, mesh_surface
-from egoskin.sensors.skin import Skin
+from egoskin.sensors.skin import FARTHEST, Skin
 from egoskin.surface import primitive_surface
 
 # Candidates for each sensor that sample elimination chooses (Yuksel 2015, section 4).
@@ -232,6 +232,16 @@ def place_sensors(
     # Six decimals are what the file holds: a saved skin is the same skin.
     position = (points.position + stand_off * points.normal).round(6)
     normal = points.normal.round(6)
+    away = np.linalg.norm(position, axis=-1)
+    if away.max() > FARTHEST:
+        link = robot.links[points.link[away.argmax()]]
+        hint = (
+            f": are the meshes of {link} in metres?" if link in (meshes or {}) else ""
+        )
+        raise ValueError(
+            f"a sensor would lie {away.max():.3g} m from the origin of {link}, farther "
+            f"than any on a robot ({FARTHEST:g} m){hint}"
+        )
     chosen = np.arange(number)
     if method == "poisson_disk":
         places = surface.points_b(points.link, position)

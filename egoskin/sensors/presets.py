@@ -36,7 +36,7 @@ def time_of_flight() -> tuple[Model, ...]:
         Noise(constant=0.005, linear=0.02),
         # Assumption: a tenth of what is at 4 m goes unseen.
         Dropout(per_metre=0.025),
-        # Assumption: one reading of nothing in ten thousand.
+        # Assumption: one reading of nothing in ten thousand, at any distance alike.
         FalsePositives(probability=1e-4, max_range=4.0),
         # Assumption: one sensor in a hundred has failed.
         DeadSensors(probability=0.01),

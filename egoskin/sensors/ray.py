@@ -335,11 +335,16 @@ def _padded(directions: np.ndarray) -> np.ndarray:
     return np.pad(directions, [(0, 0)] * (directions.ndim - 1) + [(0, extra)], "edge")
 
 
+def _numpy_serves(x: Tensor) -> bool:
+    """Whether NumPy may work on a tensor's memory."""
+    return x.is_cpu and not x.requires_grad and not torch.compiler.is_compiling()
+
+
 def _nonzero(x: Tensor) -> Tensor:
     """Return the indices of the entries that are not 0, ``[n]``."""
-    if x.is_cpu:
+    if _numpy_serves(x):
         # PyTorch's takes several times as long.
-        return torch.from_numpy(np.flatnonzero(x.detach().numpy() != 0))
+        return torch.from_numpy(np.flatnonzero(x.numpy() != 0))
     return x.flatten().nonzero()[:, 0]
 
 
@@ -355,7 +360,7 @@ def _items(x: Tensor) -> np.ndarray:
 
 def _take(grid: Tensor, rows: Tensor) -> Tensor:
     """Return some rows of a grid."""
-    if not grid.is_cpu or grid.requires_grad:
+    if not _numpy_serves(grid):
         return grid[rows]
     found = _items(grid)[rows.numpy()]
     return torch.from_numpy(found.view(grid.numpy().dtype)).view(-1, *grid.shape[1:])
@@ -363,7 +368,7 @@ def _take(grid: Tensor, rows: Tensor) -> Tensor:
 
 def _put(grid: Tensor, rows: Tensor, values: Tensor) -> None:
     """Write some rows of a grid."""
-    if not grid.is_cpu or values.requires_grad or grid.requires_grad:
-        grid[rows] = values
-    else:
+    if _numpy_serves(grid) and not values.requires_grad:
         _items(grid)[rows.numpy()] = _items(values.contiguous())
+    else:
+        grid[rows] = values

@@ -2,11 +2,13 @@
 
 All of them read the measurements of a coverage, so that every signal goes with every
 coverage and whatever corrupts a measurement comes in between. A measurement of
-infinity means that nothing is in range; one of NaN (bad input) gives a signal of NaN.
+infinity means that nothing is in range, as does one beyond the range; one of NaN (bad
+input) gives a signal of NaN.
 """
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Literal
@@ -28,32 +30,68 @@ class _Reading(RowTransform):
     """A signal of one number for each measurement, in [0, 1].
 
     Args:
+        max_range: The range of the sensors [m], one or one for each; may be infinite.
+            A measurement beyond it finds nothing.
         validity: Whether the signal's second half says which measurements found
             anything, 1 or 0: a proximity of 1 may be an object at the range exactly.
         in_keys: Key of the measurements.
         out_keys: Key of the signal.
+
+    Raises:
+        ValueError: If a range is not positive.
     """
+
+    _range: Tensor
 
     def __init__(
         self,
+        max_range: float | Sequence[float],
         validity: bool,
         in_keys: Sequence[NestedKey],
         out_keys: Sequence[NestedKey],
     ) -> None:
         super().__init__(in_keys, out_keys)
+        limit = torch.as_tensor(max_range, dtype=torch.float64)
+        if not (limit > 0).all():
+            raise ValueError(f"max_range must be positive, got {max_range}")
+        self.register_buffer("_range", limit.reshape(-1))
         self.validity = validity
 
     def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
-        """Return the signal, ``[B, S ...]`` flattened."""
+        """Return the signal, ``[B, S ...]`` flattened.
+
+        Raises:
+            ValueError: If there are several ranges, but not one for each sensor.
+        """
+        ranges, sensors = len(self._range), inputs[0].shape[1]
+        if ranges > 1 and ranges != sensors:
+            raise ValueError(
+                f"{ranges} ranges do not fit the {sensors} sensors of "
+                f"{self.in_keys[0]!r}"
+            )
         distance = inputs[0].flatten(1)
         signal = self.signal(distance)
         if self.validity:
-            signal = torch.cat((signal, found(distance)), -1)
+            signal = torch.cat((signal, self.found(distance)), -1)
         return (signal,)
 
     @abstractmethod
     def signal(self, distance: Tensor) -> Tensor:
         """Return the signal of measurements [m], ``[B, n]`` each."""
+
+    def found(self, distance: Tensor) -> Tensor:
+        """Return 1 for what is measured in range, 0 for nothing, NaN for NaN."""
+        # Nothing is infinitely far, whatever the range.
+        limit = self._limits(distance).clamp(max=torch.finfo(distance.dtype).max)
+        inside = (distance <= limit).to(distance)
+        return torch.where(distance.isnan(), distance, inside)
+
+    def _limits(self, distance: Tensor) -> Tensor:
+        """Ranges [m] in the dtype of the measurements, ``[n]`` or one for all."""
+        limit = self._range.to(distance.dtype)
+        if len(limit) > 1:
+            limit = limit.repeat_interleave(distance.shape[1] // len(limit))
+        return limit
 
     def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
         """Return the spec of the signal."""
@@ -63,13 +101,8 @@ class _Reading(RowTransform):
         return (Bounded(0.0, 1.0, shape=shape, dtype=measured.dtype),)
 
 
-def found(distance: Tensor) -> Tensor:
-    """Return 1 where something is measured, 0 for nothing, NaN for NaN."""
-    return torch.where(distance.isnan(), distance, (distance < torch.inf).to(distance))
-
-
 class Proximity(_Reading):
-    """Distance over range: 0 at the sensor, 1 at the range and for nothing.
+    """Distance over range: 0 at the sensor, 1 at the range, beyond and for nothing.
 
     Reads ``distance [*B, S]`` or ``[*B, S, K]`` [m]; writes ``signal [*B, S K]``,
     sensor by sensor.
@@ -87,8 +120,6 @@ class Proximity(_Reading):
         ValueError: If a range is not positive.
     """
 
-    _scale: Tensor
-
     def __init__(
         self,
         max_range: float | Sequence[float],
@@ -98,33 +129,13 @@ class Proximity(_Reading):
         in_keys: Sequence[NestedKey] = ("distance",),
         out_keys: Sequence[NestedKey] = ("signal",),
     ) -> None:
-        super().__init__(validity, in_keys, out_keys)
-        scale = torch.as_tensor(max_range, dtype=torch.float64)
-        if not (scale > 0).all():
-            raise ValueError(f"max_range must be positive, got {max_range}")
-        self.register_buffer("_scale", scale.reshape(-1))
-        self._unlimited = bool(scale.isinf().any())
+        super().__init__(max_range, validity, in_keys, out_keys)
+        self._unlimited = bool(self._range.isinf().any())
         self.closeness = closeness
-
-    def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
-        """Return the signal, ``[B, S ...]`` flattened.
-
-        Raises:
-            ValueError: If there are several ranges, but not one for each sensor.
-        """
-        ranges, sensors = len(self._scale), inputs[0].shape[1]
-        if ranges > 1 and ranges != sensors:
-            raise ValueError(
-                f"{ranges} ranges do not fit the {sensors} sensors of "
-                f"{self.in_keys[0]!r}"
-            )
-        return super().compute(*inputs)
 
     def signal(self, distance: Tensor) -> Tensor:
         """Return the signal of measurements [m], ``[B, n]`` each."""
-        scale = self._scale.to(distance.dtype)
-        if len(scale) > 1:
-            scale = scale.repeat_interleave(distance.shape[1] // len(scale))
+        scale = self._limits(distance)
         # An infinite distance is nothing (1) whatever the range.
         limited = (distance / scale).clamp_(0.0, 1.0)
         if self._unlimited:
@@ -135,25 +146,77 @@ class Proximity(_Reading):
 
 
 class Binary(_Reading):
-    """Whether each measurement finds anything: 1 or 0.
+    """Whether each measurement finds anything in range: 1 or 0.
 
     Reads ``distance [*B, S]`` or ``[*B, S, K]`` [m]; writes ``signal [*B, S K]``.
 
     Args:
+        max_range: The range of the sensors [m], one or one for each. (Measurements
+            that are infinite beyond it, those of perfect sensors, need none.)
         in_keys: Key of the measurements.
         out_keys: Key of the signal.
+
+    Raises:
+        ValueError: If a range is not positive.
     """
 
     def __init__(
         self,
+        max_range: float | Sequence[float] = math.inf,
+        *,
         in_keys: Sequence[NestedKey] = ("distance",),
         out_keys: Sequence[NestedKey] = ("signal",),
     ) -> None:
-        super().__init__(False, in_keys, out_keys)
+        super().__init__(max_range, False, in_keys, out_keys)
 
     def signal(self, distance: Tensor) -> Tensor:
         """Return the signal of measurements [m], ``[B, n]`` each."""
-        return found(distance)
+        return self.found(distance)
+
+
+class SkinOrder(RowTransform):
+    """Signals of several groups of sensors as one, in the order of the skin.
+
+    Reads a signal for each group, ``[*B, n]`` of its sensors one after the other, and
+    writes ``signal [*B, N]``: the readings of the skin's first sensor, of its second
+    and so on, then their validity, if the signals have one.
+
+    Args:
+        groups: The sensors of each group, which together are all.
+        validity: Whether the second half of each signal tells of its validity.
+        in_keys: Key of the signal of each group.
+        out_keys: Key of the signal of all.
+    """
+
+    def __init__(
+        self,
+        groups: Sequence[Sequence[int]],
+        *,
+        validity: bool = False,
+        in_keys: Sequence[NestedKey],
+        out_keys: Sequence[NestedKey] = ("signal",),
+    ) -> None:
+        super().__init__(in_keys, out_keys)
+        self._groups = [list(group) for group in groups]
+        self._halves = 2 if validity else 1
+
+    def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """Return the signal of all, ``[B, N]``."""
+        # Which sensor, of which half, each number comes from.
+        sensors = sum(map(len, self._groups))
+        owners = []
+        for group, signal in zip(self._groups, inputs, strict=True):
+            each = signal.shape[1] // (self._halves * len(group))
+            owner = torch.tensor([group, [s + sensors for s in group]])[: self._halves]
+            owners.append(owner.flatten().repeat_interleave(each))
+        order = torch.cat(owners).argsort(stable=True).to(inputs[0].device)
+        return (torch.cat(inputs, -1)[:, order],)
+
+    def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
+        """Return the spec of the signal of all."""
+        size = sum(spec[key].shape[-1] for key in self.in_keys)
+        shape, dtype = torch.Size((*spec.shape, size)), spec[self.in_keys[0]].dtype
+        return (Bounded(0.0, 1.0, shape=shape, dtype=dtype),)
 
 
 class BeamMinimum(RowTransform):
@@ -187,10 +250,10 @@ class BeamMinimum(RowTransform):
 class Localization(RowTransform):
     """Position of the detected object nearest to the robot's centre frame.
 
-    Reads ``base_pose [*B, 7]``, ``object_pose [*B, O, 7]``, any number of
-    ``object_detected [*B, O]`` (an object counts if one of them says so) and, for a
-    centre other than the base, ``joint_pos [*B, J]``. Writes ``signal [*B, 3]`` [m],
-    zero if no sensor detects any object.
+    Reads ``base_pose [*B, 7]``, ``object_pose [*B, O, 7]``, ``joint_pos [*B, J]`` and
+    any number of ``object_detected [*B, O]`` (an object counts if one of them says
+    so). Writes ``signal [*B, 3]`` [m], zero if no sensor detects any object and NaN if
+    one does in a row that holds NaN: where the sensors are is then unknown.
 
     Args:
         scale: Divide the position by this [m] (the range, for values below about 1).
@@ -200,8 +263,8 @@ class Localization(RowTransform):
         centre: Link whose frame the position is given in, with the chain of the
             robot; None is the base.
         validity: Append for each slot whether it holds a detected object, 1 or 0.
-        in_keys: Keys of base pose, object pose, detections (one or more) and, with a
-            centre, last, joint positions.
+        in_keys: Keys of base pose, object pose, joint positions and detections (one
+            or more).
         out_keys: Key of the signal.
 
     Raises:
@@ -216,7 +279,10 @@ class Localization(RowTransform):
         yaw_only: bool = False,
         centre: tuple[pk.Chain, str] | None = None,
         validity: bool = False,
-        in_keys: Sequence[NestedKey] | None = None,
+        in_keys: Sequence[NestedKey] = (
+            *("base_pose", "object_pose", "joint_pos"),
+            "object_detected",
+        ),
         out_keys: Sequence[NestedKey] = ("signal",),
     ) -> None:
         if not scale > 0:
@@ -225,10 +291,6 @@ class Localization(RowTransform):
             raise ValueError(f"slots must be 'nearest' or 'all', got {slots!r}")
         if yaw_only and centre is not None:
             raise ValueError("yaw_only levels the base's axes: give no centre link")
-        if in_keys is None:
-            in_keys = ("base_pose", "object_pose", "object_detected")
-            if centre is not None:
-                in_keys = (*in_keys, "joint_pos")
         super().__init__(in_keys, out_keys)
         self.scale, self.slots, self.validity = scale, slots, validity
         self.yaw_only = yaw_only
@@ -239,9 +301,8 @@ class Localization(RowTransform):
 
     def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Return the signal, ``[B, 3]``, or more by slots and validity."""
-        base_pose, object_pose, *rest = inputs
-        joint_pos = rest.pop() if self._centre is not None else None
-        detected = torch.stack(rest).any(0)
+        base_pose, object_pose, joint_pos, *detections = inputs
+        detected = torch.stack(detections).any(0)
         offset_w = object_pose[..., :3] - base_pose[:, None, :3]
         quat = base_pose[:, None, 3:].expand(-1, offset_w.shape[1], -1)
         position = rotate_inverse(quat, offset_w)
@@ -251,19 +312,23 @@ class Localization(RowTransform):
         elif self._centre is not None:
             position = self._in_link(joint_pos, position)
             away = position.square().sum(-1)
+        # Bad joints leave open where the sensors are: 0 NaN = NaN.
+        position = position + 0.0 * joint_pos.sum(-1)[:, None, None]
         if self.slots == "nearest":
             nearest = away.masked_fill(~detected, torch.inf).argmin(-1, keepdim=True)
             position = position.gather(1, nearest[..., None].expand(-1, -1, 3))
             detected = detected.any(-1, keepdim=True)
         # A detected object of NaN stays NaN; what is not in play may be anywhere.
-        flag = detected.to(position.dtype)
-        signal = position.masked_fill(~detected[..., None], 0.0).flatten(1) / self.scale
-        return (torch.cat((signal, flag), -1) if self.validity else signal,)
+        seen = position.masked_fill(~detected[..., None], 0.0)
+        signal = seen.flatten(1) / self.scale
+        if self.validity:
+            flag = detected.to(signal.dtype) + 0.0 * seen.sum(-1)
+            signal = torch.cat((signal, flag), -1)
+        return (signal,)
 
-    def _in_link(self, joint_pos: Tensor | None, position: Tensor) -> Tensor:
+    def _in_link(self, joint_pos: Tensor, position: Tensor) -> Tensor:
         """Positions in the base frame, taken to the centre link's, ``[B, O, 3]``."""
         assert self._centre is not None
-        assert joint_pos is not None
         origin, rotation = self._centre.poses_b(joint_pos)
         x, y, z = (position - origin).unbind(-1)
         # p_link = R^T (p - o), written out: the same bits in every batch.

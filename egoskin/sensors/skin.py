@@ -132,7 +132,7 @@ class Skin:
     position: np.ndarray
     """Positions in the link frames [m], ``[S, 3]``."""
     normal: np.ndarray
-    """Outward unit normals in the link frames, ``[S, 3]``."""
+    """Outward unit normals in the link frames, ``[S, 3]``; as rounded as they come."""
     coverage: tuple[Coverage | None, ...] = ()
     """What each sensor sees, ``S`` of them; None leaves it to the configuration."""
     range: np.ndarray = field(default_factory=lambda: np.empty(0))
@@ -202,8 +202,11 @@ class Skin:
                 )
 
     def rotation(self) -> np.ndarray:
-        """Sensor frames in the link frames: columns x, y, z, ``[S, 3, 3]``."""
-        z = self.normal
+        """Sensor frames in the link frames: columns x, y, z, ``[S, 3, 3]``.
+
+        Orthonormal to rounding, whatever digits the normals were written with.
+        """
+        z = self.normal / np.linalg.norm(self.normal, axis=-1, keepdims=True)
         # x = normalise(z_link x n); parallel to z_link: x_link.
         x = np.cross([0.0, 0.0, 1.0], z)
         length = np.linalg.norm(x, axis=-1, keepdims=True)
@@ -215,6 +218,45 @@ class Skin:
         roll = np.radians(self.roll_deg)[:, None]
         c, s = np.cos(roll), np.sin(roll)
         return np.stack((c * x + s * y, c * y - s * x, z), axis=-1)
+
+    def misplaced(self, position_std: float, angle_std_deg: float, seed: int) -> Skin:
+        """Return the skin as it is mounted: every sensor a little off its place.
+
+        Args:
+            position_std: Standard deviation of each coordinate [m].
+            angle_std_deg: Standard deviation of the turn about each axis [deg].
+            seed: Seed of the errors.
+
+        Raises:
+            ValueError: If a deviation is negative or not finite.
+        """
+        error = {"position_std": position_std, "angle_std_deg": angle_std_deg}
+        for name, std in error.items():
+            if not 0 <= std < math.inf:
+                raise ValueError(f"{name} must be finite and not negative, got {std}")
+        rng = np.random.default_rng(seed)
+        shift = position_std * rng.standard_normal((len(self), 3))
+        turn = np.radians(angle_std_deg) * rng.standard_normal((len(self), 3))
+        angle = np.linalg.norm(turn, axis=-1)[:, None, None]
+        # Rodrigues: R = cos 1 + sin [k] + (1 - cos) k k^T.
+        k = turn / np.maximum(angle[:, 0], 1e-300)
+        cross = np.cross(k[:, None], np.eye(3)).transpose(0, 2, 1)
+        whole = np.cos(angle) * np.eye(3) + np.sin(angle) * cross
+        whole += (1 - np.cos(angle)) * k[:, :, None] * k[:, None]
+        x, _, normal = np.moveaxis(whole @ self.rotation(), -1, 0)
+        moved = replace(
+            self,
+            position=self.position + shift,
+            normal=normal,
+            roll_deg=np.zeros(len(self)),
+            provenance={
+                **self.provenance,
+                "misplaced": {**error, "seed": seed},
+            },
+        )
+        plain = moved.rotation()
+        roll = np.arctan2((x * plain[..., 1]).sum(-1), (x * plain[..., 0]).sum(-1))
+        return replace(moved, roll_deg=np.degrees(roll))
 
     def select(self, index: Sequence[int]) -> Skin:
         """Return the skin of some of the sensors, in the order given."""

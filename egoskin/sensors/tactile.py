@@ -46,6 +46,15 @@ def _matching(links: Sequence[str], patterns: Sequence[str]) -> Tensor:
     )
 
 
+def _check_links(tactile: Tensor, links: Tensor, key: NestedKey) -> None:
+    """Raise ValueError unless contacts have one entry for each link."""
+    if tactile.shape[-1] != len(links):
+        raise ValueError(
+            f"{key!r} holds {tactile.shape[-1]} contacts a row, the transform was "
+            f"made for {len(links)} links"
+        )
+
+
 class Tactile(RowTransform):
     """Whether each link is touched: its contact force is above a threshold.
 
@@ -119,6 +128,7 @@ class ContactPenalty(Transform):
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         tactile, reward = (next_tensordict[key] for key in self.in_keys)
+        _check_links(tactile, self._prices, self.in_keys[0])
         cost = tactile.to(reward.dtype) @ self._prices.to(reward.dtype)
         return next_tensordict.set(self.out_keys[0], reward - cost[..., None])
 
@@ -167,6 +177,7 @@ class ContactTermination(Transform):
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         tactile, *ends = (next_tensordict[key] for key in self.in_keys)
+        _check_links(tactile, self._counted, self.in_keys[0])
         touched = torch.any(tactile & self._counted, -1, keepdim=True)
         for key, end in zip(self.out_keys, ends, strict=True):
             next_tensordict.set(key, end | touched)
@@ -214,6 +225,7 @@ class ContactFree(StatefulTransform):
     ) -> Sequence[Tensor]:
         """Return whether the first state is free of contact, ``[B, 1]``."""
         (tactile,) = inputs
+        _check_links(tactile, self._counted, self.in_keys[0])
         return (~(tactile & self._counted).any(-1, keepdim=True),)
 
     def advance(

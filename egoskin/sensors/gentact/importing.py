@@ -124,7 +124,7 @@ def _metres(
     if unit is None:
         raise ValueError(
             f"{path}: a 3-D print export of an old version, whose unit is unknown; "
-            "give scale (--scale 0.001 for millimetres)"
+            "give scale (--scale 0.001 for millimetres, --scale 1 for metres)"
         )
     position = unit * np.array([s.position for s in export.sensors])
     length = np.linalg.norm(position, axis=-1)
@@ -135,7 +135,8 @@ def _metres(
         raise ValueError(
             f"{export.sensors[worst].where}: the sensor lies {length[worst]:.3g} m "
             f"from the origin of its link with {unit:g} m to the unit of the file; "
-            "give the right one as scale (--scale 0.001 for millimetres)"
+            "give the right one as scale (--scale 0.001 for millimetres, --scale 1 "
+            "for metres)"
         )
     return position, unit
 
