@@ -108,6 +108,29 @@ def test_rays_have_the_same_bits(
 
 
 @needs_compiler
+@pytest.mark.parametrize("per_object", [False, True])
+@pytest.mark.parametrize("shift", [0, 4], ids=["whole lines", "shifted"])
+def test_a_grid_larger_than_the_cache_has_the_same_bits(
+    skin, random_state, per_object, shift
+):
+    state = random_state(2200, seed=1, objects=2)
+    state["joint_pos"][7, 3] = math.nan
+    inputs = [state[key] for key in KEYS]
+    args = (skin, H1_2.chain, BALLS[:2], 1.0)
+    plain, fast = pair(RaySensor, *args, per_object=per_object)
+    expected = plain.compute(*inputs)
+    size = expected[0].numel()
+    assert 4 * size > 32 * 2**20
+    buffer = torch.full((shift + size + 100,), -1.0)
+    planes = (2, *expected[0].shape[:3]) if per_object else expected[0].shape
+    out = buffer[shift : shift + size].view(planes)
+    assert_same_bits(fast.compute(*inputs, out=out), expected)
+    # Nothing is written beside it.
+    assert (buffer[:shift] == -1).all()
+    assert (buffer[shift + size :] == -1).all()
+
+
+@needs_compiler
 def test_many_hits_find_room(skin, random_state):
     # From within a ball every beam hits: more than the first call has room for.
     plain, fast = pair(RaySensor, skin, H1_2.chain, [Sphere(radius=3)], math.inf)

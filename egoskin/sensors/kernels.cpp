@@ -17,6 +17,9 @@
 #include <numeric>
 #include <type_traits>
 #include <vector>
+#ifdef __SSE2__
+#include <emmintrin.h>
+#endif
 
 extern "C" {
 
@@ -163,9 +166,21 @@ void write_rows(const V<T> *numbers, int64_t count, int64_t rows, T *out,
   for (; i + W <= count; i += W) {
     V<T> tile[W];
     std::copy_n(numbers + i, W, tile);
+    // Rows are too many streams for the processor to foresee: two tiles ahead.
+    T *to = out + i;
+#pragma GCC unroll 16
+    for (int row = 0; row < W; row++)
+      __builtin_prefetch(to + row * stride + 2 * W, 1);
     transpose<T>(tile);
-    for (int64_t row = 0; row < rows; row++)
-      std::memcpy(out + row * stride + i, &tile[row], sizeof(tile[row]));
+    if (rows == W) {
+      // Unrolled, so that the tile stays in registers.
+#pragma GCC unroll 16
+      for (int row = 0; row < W; row++)
+        std::memcpy(to + row * stride, &tile[row], sizeof(tile[row]));
+    } else {
+      for (int64_t row = 0; row < rows; row++)
+        std::memcpy(to + row * stride, &tile[row], sizeof(tile[row]));
+    }
   }
   for (; i < count; i++)
     for (int64_t row = 0; row < rows; row++) out[row * stride + i] = numbers[i][row];
@@ -553,25 +568,85 @@ void rays(const Tables &t, const Inputs &in, uint8_t *detected, Begin begin,
   }
 }
 
+// A large grid, written from its first number to its last and past the cache, which
+// it would empty: so the processor need not read what it overwrites.
+template <class T> class Stream {
+public:
+  // Whether a grid is one to stream: far larger than a cache, and of whole lines.
+  static bool serves(const T *out, int64_t beams, int64_t size) {
+#ifdef __SSE2__
+    return size * sizeof(T) > MANY && beams * sizeof(T) % LINE == 0 &&
+           reinterpret_cast<uintptr_t>(out) % LINE == 0;
+#else
+    return false;
+#endif
+  }
+
+  explicit Stream(T *out) : next(out) {}
+
+  void fill(const T *end, T value) {
+    T line[LINE / sizeof(T)];
+    std::fill_n(line, LINE / sizeof(T), value);
+    while (next < end) write(line);
+  }
+
+  void copy(const T *from, int64_t count) {
+    for (const T *end = next + count; next < end; from += LINE / sizeof(T)) write(from);
+  }
+
+  // What was written is then seen by other threads, too.
+  static void finish() {
+#ifdef __SSE2__
+    _mm_sfence();
+#endif
+  }
+
+private:
+  static constexpr size_t MANY = 32 << 20, LINE = 64; // [bytes]
+  T *next;
+
+  void write(const T *line) {
+#ifdef __SSE2__
+    __m128i parts[LINE / 16];
+    std::memcpy(parts, line, LINE);
+    for (size_t i = 0; i < LINE / 16; i++)
+      _mm_stream_si128(reinterpret_cast<__m128i *>(next) + i, parts[i]);
+#endif
+    next += LINE / sizeof(T);
+  }
+};
+
 // The grid, or of each sensor the least.
 template <class T>
 void ray(const Tables &t, const Inputs &in, T *out, uint8_t *detected) {
   const T inf = std::numeric_limits<T>::infinity();
   const int64_t beams = t.reduce ? 1 : t.beams, size = t.sensors * beams;
+  const int64_t planes = t.apart ? t.objects : 1, plane = in.rows * size;
+  const bool stream = Stream<T>::serves(out, beams, planes * plane);
+  std::vector<Stream<T>> streams;
+  for (int64_t i = 0; i < planes; i++) streams.emplace_back(out + i * plane);
   rays<T>(
       t, in, detected,
       [&](int64_t row, int64_t count) {
-        for (int64_t object = 0; object < (t.apart ? t.objects : 1); object++)
-          std::fill_n(out + (object * in.rows + row) * size, count * size, inf);
+        for (int64_t i = 0; !stream && i < planes; i++)
+          std::fill_n(out + i * plane + row * size, count * size, inf);
       },
       [&](int64_t row, const Pair<T> &pair, const T *reading, T nearest) {
-        int64_t at = (t.apart ? pair.object * in.rows : 0) + row;
-        T *place = out + at * size + pair.sensor * beams;
-        if (t.reduce)
+        const int64_t i = t.apart ? pair.object : 0;
+        T *place = out + i * plane + row * size + pair.sensor * beams;
+        if (stream) {
+          streams[i].fill(place, inf);
+          streams[i].copy(reading, beams);
+        } else if (t.reduce) {
           *place = nearest;
-        else
+        } else {
           std::copy_n(reading, beams, place);
+        }
       });
+  if (stream) {
+    for (int64_t i = 0; i < planes; i++) streams[i].fill(out + (i + 1) * plane, inf);
+    Stream<T>::finish();
+  }
 }
 
 // RaySensor.hits: places in the grid, ascending, and readings; returns their number,
