@@ -277,6 +277,16 @@ def test_without_a_desired_divergence_the_learning_rate_stays():
     assert "kl" not in metrics
 
 
+def test_the_state_of_another_optimiser_is_refused():
+    agent = bandit_agent()
+    one = PPO(agent, PPOConfig())
+    one.update(bandit_rollout(agent))
+    state = one.state()
+    state["0/exp_avg"] = state["0/exp_avg"][1:]
+    with pytest.raises(ValueError, match="other networks"):
+        PPO(agent, PPOConfig()).load_state(state, 1e-3)
+
+
 def test_an_adapted_learning_rate_is_restored():
     agent = bandit_agent()
     ppo = PPO(agent, PPOConfig(desired_kl=1e-9))

@@ -304,10 +304,10 @@ class PPO:
             functional=False,
         )
         self.loss.set_keys(sample_log_prob="action_log_prob")
-        self._actor = [p for p in agent.actor.parameters() if p.requires_grad]
-        self._critic = [p for p in agent.critic.parameters() if p.requires_grad]
+        self._weights = [*_weights(agent.actor), *_weights(agent.critic)]
+        self._actor, self._critic = _joint(agent.actor), _joint(agent.critic)
         self.optimizer = torch.optim.Adam(
-            [*self._actor, *self._critic], lr=config.learning_rate, eps=1e-5, fused=True
+            [self._actor, self._critic], lr=config.learning_rate, eps=1e-5, fused=True
         )
         threads = torch.get_num_threads()
         on_cpu = agent.head.log_std.device.type == "cpu"
@@ -332,11 +332,21 @@ class PPO:
         return {f"{i}/{key}": v for i, state in states for key, v in state.items()}
 
     def load_state(self, tensors: Mapping[str, Tensor], learning_rate: float) -> None:
-        """Put the optimiser into a state that `state` returned."""
+        """Put the optimiser into a state that `state` returned.
+
+        Raises:
+            ValueError: If it is that of other networks.
+        """
         content = self.optimizer.state_dict()
         for name, value in tensors.items():
             index, key = name.split("/")
             content["state"].setdefault(int(index), {})[key] = value
+        moments = [state["exp_avg"].shape for state in content["state"].values()]
+        if moments and moments != [self._actor.shape, self._critic.shape]:
+            raise ValueError(
+                "the state of the optimiser is one of other networks, or of an older "
+                "egoskin"
+            )
         self.optimizer.load_state_dict(content)
         self.learning_rate = learning_rate
 
@@ -410,18 +420,21 @@ class PPO:
         mode = set_exploration_type(self.loss.deterministic_sampling_mode)
         with mode, set_recurrent_mode(True):
             results = list(self._pool.map(partial(self._gradients, data), shares))
-        parameters = [*self._actor, *self._critic]
         weights = [len(share) / len(index) for share in shares]
 
         def mean(values: Iterable[Tensor]) -> Tensor:
             return _total(w * v for w, v in zip(weights, values, strict=True))
 
         metrics = {name: mean(r[1][name] for r in results) for name in results[0][1]}
-        for parameter, *parts in zip(parameters, *(r[0] for r in results), strict=True):
-            parameter.grad = mean(parts)
-        limit = self.config.max_grad_norm
-        actor_norm = nn.utils.clip_grad_norm_(self._actor, limit)
-        critic_norm = nn.utils.clip_grad_norm_(self._critic, limit)
+        networks = (self._actor, self._critic)
+        gradient = mean(r[0] for r in results).split([len(n) for n in networks])
+        norms = []
+        for network, part in zip(networks, gradient, strict=True):
+            assert network.grad is not None
+            network.grad.copy_(part)
+            limit = self.config.max_grad_norm
+            norms.append(nn.utils.clip_grad_norm_(network, limit))
+        actor_norm, critic_norm = norms
         # A loss that is not finite shows in a gradient norm that is not.
         if not torch.isfinite(actor_norm + critic_norm):
             losses = (f"{k} {float(v)}" for k, v in metrics.items() if "loss" in k)
@@ -431,7 +444,7 @@ class PPO:
                 _rows(data, index),
             )
         self.optimizer.step()
-        norm = nn.utils.get_total_norm(parameters)
+        norm = nn.utils.get_total_norm(networks)
         if not torch.isfinite(norm):
             raise NonFiniteError(
                 f"norm of the weights {float(norm)}", _rows(data, index)
@@ -445,19 +458,23 @@ class PPO:
 
     def _gradients(
         self, data: TensorDictBase, index: Tensor
-    ) -> tuple[Sequence[Tensor], dict[str, Tensor]]:
-        """Return gradients and metrics of the mean loss of some rows."""
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the gradient and metrics of the mean loss of some rows.
+
+        Returns:
+            The gradient of all weights, one after the other, and metrics by name.
+        """
         batch = _rows(data.exclude("loc", "scale"), index)
         losses = self.loss(batch)
         total = _total(v for k, v in losses.items() if k.startswith("loss_"))
-        gradients = torch.autograd.grad(total, [*self._actor, *self._critic])
+        gradients = torch.autograd.grad(total, self._weights)
         metrics = {
             "loss_actor": losses["loss_objective"].detach(),
             "loss_critic": losses["loss_critic"].detach(),
             "entropy": losses["entropy"],
             "clip_fraction": losses["clip_fraction"],
         }
-        return gradients, metrics
+        return torch.cat([g.flatten() for g in gradients]), metrics
 
     @torch.no_grad()
     def _divergence(self, data: TensorDictBase, index: Tensor) -> float:
@@ -483,6 +500,27 @@ def gaussian_kl(loc0: Tensor, scale0: Tensor, loc1: Tensor, scale1: Tensor) -> T
     # log(s1/s0) + (s0^2 + (m0 - m1)^2) / (2 s1^2) - 1/2
     ratio = (scale0.square() + (loc0 - loc1).square()) / (2 * scale1.square())
     return ((scale1 / scale0).log() + ratio - 0.5).sum(-1)
+
+
+def _weights(network: nn.Module) -> list[nn.Parameter]:
+    """Return what is learnt of a network."""
+    return [p for p in network.parameters() if p.requires_grad]
+
+
+def _joint(network: nn.Module) -> nn.Parameter:
+    """Return what is learnt of a network as one vector, whose parts the layers share.
+
+    An optimiser then takes one step, not one for each layer, for each of which it
+    wakes its threads: a twelfth of an update. Gradients are shared, too.
+    """
+    weights = _weights(network)
+    vector = nn.Parameter(nn.utils.parameters_to_vector(weights).detach())
+    nn.utils.vector_to_parameters(vector.detach(), weights)
+    vector.grad = torch.zeros_like(vector)
+    parts = vector.grad.split([weight.numel() for weight in weights])
+    for weight, part in zip(weights, parts, strict=True):
+        weight.grad = part.view_as(weight)
+    return vector
 
 
 def _total(values: Iterable[Tensor]) -> Tensor:
