@@ -27,12 +27,14 @@ class ProgressLine:
     def update(self, metrics: Mapping[str, float]) -> None:
         """Show the state after a rollout."""
         now, frames = time.monotonic(), metrics["frames"]
+        # Before any episode was old enough there is none to tell of.
+        success = f"{metrics['episode/success']:6.1%}".replace("nan%", "   -")
         text = (
             f"{frames / 1e6:8.2f} M / {self._total / 1e6:.1f} M frames  "
             f"{frames / self._total:6.1%}  ETA {self._left(now, frames)}  "
             f"{metrics['time/steps_per_s']:8,.0f} steps/s  "
             f"survival {metrics['episode/survival_s']:5.2f} s  "
-            f"success {metrics['episode/success']:6.1%}  "
+            f"success {success}  "
             f"reward {metrics['reward/mean']:+.4f}"
         )
         for name, what in (
