@@ -71,7 +71,7 @@ class TrainConfig:
     """Share of its price (`task.reward.drift_distance`) that the distance from the
     start costs at first: dodging is found sooner where drift is cheap, and where it
     stays cheap a robot that leaps about blindly does as well as one that feels."""
-    drift_frames: tuple[int, int] = (17_000_000, 25_000_000)
+    drift_frames: tuple[int, int] = (6_000_000, 14_000_000)
     """Environment steps up to which it costs that share, and from which on all; a
     share that grows in between (a curriculum). (0, 0): all from the start, as in the
     paper."""
