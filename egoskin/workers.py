@@ -40,9 +40,10 @@ from torchrl.envs import EnvBase, ParallelEnv, Transform, TransformedEnv
 from egoskin import watchdog
 from egoskin.watchdog import Watch
 
-# How long the parent sleeps between looks at its workers: at least this [s], and this
-# share of the time it has waited. It adds as much to a step, and costs no CPU.
-_POLL, _POLL_SHARE = 2e-4, 0.01
+# How long the parent sleeps between looks at its workers: first this share of the time
+# that the last step took, then at least this [s], and this share of the time it has
+# waited since. That adds as much to a step; more looks take CPU from the workers.
+_SURE_SHARE, _POLL, _POLL_SHARE = 0.75, 2e-4, 0.01
 # The server tells of a death soon after the channel of the dead closes [s].
 _DEATH_NOTICE = 5.0
 
@@ -206,6 +207,7 @@ class WorkerPool(ParallelEnv):
 
     def __init__(self, builders: Sequence[Callable[[], EnvBase]]) -> None:
         self._reports = Path(tempfile.mkdtemp(dir=_temporary_folder()))
+        self._last_step = 0.0
         keep_freed_memory()
         threads = torch.get_num_threads()
         super().__init__(
@@ -292,8 +294,10 @@ class WorkerPool(ParallelEnv):
     def _wait_for_workers(self, workers_range: Iterable[int]) -> None:
         """Sleep until the workers have set their flags; raise if one cannot."""
         workers, flags = list(workers_range), self._shm_done_flags
-        indices = self._worker_indices
+        indices, begin = self._worker_indices, time.monotonic()
+        time.sleep(min(_SURE_SHARE * self._last_step, watchdog.INTERVAL))
         self._wait(workers, lambda worker: bool(flags[indices[worker]]))
+        self._last_step = time.monotonic() - begin
         for worker in workers:
             flags[indices[worker]] = 0
 
