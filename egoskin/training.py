@@ -18,9 +18,10 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from egoskin.agents.networks import Agent
-from egoskin.agents.ppo import PPO, NonFiniteError, collect
+from egoskin.agents.ppo import PPO, NonFiniteError
 from egoskin.checkpoint import part, prefixed, save_tensors
 from egoskin.cli import to_plain
+from egoskin.collection import collect
 from egoskin.envs.dodgeball import Ease
 from egoskin.envs.rewards import TERMS
 from egoskin.make import load_env_state, make_env, save_env_state

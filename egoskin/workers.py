@@ -20,6 +20,7 @@ import tempfile
 import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from multiprocessing import (
     forkserver,
@@ -30,7 +31,7 @@ from multiprocessing import (
 )
 from pathlib import Path
 from threading import Event, Thread
-from typing import NoReturn
+from typing import NoReturn, TypeVar
 
 import torch
 from tensordict import TensorDictBase
@@ -47,6 +48,8 @@ _SURE_SHARE, _POLL, _POLL_SHARE = 0.75, 2e-4, 0.01
 # The server tells of a death soon after the channel of the dead closes [s].
 _DEATH_NOTICE = 5.0
 
+
+T = TypeVar("T")
 
 # Numbers of glibc mallopt, and the threshold that every version of it takes [bytes].
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _MMAP_MOST = -1, -3, 2**25
@@ -207,7 +210,8 @@ class WorkerPool(ParallelEnv):
 
     def __init__(self, builders: Sequence[Callable[[], EnvBase]]) -> None:
         self._reports = Path(tempfile.mkdtemp(dir=_temporary_folder()))
-        self._last_step = 0.0
+        self._num_all, self._last_step = len(builders), 0.0
+        self._halves: list[WorkerPool] = []
         keep_freed_memory()
         threads = torch.get_num_threads()
         super().__init__(
@@ -217,6 +221,30 @@ class WorkerPool(ParallelEnv):
         )
         # TorchRL lowers the parent's threads for good when the workers start.
         self.num_threads = threads
+
+    def halves(self) -> list[WorkerPool]:
+        """Return what may be stepped at the same time, in the order of the workers.
+
+        That is each half of the workers, or this where they are odd in number.
+        """
+        if self.num_workers % 2:
+            return [self]
+        if not self._halves:
+            middle = self.num_workers // 2
+            self._halves = [self._part(p) for p in (slice(middle), slice(middle, None))]
+        return self._halves
+
+    def _part(self, workers: slice) -> WorkerPool:
+        """Return TorchRL's view of some workers, without its lazy stacks.
+
+        Those take an operation for each row.
+        """
+        part = self[workers]
+        assert isinstance(part, WorkerPool)
+        shared = part.shared_tensordict_parent = self.shared_tensordict_parent[workers]
+        part._shared_tensordict_parent_next = shared.get("next")
+        part._shared_tensordict_parent_root = shared.exclude("next", *part.reset_keys)
+        return part
 
     def simulation_state(self) -> dict[str, Tensor]:
         """Return the state of all rows, in the order of the workers."""
@@ -265,7 +293,9 @@ class WorkerPool(ParallelEnv):
         start_server()
         self._reports.mkdir(exist_ok=True)
         started = Event()
-        self._workers, self._hung = [], {}
+        self._workers, self._hung, self._halves = [], {}, []
+        # The halves share this list.
+        self._failures: list[str] = []
         watch = Thread(target=self._watch_start, args=(started,), daemon=True)
         watch.start()
         try:
@@ -306,6 +336,8 @@ class WorkerPool(ParallelEnv):
         watches = {worker: Watch(self._workers[worker].pid) for worker in workers}
         begin = looked = time.monotonic()
         while watches := {i: w for i, w in watches.items() if not answered(i)}:
+            if self._failures:
+                raise WorkerError(self._failures[0])
             now = time.monotonic()
             if now - looked > watchdog.INTERVAL:
                 looked = now
@@ -343,7 +375,7 @@ class WorkerPool(ParallelEnv):
     def _death(self, worker: int) -> str:
         if worker in self._hung:
             return f"hung while it started: {self._hung[worker]}"
-        report = self._report(worker)
+        report = self._report(self._worker_indices[worker])
         if report.exists():
             return f"raised\n{report.read_text()}"
         code = self._workers[worker].exitcode
@@ -352,9 +384,11 @@ class WorkerPool(ParallelEnv):
         return f"ended with exit status {code}"
 
     def _fail(self, worker: int, reason: str) -> NoReturn:
-        """End all workers and raise."""
+        """End the workers and raise; the other half then does, too."""
+        number = self._worker_indices[worker]
+        self._failures.append(f"worker {number} of {self._num_all} {reason}")
         self._end()
-        raise WorkerError(f"worker {worker} of {self.num_workers} {reason}")
+        raise WorkerError(self._failures[0])
 
     def _end(self) -> None:
         """Kill all workers."""
@@ -366,7 +400,8 @@ class WorkerPool(ParallelEnv):
             channel.close()
         # Nothing is left to close; TorchRL would wait for answers that never come.
         self.is_closed = True
-        shutil.rmtree(self._reports, ignore_errors=True)
+        if self._owns_workers:
+            shutil.rmtree(self._reports, ignore_errors=True)
 
     def close(self, *, raise_if_closed: bool = False) -> None:
         """End the workers; closing twice is allowed."""
@@ -376,3 +411,34 @@ class WorkerPool(ParallelEnv):
             else:
                 self._end()
         shutil.rmtree(self._reports, ignore_errors=True)
+
+
+def in_halves(
+    env: EnvBase,
+    root: TensorDictBase,
+    run: Callable[[EnvBase, TensorDictBase, slice], T],
+) -> list[T]:
+    """Let both halves of an environment's workers go on at the same time.
+
+    Each half is stepped while another thread reads what the other half gave: no core
+    is idle between two steps, and no worker waits for a slower one.
+
+    Args:
+        env: Batched environment; all of it is one half if it has no two.
+        root: Tensordict to start from.
+        run: Is given a half, what of ``root`` is that half's, and its rows.
+
+    Returns:
+        What was returned for each half.
+    """
+    halves = env.halves() if isinstance(env, WorkerPool) else [env]
+    if len(halves) == 1:
+        return [run(env, root, slice(0, root.numel()))]
+    threads = max(torch.get_num_threads() // len(halves), 1)
+    roots = root.chunk(len(halves))
+    ends = torch.tensor([half.numel() for half in roots]).cumsum(0).tolist()
+    rows = map(slice, [0, *ends], ends)
+    with ThreadPoolExecutor(
+        len(halves), "collector", torch.set_num_threads, (threads,)
+    ) as pool:
+        return list(pool.map(run, halves, roots, rows))

@@ -17,9 +17,9 @@ from egoskin.agents.ppo import (
     NonFiniteError,
     PPOConfig,
     add_advantages,
-    collect,
     gaussian_kl,
 )
+from egoskin.collection import collect
 
 
 class CountingEnv(EnvBase):

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 
 from egoskin.agents.networks import Agent, NetworkConfig, SignalNorm
-from egoskin.agents.ppo import PPO, PPOConfig, collect
+from egoskin.agents.ppo import PPO, PPOConfig
+from egoskin.collection import collect
 from egoskin.make import EnvConfig, make_env
 from egoskin.policies import (
     PolicySpec,

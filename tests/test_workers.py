@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from functools import partial
 from pathlib import Path
@@ -28,7 +29,12 @@ from egoskin.make import (
 from egoskin.robots import H1_2
 from egoskin.sensors import place_sensors
 from egoskin.sensors.config import SensorConfig
-from egoskin.workers import WorkerError, WorkerPool, default_num_workers
+from egoskin.workers import (
+    WorkerError,
+    WorkerPool,
+    default_num_workers,
+    in_halves,
+)
 
 NUM_ENVS = 32
 
@@ -155,6 +161,42 @@ def test_a_killed_worker_is_named_with_its_signal(skin):
         pool.step_and_maybe_reset(root)
     assert time.monotonic() - start < 10
     assert not any(process.is_alive() for process in processes)
+    pool.close()
+
+
+def test_both_halves_end_when_a_worker_of_one_is_killed(skin):
+    pool = make_pool(skin, 4)
+
+    def run(half, root, rows: slice) -> None:
+        for i in range(1000):
+            if i == 3 and rows.start:
+                os.kill(half._workers[1].pid, signal.SIGKILL)
+            root["action"] = torch.zeros(*root.batch_size, 21)
+            _, root = half.step_and_maybe_reset(root)
+
+    root, start = pool.reset(), time.monotonic()
+    with pytest.raises(WorkerError, match="worker 3 of 4 was killed by SIGKILL"):
+        in_halves(pool, root, run)
+    assert time.monotonic() - start < 10
+    pool.close()
+    assert not any(process.is_alive() for process in pool._workers)
+
+
+def test_neither_half_waits_for_the_other(skin):
+    pool, met = make_pool(skin, 2), threading.Event()
+
+    def run(half, root, rows: slice) -> tuple[int, int]:
+        for _ in range(3):
+            root["action"] = torch.zeros(*root.batch_size, 21)
+            _, root = half.step_and_maybe_reset(root)
+        # The first waits in the middle until the second is at its end.
+        met.set() if rows.start else met.wait(30)
+        assert met.is_set()
+        root["action"] = torch.zeros(*root.batch_size, 21)
+        half.step_and_maybe_reset(root)
+        return rows.start, rows.stop
+
+    assert in_halves(pool, pool.reset(), run) == [(0, 16), (16, 32)]
     pool.close()
 
 

@@ -1,22 +1,16 @@
-"""Proximal policy optimisation: collection, advantages, update.
-
-Contract: a rollout keeps the values it bootstraps from, not the next observations;
-the value of a time-out is taken from the terminal observation, before the reset.
-"""
+"""Proximal policy optimisation: advantages and the update on a rollout."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
 
 import torch
 from tensordict import NonTensorData, TensorDict, TensorDictBase
 from torch import Tensor, nn
-from torchrl.envs import EnvBase
 from torchrl.envs.utils import set_exploration_type
 from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import ClipPPOLoss
@@ -129,116 +123,6 @@ class PPOConfig:
         if self.entropy_frames is None:
             return self.entropy_coeff
         return self.entropy_coeff * max(0.0, 1.0 - frames / self.entropy_frames)
-
-
-@torch.no_grad()
-def collect(
-    env: EnvBase,
-    agent: Agent,
-    root: TensorDictBase,
-    num_steps: int,
-    info_keys: Sequence[str] = (),
-    noise_correlation: float = 0.0,
-) -> tuple[TensorDict, TensorDictBase, list[TensorDict]]:
-    """Step an environment with an agent; return what PPO needs.
-
-    Args:
-        env: Batched environment; its batch ``[*B]`` is flattened to ``N`` rows.
-        agent: Chooses the actions, on its own device.
-        root: Tensordict to start from.
-        num_steps: Number of steps ``T``.
-        info_keys: What else to keep of what the environment says, for metrics.
-        noise_correlation: Of the noise with that of the step before.
-
-    Returns:
-        The rollout ``[T, N]`` with the agent's ``inputs``, what it normalises, and
-        ``action``, ``action_log_prob``, ``loc``, ``scale``, ``state_value``,
-        ``next_state_value``, ``reward``, ``done``, ``terminated``, on its device; the
-        tensordict to go on from; and for each step the entries asked for.
-    """
-    device = agent.head.log_std.device
-    frames, bootstraps, infos = [], [], []
-    noise: Tensor | None = None
-    for _ in range(num_steps):
-        features = _features(agent, root, device)
-        frame = agent.encode(features)
-        agent.actor(frame)
-        if noise_correlation:
-            noise = _correlate(agent, frame, noise, noise_correlation)
-        root["action"] = frame["action"].reshape(*root.batch_size, -1).to(root.device)
-        step, root = env.step_and_maybe_reset(root)
-        after = step["next"].reshape(-1)
-        for key in ("reward", "done", "terminated"):
-            frame[key] = after[key].to(device)
-        # For the statistics.
-        frames.append(frame.update(features.select(*agent.norms)))
-        bootstraps.append(_timeout_values(agent, after, device))
-        infos.append(after.select(*info_keys))
-    features = _features(agent, root, device)
-    following = agent.critic(agent.encode(features))["state_value"]
-    flat = agent.critic(_joined(frames))
-    rollout = flat.reshape(num_steps, -1)
-    next_value = torch.cat((rollout["state_value"][1:], following[None]))
-    for t, (rows, values) in enumerate(bootstraps):
-        next_value[t, rows] = values
-    rollout["next_state_value"] = next_value
-    return rollout, root, infos
-
-
-def _features(agent: Agent, root: TensorDictBase, device: torch.device) -> TensorDict:
-    """Return what the agent's networks read, ``[N]``, on its device."""
-    return agent.sense(root.select(*agent.read_keys).reshape(-1).to(device))
-
-
-def _correlate(
-    agent: Agent, frame: TensorDict, before: Tensor | None, correlation: float
-) -> Tensor:
-    """Let the noise of a frame's actions go on from that of the step before.
-
-    Each step's action is distributed as without, and has that log-probability: what
-    is learnt is what a shift that lasts as long as the noise would do.
-
-    Args:
-        agent: Chose the actions.
-        frame: Holds ``action``, ``loc`` and ``scale``; the action and its
-            ``action_log_prob`` are replaced.
-        before: What this returned at the step before, ``[N, J]``; None at the first.
-        correlation: Of the noise with that of the step before.
-
-    Returns:
-        The noise in standard deviations, ``[N, J]``.
-    """
-    noise = (frame["action"] - frame["loc"]) / frame["scale"]
-    if before is not None:
-        # AR(1), whose variance stays 1.
-        noise = correlation * before + (1 - correlation**2) ** 0.5 * noise
-        frame["action"] = frame["loc"] + frame["scale"] * noise
-        likelihood = agent.actor.build_dist_from_params(frame)
-        frame["action_log_prob"] = likelihood.log_prob(frame["action"])
-    return noise
-
-
-def _joined(frames: Sequence[TensorDict]) -> TensorDict:
-    """Return frames ``[N]`` one after the other, ``[T N]``."""
-    joined = TensorDict(batch_size=[sum(map(len, frames))], device=frames[0].device)
-    for key, value in frames[0].items(True):
-        parts: list[Any] = [frame[key] for frame in frames]
-        if isinstance(value, NonTensorData):
-            joined.set_non_tensor(key, SparseRows.cat(parts))
-        elif isinstance(value, Tensor):
-            joined[key] = torch.cat(parts)
-    return joined
-
-
-def _timeout_values(
-    agent: Agent, after: TensorDictBase, device: torch.device
-) -> tuple[Tensor, Tensor]:
-    """Rows that ended without termination, and the values of their last states."""
-    ended = (after["done"] & ~after["terminated"])[:, 0].nonzero()[:, 0]
-    if not len(ended):
-        return ended.to(device), torch.zeros(0, 1, device=device)
-    terminal = agent.sense(after.select(*agent.read_keys)[ended].to(device))
-    return ended.to(device), agent.critic(agent.encode(terminal))["state_value"]
 
 
 def add_advantages(

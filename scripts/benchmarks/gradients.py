@@ -13,7 +13,8 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from benchmarks.report import Row, show
-from egoskin.agents.ppo import PPO, add_advantages, collect
+from egoskin.agents.ppo import PPO, add_advantages
+from egoskin.collection import collect
 from egoskin.runs import Run
 from egoskin.training import open_trainer
 

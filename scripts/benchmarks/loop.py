@@ -20,8 +20,9 @@ from torchrl.envs import EnvBase
 
 from benchmarks.report import Row, show
 from egoskin.agents.networks import RunningNorm
-from egoskin.agents.ppo import PPO, PPOConfig, collect
+from egoskin.agents.ppo import PPO, PPOConfig
 from egoskin.checkpoint import part
+from egoskin.collection import collect
 from egoskin.compilation import can_compile
 from egoskin.envs.dodgeball import DodgeballEnv
 from egoskin.envs.physics import Physics
@@ -33,7 +34,7 @@ from egoskin.make import (
     save_env_state,
 )
 from egoskin.policies import PolicySpec, sparse_sources
-from egoskin.workers import WorkerPool
+from egoskin.workers import WorkerPool, in_halves
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,7 +113,7 @@ class RecordingEnv(DodgeballEnv):
     physics_class = Recording
 
 
-Layer = tuple[Callable[[], Any], Callable[[Any], None]]
+Layer = tuple[Callable[[], Any], Callable[[Any], object]]
 """What makes a layer ready, and what is timed."""
 
 
@@ -209,13 +210,13 @@ class _Loop:
     def _restore(self, pool: WorkerPool) -> TensorDictBase:
         return load_env_state(pool, self._start)
 
-    def _replay(self, env: EnvBase) -> Callable[[TensorDictBase], None]:
-        def run(root: TensorDictBase) -> None:
-            for action in self._actions.reshape(self._steps, *root.batch_size, -1):
-                root["action"] = action
+    def _replay(self, env: EnvBase) -> Callable[[TensorDictBase], object]:
+        def run(env: EnvBase, root: TensorDictBase, rows: slice) -> None:
+            for action in self._actions[:, rows]:
+                root["action"] = action.reshape(*root.batch_size, -1)
                 _, root = env.step_and_maybe_reset(root)
 
-        return run
+        return lambda root: in_halves(env, root, run)
 
     def _collect(self, root: TensorDictBase) -> None:
         collect(self._pool, self._agent, root, self._steps)
