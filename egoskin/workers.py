@@ -432,12 +432,12 @@ def in_halves(
         What was returned for each half.
     """
     halves = env.halves() if isinstance(env, WorkerPool) else [env]
-    if len(halves) == 1:
-        return [run(env, root, slice(0, root.numel()))]
-    threads = max(torch.get_num_threads() // len(halves), 1)
     roots = root.chunk(len(halves))
-    ends = torch.tensor([half.numel() for half in roots]).cumsum(0).tolist()
+    ends = [(i + 1) * root.numel() // len(halves) for i in range(len(halves))]
     rows = map(slice, [0, *ends], ends)
+    # As many of PyTorch's threads for each, be there two halves or one: with more, the
+    # last bits of a sum may differ.
+    threads = max(torch.get_num_threads() // 2, 1)
     with ThreadPoolExecutor(
         len(halves), "collector", torch.set_num_threads, (threads,)
     ) as pool:
