@@ -270,9 +270,14 @@ def analyse(
     """
     if not coverages or not ranges:
         raise ValueError("an analysis needs at least one coverage and one range")
-    every = [*ranges, *skin.range[~np.isnan(skin.range)].tolist()]
-    if not all(0 < r < math.inf for r in every):
-        raise ValueError(f"ranges must be positive and finite, got {every}")
+    if not all(0 < r < math.inf for r in ranges):
+        raise ValueError(f"ranges must be positive and finite, got {list(ranges)}")
+    if np.isinf(skin.range).any():
+        sensor = int(np.isinf(skin.range).argmax())
+        raise ValueError(
+            f"sensor {sensor} of the skin has an infinite range: there are no seconds "
+            "of warning of what is always in sight"
+        )
     check_seed(seed)
     if num_throws < 1:
         raise ValueError(f"num_throws must be at least 1, got {num_throws}")

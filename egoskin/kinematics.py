@@ -237,10 +237,10 @@ def _matrix(transform: pk.Transform3d | None) -> np.ndarray:
 
 
 def quat_to_matrix(quat: Tensor) -> Tensor:
-    """Return the rotation matrix of unit quaternions (w, x, y, z).
+    """Return the rotation matrix of quaternions (w, x, y, z) of any length.
 
     Args:
-        quat: Unit quaternions, ``[*B, 4]``.
+        quat: Quaternions, ``[*B, 4]``; zero gives NaN.
 
     Returns:
         Rotation matrices, ``[*B, 3, 3]``.
@@ -252,19 +252,21 @@ def quat_to_entries(quat: Sequence[Tensor]) -> tuple[Tensor, ...]:
     """Return the nine entries of `quat_to_matrix`, row by row.
 
     Args:
-        quat: w, x, y, z of unit quaternions, of one shape.
+        quat: w, x, y, z of quaternions, of one shape.
     """
     w, x, y, z = quat
+    # 2 for a unit quaternion.
+    s = 2 / (w * w + x * x + y * y + z * z)
     return (
-        1 - 2 * (y * y + z * z),
-        2 * (x * y - w * z),
-        2 * (x * z + w * y),
-        2 * (x * y + w * z),
-        1 - 2 * (x * x + z * z),
-        2 * (y * z - w * x),
-        2 * (x * z - w * y),
-        2 * (y * z + w * x),
-        1 - 2 * (x * x + y * y),
+        1 - s * (y * y + z * z),
+        s * (x * y - w * z),
+        s * (x * z + w * y),
+        s * (x * y + w * z),
+        1 - s * (x * x + z * z),
+        s * (y * z - w * x),
+        s * (x * z - w * y),
+        s * (y * z + w * x),
+        1 - s * (x * x + y * y),
     )
 
 

@@ -39,6 +39,24 @@ def signal(config: SensorConfig, skin: Skin, state: TensorDict) -> torch.Tensor:
     return stored["signal"][:, 0]
 
 
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        ({"corruption": "acoustic"}, "corruption"),
+        ({"occlusion": True}, "occlusion"),
+        ({"per_object": True}, "per_object"),
+        ({"validity": True}, "validity"),
+        ({"reduce": "min"}, "reduce"),
+        ({"signal": "localization"}, "signal=localization"),
+    ],
+)
+@pytest.mark.parametrize("coverage", ["none", "oracle"])
+def test_what_needs_a_skin_is_refused_without_one(coverage, options, named):
+    text = f"{named} has no effect with coverage={coverage}"
+    with pytest.raises(ValueError, match=text):
+        SensorConfig(coverage=coverage, **options)
+
+
 @pytest.mark.parametrize("options", [{}, {"per_object": True}, {"reduce": "min"}])
 @pytest.mark.parametrize("kind", ["proximity", "binary"])
 def test_a_mixed_skin_signals_sensor_by_sensor(mixed, random_state, kind, options):

@@ -10,6 +10,7 @@ import torch
 
 from egoskin.robots import H1_2
 from egoskin.sensors import FieldSensor, Ray, RaySensor
+from egoskin.shapes import Sphere
 from sensing import KEYS, SHAPES, measure
 
 RANGE = 1.5
@@ -44,6 +45,31 @@ def test_nan_anywhere_reads_nan(skin, random_state, kind, body, shape, key):
         marked = [1, 3, 5] if own and i >= number // 2 else [1, 3, 5, 7]
         assert distance[marked].isnan().all()
         assert (detected[marked].sum(-1) >= 1).all()
+
+
+@pytest.mark.parametrize("key", ["base_pose", "object_pose"])
+@pytest.mark.parametrize("shape", SHAPES)
+@every_kind
+def test_a_quaternion_is_a_turn_whatever_its_length(
+    skin, random_state, kind, shape, key
+):
+    state = random_state(8, seed=5, objects=2)
+    state["object_active"][:] = True
+    sensor = kind(skin.select(range(8)), H1_2.chain, (shape, shape), RANGE)
+    exact, _ = measure(sensor, state)
+    for length in (0.5, 1.008, 3.0):
+        other = state.clone()
+        other[key][..., 3:] *= length
+        distance, _ = measure(sensor, other)
+        assert torch.equal(distance.isinf(), exact.isinf())
+        torch.testing.assert_close(distance, exact, atol=1e-5, rtol=0.0)
+    # None at all is no turn, near or far; but a sphere needs none.
+    state[key][1::2, ..., 3:] = 0.0
+    state["object_pose"][5:, :, :2] += 50.0
+    distance, _ = measure(sensor, state)
+    needs_none = key == "object_pose" and isinstance(shape, Sphere)
+    assert distance[1::2].isnan().all() != needs_none
+    assert not distance[::2].isnan().any()
 
 
 @every_kind

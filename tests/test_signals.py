@@ -126,6 +126,21 @@ def test_localization_ignores_an_undetected_ball_wherever_it_is():
     assert localize(UPRIGHT, balls, [True, False]) == [0, 3, 0]
 
 
+def test_localization_turns_with_a_base_of_any_length_but_zero():
+    for length in (0.5, 3.0):
+        base = [1.0, 0, 1, length * HALF, 0, 0, length * HALF]
+        assert localize(base, [(1.0, 2, 1)], [True]) == pytest.approx([2, 0, 0])
+    signal = localize([0.0] * 7, [(1.0, 2, 1)], [True])
+    assert all(map(math.isnan, signal))
+
+
+def test_localization_of_an_object_turned_by_nan_is_nan():
+    pose = torch.tensor([[[5.0, 0, 0, 1, 0, math.nan, 0]]])
+    base, joints = torch.tensor([UPRIGHT]), torch.zeros(1, 4)
+    (signal,) = Localization().compute(base, pose, joints, torch.tensor([[True]]))
+    assert signal.isnan().all()
+
+
 @pytest.mark.parametrize("slots", ["nearest", "all"])
 def test_localization_in_a_row_of_nan_is_nan_and_so_is_its_validity(slots):
     pose = torch.tensor([[[1.0, 0, 0, 1, 0, 0, 0]]]).expand(3, -1, -1)

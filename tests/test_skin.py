@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from egoskin.robots import H1_2
-from egoskin.sensors import Skin
+from egoskin.sensors import Ray, Skin
 from egoskin.sensors.config import SkinConfig
+from egoskin.sensors.gentact import save_gentact
 
 
 def make_skin(normal, **changes) -> Skin:
@@ -107,6 +108,28 @@ def test_a_skin_misplaced_by_nothing_has_its_own_frames():
 
 
 # --- file -----------------------------------------------------------------------
+
+
+def test_an_infinite_range_numpys_integers_and_a_path_are_saved_as_json(tmp_path):
+    grid = (np.int64(2), np.int64(3))
+    skin = make_skin(
+        [[1, 0, 0]],
+        range=[np.inf],
+        coverage=(Ray(grid=grid),),
+        provenance={"of": tmp_path},
+    )
+    path = tmp_path / "skin.json"
+    skin.save(path)
+
+    def refuse(constant: str) -> None:
+        raise AssertionError(f"{constant} is no JSON")
+
+    json.loads(path.read_text(), parse_constant=refuse)
+    loaded = Skin.load(path)
+    assert loaded.range.tolist() == [np.inf]
+    assert loaded.coverage == skin.coverage
+    assert loaded.provenance == {"of": str(tmp_path)}
+    assert save_gentact(skin, tmp_path / "skin.csv") == ("coverage", "range")
 
 
 def test_a_saved_skin_is_the_same_skin(skin, tmp_path):

@@ -118,6 +118,21 @@ class SensorConfig:
         """Raise ValueError for a range that is not positive, or what has no effect."""
         if not self.range > 0:
             raise ValueError(f"the sensor range must be positive, got {self.range}")
+        if not self.uses_skin:
+            ignored = {
+                "reduce": self.reduce != "none",
+                "occlusion": self.occlusion,
+                "per_object": self.per_object,
+                "validity": self.validity,
+                "corruption": self.corruption != "none",
+                "signal=localization": self.signal == "localization",
+            }
+            for name, given in ignored.items():
+                if given:
+                    raise ValueError(
+                        f"{name} has no effect with coverage={self.coverage}, which "
+                        "has no skin"
+                    )
         if self.validity and self.signal == "binary":
             raise ValueError("a binary signal is its own validity: leave validity off")
         if self.localization.over_range and math.isinf(self.range):

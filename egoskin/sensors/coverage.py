@@ -75,6 +75,9 @@ class Ray:
                 "beams='edges' needs a grid of at least 2 x 2 and sub_beams=1, got "
                 f"grid {self.grid} and sub_beams {self.sub_beams}"
             )
+        # NumPy's integers go into no JSON.
+        object.__setattr__(self, "grid", tuple(map(int, self.grid)))
+        object.__setattr__(self, "sub_beams", int(self.sub_beams))
 
     @property
     def num_beams(self) -> int:

@@ -93,15 +93,6 @@ def _turned_back(rotation: Tensor, vector: Tensor) -> Tensor:
     return rotation[0] * x + rotation[1] * y + rotation[2] * z
 
 
-def _poison(base_pose: Tensor, joint_pos: Tensor, object_pose: Tensor) -> Tensor:
-    """Return 0 or, for NaN in the row or in the object, NaN, ``[B, O]``: 0 NaN = NaN.
-
-    It makes all readings of the object NaN, culled or not; no comparison discards it.
-    """
-    row = 0.0 * (joint_pos.sum(-1) + base_pose.sum(-1))
-    return row[:, None] + 0.0 * object_pose.sum(-1)
-
-
 def _writable(out: Tensor | None, shape: Sequence[int], like: Tensor) -> Tensor:
     """Return what is written to, or a new tensor.
 
@@ -120,7 +111,7 @@ def _writable(out: Tensor | None, shape: Sequence[int], like: Tensor) -> Tensor:
 
 
 def _matrix(quat: Tensor) -> Tensor:
-    """Return rotation matrices ``[3, 3, B]`` of unit quaternions ``[4, B]``."""
+    """Return rotation matrices ``[3, 3, B]`` of quaternions ``[4, B]``."""
     return torch.stack(quat_to_entries(quat.unbind(0))).unflatten(0, (3, 3))
 
 
@@ -225,7 +216,7 @@ class ProximitySensor(RowTransform):
         self, base_pose: Tensor, joint_pos: Tensor, object_pose: Tensor, active: Tensor
     ) -> Scene:
         """Return what is computed from, given the four inputs."""
-        poison = _poison(base_pose, joint_pos, object_pose)
+        poison = self._poison(base_pose, joint_pos, object_pose)
         objects = (object_pose + poison[..., None]).permute(1, 2, 0).contiguous()
         skin = {
             name.removeprefix("_"): value.to(base_pose.dtype).contiguous()
@@ -425,6 +416,25 @@ class ProximitySensor(RowTransform):
                     f"quaternion w x y z), got {inputs[i].shape[-1]}"
                 )
 
+    def _poison(
+        self, base_pose: Tensor, joint_pos: Tensor, object_pose: Tensor
+    ) -> Tensor:
+        """Return 0 or, for bad input in the row or the object, NaN, ``[B, O]``.
+
+        That is NaN (0 NaN = NaN) or a quaternion of zero (0 / 0 = NaN), but for that of
+        a sphere. It makes all readings of the object NaN, culled or not; no comparison
+        discards it.
+        """
+        row = 0.0 * (joint_pos.sum(-1) + base_pose.sum(-1))
+        row = row + 0.0 / base_pose[:, 3:].square().sum(-1)
+        own = 0.0 * object_pose.sum(-1)
+        if not all(isinstance(shape, Sphere) for shape in self.objects):
+            sphere = [isinstance(shape, Sphere) for shape in self.objects]
+            length = object_pose[..., 3:].square().sum(-1)
+            length = length.masked_fill(torch.tensor(sphere).to(length.device), 1.0)
+            own = own + 0.0 / length
+        return row[:, None] + own
+
     def _rows_in_reach(
         self,
         base_pose: Tensor,
@@ -436,7 +446,7 @@ class ProximitySensor(RowTransform):
         bounds = [shape.bounding_radius for shape in self.objects]
         limit = self._farthest + object_pose.new_tensor(bounds)
         away = (object_pose[..., :3] - base_pose[:, None, :3]).square().sum(-1)
-        away = away + _poison(base_pose, joint_pos, object_pose)
+        away = away + self._poison(base_pose, joint_pos, object_pose)
         return (~(away > limit * limit) & active).any(1).nonzero()[:, 0]
 
     def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:

@@ -139,7 +139,7 @@ class Noise(_Spread, PointModel):
 
 @dataclass(frozen=True, kw_only=True)
 class Drift(_Spread, FrameModel):
-    """A baseline that walks at random from 0 at the start of an episode.
+    """A baseline that walks at random from 0, by one step before the first reading.
 
     The spread after t seconds is sqrt(t) times the one given, which may depend on
     the distance (`_Spread`). All beams of a sensor share its walk.
@@ -194,7 +194,10 @@ class Dropout(PointModel):
         """Return the distances, infinite where dropped [m], ``[n]``."""
         chance = self.probability + self.per_metre * distance
         if self.per_speed:
-            chance += self.per_speed * moment.speed.to(distance.dtype).take(places.row)
+            speed = moment.speed.to(distance.dtype).take(places.row)
+            chance += self.per_speed * speed
+            # At a speed of NaN nobody knows: 0 NaN = NaN.
+            distance = distance + 0.0 * speed
         return _hide(distance, places.draw(moment), chance)
 
 

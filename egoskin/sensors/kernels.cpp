@@ -330,10 +330,11 @@ void place_objects(const Tables &t, const Rows &rows, Block<T> &block) {
   if (!block.finite)
     poison = rows.poison<T>(JOINT_POS, 0, t.joints) + rows.poison<T>(BASE, 0, 7);
   V<T> w = base[3], x = base[4], y = base[5], z = base[6], one = filled<T>(1);
+  V<T> s = filled<T>(2) / (w * w + x * x + y * y + z * z);
   V<T> turn[3][3] = {
-      {one - (y * y + z * z) * T(2), (x * y - w * z) * T(2), (x * z + w * y) * T(2)},
-      {(x * y + w * z) * T(2), one - (x * x + z * z) * T(2), (y * z - w * x) * T(2)},
-      {(x * z - w * y) * T(2), (y * z + w * x) * T(2), one - (x * x + y * y) * T(2)}};
+      {one - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y)},
+      {s * (x * y + w * z), one - s * (x * x + z * z), s * (y * z - w * x)},
+      {s * (x * z - w * y), s * (y * z + w * x), one - s * (x * x + y * y)}};
   for (int64_t object = 0; object < t.objects; object++) {
     V<T> d[3], centre[3];
     for (int i = 0; i < 3; i++)

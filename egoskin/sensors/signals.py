@@ -304,16 +304,19 @@ class Localization(RowTransform):
         base_pose, object_pose, joint_pos, *detections = inputs
         detected = torch.stack(detections).any(0)
         offset_w = object_pose[..., :3] - base_pose[:, None, :3]
-        quat = base_pose[:, None, 3:].expand(-1, offset_w.shape[1], -1)
-        position = rotate_inverse(quat, offset_w)
+        quat = base_pose[:, 3:] / base_pose[:, 3:].norm(dim=-1, keepdim=True)
+        each = quat[:, None].expand(-1, offset_w.shape[1], -1)
+        position = rotate_inverse(each, offset_w)
         away = offset_w.square().sum(-1)
         if self.yaw_only:
-            position = self._level(base_pose, offset_w)
+            position = self._level(quat, offset_w)
         elif self._centre is not None:
             position = self._in_link(joint_pos, position)
             away = position.square().sum(-1)
-        # Bad joints leave open where the sensors are: 0 NaN = NaN.
-        position = position + 0.0 * joint_pos.sum(-1)[:, None, None]
+        # Bad joints leave open where the sensors are, a bad orientation of an object
+        # where its surface is: 0 NaN = NaN.
+        bad = joint_pos.sum(-1, keepdim=True) + object_pose[..., 3:].sum(-1)
+        position = position + 0.0 * bad[..., None]
         if self.slots == "nearest":
             nearest = away.masked_fill(~detected, torch.inf).argmin(-1, keepdim=True)
             position = position.gather(1, nearest[..., None].expand(-1, -1, 3))
@@ -337,9 +340,9 @@ class Localization(RowTransform):
             [c[..., 0] * x + c[..., 1] * y + c[..., 2] * z for c in columns], -1
         )
 
-    def _level(self, base_pose: Tensor, offset_w: Tensor) -> Tensor:
+    def _level(self, quat: Tensor, offset_w: Tensor) -> Tensor:
         """Positions in axes that turn with the heading alone, ``[B, O, 3]``."""
-        w, x, y, z = base_pose[:, 3:].unbind(-1)
+        w, x, y, z = quat.unbind(-1)
         # The heading is the direction of the base's x axis on the ground.
         c, s = 1 - 2 * (y * y + z * z), 2 * (x * y + w * z)
         length = (c * c + s * s).sqrt().clamp(min=1e-9)

@@ -105,6 +105,8 @@ def _check_sensor(index: int, sensor: object, types: Mapping[str, Coverage]) -> 
             "in metres"
         )
     for name in ("range", "roll_deg", "radius"):
+        if name == "range" and sensor.get(name) == "inf":
+            continue
         if name in sensor and type(sensor[name]) not in (int, float):
             raise ValueError(
                 f"{where}: {name!r} must be a number, got {sensor[name]!r}"
@@ -303,7 +305,8 @@ class Skin:
             for name in ("range", "radius"):
                 value = float(getattr(self, name)[i])
                 if not np.isnan(value):
-                    entry[name] = value
+                    # JSON has no number for it.
+                    entry[name] = "inf" if value == math.inf else value
             if coverage is not None:
                 number = len(types) + 1
                 entry["type"] = types.setdefault(coverage, f"type_{number}")
@@ -370,7 +373,8 @@ class Skin:
         """Write the skin to a JSON file, one sensor on each line."""
         content = self.to_dict()
         sensors = content.pop("sensors")
-        head = json.dumps(content, indent=2)[:-2]
+        # Provenance may hold a path.
+        head = json.dumps(content, indent=2, default=str)[:-2]
         lines = ",\n".join(f"    {json.dumps(sensor)}" for sensor in sensors)
         Path(path).write_text(f'{head},\n  "sensors": [\n{lines}\n  ]\n}}\n')
 

@@ -193,7 +193,8 @@ class ContactFree(StatefulTransform):
 
     Reads ``tactile [*B, L]``; writes ``contact_free [*B, 1]`` bool, which is its
     state. At the last step of a trajectory it is the label that `contact_free` gives
-    to the whole of it.
+    to the whole of it, unless the state it was reset to already touches: that counts
+    here, and is no step there.
 
     Args:
         links: Names of the links, in the order of ``tactile``.

@@ -71,7 +71,7 @@ def save_gentact(skin: Skin, path: Path | str) -> tuple[str, ...]:
             writer.writerow([i, *row, f"/{skin.robot}/{link}/visuals", "visuals"])
     lost = {
         "coverage": any(c is not None for c in skin.coverage),
-        "range": bool(np.isfinite(skin.range).any()),
+        "range": bool((~np.isnan(skin.range)).any()),
         "roll_deg": bool(skin.roll_deg.any()),
     }
     return tuple(name for name, is_lost in lost.items() if is_lost)
