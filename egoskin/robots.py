@@ -1,14 +1,15 @@
 """Robots: model file, kinematic chain, and the facts that no model file holds.
 
-Adding a robot is adding a `RobotConfig` here and its MJCF to ``assets/``. Names are
-resolved to indices once, in the properties of the configuration.
+Adding a robot is adding a `RobotConfig` here and its MJCF to ``assets/``; to place
+sensors on one elsewhere, make its `RobotConfig` there. Names are resolved to indices
+once, in the properties of the configuration.
 """
 
 from __future__ import annotations
 
 import fnmatch
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -79,23 +80,29 @@ class Primitive:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RobotConfig:
-    """A legged robot with a floating base and position-controlled hinge joints."""
+    """A robot: a base, and the hinges and slides below it.
+
+    Sensors can be placed on any. The task wants a floating base, hinges alone, gains
+    and the file of the robot alone: no floor, no actuators, no sensors.
+    """
 
     name: str
     """Name by which configurations refer to the robot."""
     model_path: Path
-    """MJCF of the robot alone: no floor, no actuators, no sensors."""
+    """MJCF; only what hangs on the base counts."""
     base: str
-    """Root body, which carries the free joint; the *robot's centre frame*."""
-    default_pose: Mapping[str, float]
-    """Joint positions [rad] of the default pose by joint name pattern; else 0."""
-    gains: Mapping[str, Mapping[str, Gain]]
-    """Named sets of PD gains by joint name pattern."""
-    feet: tuple[str, ...]
-    """Links that may touch the ground."""
+    """Root of `chain`, the *robot's centre frame*: the body with the free joint or, of
+    a robot that stands fixed, one that is welded to the world, or ``"world"``."""
     skin_links: tuple[str, ...]
     """Links that carry the proximity skin (the upper body)."""
-    untargeted_links: tuple[str, ...]
+    default_pose: Mapping[str, float] = field(default_factory=dict)
+    """Joint positions [rad], of slides [m], of the default pose by joint name pattern;
+    else 0."""
+    gains: Mapping[str, Mapping[str, Gain]] = field(default_factory=dict)
+    """Named sets of PD gains by joint name pattern."""
+    feet: tuple[str, ...] = ()
+    """Links that may touch the ground."""
+    untargeted_links: tuple[str, ...] = ()
     """Links that throws are not aimed at."""
 
     @cached_property
@@ -108,23 +115,52 @@ class RobotConfig:
         return mujoco.MjSpec.from_file(str(self.model_path))
 
     @cached_property
+    def _bodies(self) -> list[int]:
+        """The base, be it the world, and all that hangs on it, in MuJoCo's order."""
+        bodies = [self.model.body(self.base).id]
+        for body in range(bodies[0] + 1, self.model.nbody):
+            if self.model.body_parentid[body] in bodies:
+                bodies.append(body)
+        return bodies
+
+    @cached_property
     def links(self) -> tuple[str, ...]:
-        """Bodies of the robot in MuJoCo's order (without the world)."""
-        return tuple(self.model.body(i).name for i in range(1, self.model.nbody))
+        """The base and the bodies below it in MuJoCo's order (without the world).
+
+        Those without a name are named as in `build_chain`.
+        """
+        return tuple(body_name(self.model, body) for body in self._bodies if body)
+
+    @cached_property
+    def _joint_ids(self) -> np.ndarray:
+        """Which of the model's joints are the robot's, ``[J]``."""
+        model = self.model
+        below = np.isin(model.jnt_bodyid, self._bodies[1:])
+        return np.flatnonzero(below & np.isin(model.jnt_type, list(_JOINT_TYPES)))
 
     @cached_property
     def joints(self) -> tuple[str, ...]:
-        """Actuated hinge joints, in MuJoCo's order (without the free joint)."""
-        model = self.model
-        if model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
-            raise ValueError(f"{self.name}: the first joint must be the free joint")
-        if (model.jnt_type[1:] != mujoco.mjtJoint.mjJNT_HINGE).any():
-            raise ValueError(f"{self.name}: all joints but the first must be hinges")
-        return tuple(model.joint(i).name for i in range(1, model.njnt))
+        """Hinges and slides below the base, in MuJoCo's order, as `build_chain`'s."""
+        return tuple(_joint_name(self.model, joint) for joint in self._joint_ids)
+
+    def check_floating_base(self) -> None:
+        """Raise ValueError unless the base floats and all other joints are hinges."""
+        model, kinds = self.model, self.model.jnt_type
+        free = model.njnt > 0 and kinds[0] == mujoco.mjtJoint.mjJNT_FREE
+        if not free or model.jnt_bodyid[0] != self._bodies[0]:
+            raise ValueError(
+                f"{self.name}: the first joint must be the free joint of its base "
+                f"{self.base!r} (sensors can be placed without, but no balls thrown)"
+            )
+        hinges = kinds[self._joint_ids] == mujoco.mjtJoint.mjJNT_HINGE
+        if hinges.sum() != model.njnt - 1:
+            raise ValueError(
+                f"{self.name}: all joints but the first must be hinges below its base"
+            )
 
     @cached_property
     def default_joint_pos(self) -> np.ndarray:
-        """Joint positions of the default pose [rad], ``[J]``."""
+        """Joint positions of the default pose [rad], of slides [m], ``[J]``."""
         rest = {
             name: 0.0
             for name in self.joints
@@ -135,13 +171,16 @@ class RobotConfig:
 
     @cached_property
     def torque_limit(self) -> np.ndarray:
-        """Largest torque of each joint [N m], ``[J]`` (``actuatorfrcrange``)."""
-        return self.model.jnt_actfrcrange[1:, 1].copy()
+        """Largest torque of each joint [N m], ``[J]`` (``actuatorfrcrange``).
+
+        Of a slide, the largest force [N].
+        """
+        return self.model.jnt_actfrcrange[self._joint_ids, 1]
 
     @cached_property
     def joint_range(self) -> np.ndarray:
-        """Lower and upper end of each joint's range [rad], ``[2, J]``."""
-        return self.model.jnt_range[1:].T.copy()
+        """Lower and upper end of each joint's range [rad], [m], ``[2, J]``."""
+        return self.model.jnt_range[self._joint_ids].T.copy()
 
     def joint_gains(self, gain_set: str) -> tuple[np.ndarray, np.ndarray]:
         """Return (kp [N m/rad], kd [N m s/rad]) of a named gain set, ``[J]`` each.
@@ -161,33 +200,43 @@ class RobotConfig:
     def default_base_height(self) -> float:
         """Height of the base when the default pose stands on the ground [m]."""
         model, data = self.model, mujoco.MjData(self.model)
-        data.qpos[7:] = self.default_joint_pos
+        data.qpos[model.jnt_qposadr[self._joint_ids]] = self.default_joint_pos
         mujoco.mj_kinematics(model, data)
-        lowest = min(_lowest_point(model, data, g) for g in range(model.ngeom))
-        return float(data.qpos[2] - lowest)
+        geoms = self._collision_geoms(self.links)
+        lowest = min(_lowest_point(model, data, geom) for geom in geoms)
+        return float(data.xpos[self._bodies[0], 2] - lowest)
 
     @cached_property
     def primitives(self) -> tuple[Primitive, ...]:
         """The collision shapes, with their poses in the frames of their links."""
-        model, kinds = self.model, mujoco.mjtGeom
-        names = {
-            int(kinds.mjGEOM_SPHERE): "sphere",
-            int(kinds.mjGEOM_CAPSULE): "capsule",
-            int(kinds.mjGEOM_BOX): "box",
-        }
-        shapes = []
-        for geom in range(model.ngeom):
-            kind = names.get(int(model.geom_type[geom]))
-            if kind is None:
-                raise ValueError(
-                    f"geom {model.geom(geom).name!r} is no sphere, capsule or box"
-                )
+        return self.primitives_on(self.links)
+
+    def _collision_geoms(self, links: Collection[str]) -> list[int]:
+        """Return the geoms of links that touch something, not those to look at."""
+        model = self.model
+        wanted = [b for b in self._bodies if b and body_name(model, b) in links]
+        touching = (model.geom_contype | model.geom_conaffinity) != 0
+        touching[[*model.pair_geom1, *model.pair_geom2]] = True
+        on_links = np.isin(model.geom_bodyid, wanted)
+        return np.flatnonzero(on_links & touching).tolist()
+
+    def primitives_on(self, links: Collection[str]) -> tuple[Primitive, ...]:
+        """Return the collision shapes of some links, with their poses in their frames.
+
+        Args:
+            links: Names of the links; the shapes of others are not looked at.
+
+        Raises:
+            ValueError: If a shape is no sphere, capsule or box.
+        """
+        model, shapes = self.model, []
+        for geom in self._collision_geoms(links):
             rotation = np.zeros(9)
             mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
             shapes.append(
                 Primitive(
-                    link=model.body(int(model.geom_bodyid[geom])).name,
-                    kind=kind,
+                    link=body_name(model, int(model.geom_bodyid[geom])),
+                    kind=_primitive_kind(model, geom),
                     size=model.geom_size[geom].copy(),
                     position=model.geom_pos[geom].copy(),
                     rotation=rotation.reshape(3, 3),
@@ -206,19 +255,45 @@ class RobotConfig:
         return build_chain(self.model, self.base)
 
 
+def body_name(model: mujoco.MjModel, body: int) -> str:
+    """Return the name of a body, ``body2`` if the model gives it none."""
+    return model.body(body).name or f"body{body}"
+
+
+def _joint_name(model: mujoco.MjModel, joint: int) -> str:
+    """Return the name of a joint, ``joint3`` if the model gives it none."""
+    return model.joint(joint).name or f"joint{joint}"
+
+
+def _primitive_kind(model: mujoco.MjModel, geom: int) -> str:
+    """Return "sphere", "capsule" or "box".
+
+    Raises:
+        ValueError: If the geom is none of these.
+    """
+    kind = mujoco.mjtGeom(int(model.geom_type[geom])).name
+    kind = kind.removeprefix("mjGEOM_").lower()
+    if kind not in ("sphere", "capsule", "box"):
+        link = body_name(model, int(model.geom_bodyid[geom]))
+        name = model.geom(geom).name or geom
+        raise ValueError(
+            f"link {link!r} has a collision shape, geom {name!r}, of kind {kind}, not "
+            "sphere, capsule or box: place sensors with that link's meshes instead, "
+            f"meshes={{{link!r}: [...]}}, or put one of those three in its place"
+        )
+    return kind
+
+
 def _lowest_point(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
     """Height of the lowest point of a primitive geom [m]."""
-    size, kind = model.geom_size[geom], model.geom_type[geom]
+    size, kind = model.geom_size[geom], _primitive_kind(model, geom)
     z_row = data.geom_xmat[geom].reshape(3, 3)[2]
-    if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
+    if kind == "sphere":
         reach = size[0]
-    elif kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
+    elif kind == "capsule":
         reach = size[0] + size[1] * abs(z_row[2])
-    elif kind == mujoco.mjtGeom.mjGEOM_BOX:
-        reach = float(np.abs(z_row) @ size)
     else:
-        name = model.geom(geom).name
-        raise ValueError(f"geom {name!r} is no sphere, capsule or box")
+        reach = float(np.abs(z_row) @ size)
     return float(data.geom_xpos[geom, 2] - reach)
 
 
@@ -239,7 +314,7 @@ def _body_frames(
     T(-p) goes to the next frame, and there is one more frame after the last such joint.
     """
     body = model.body(body_id)
-    name = body.name or f"body{body_id}"
+    name = body_name(model, body_id)
     # All frames of a body have its name as link, so that the chain's links are bodies.
     frames: list[pk_frame.Frame] = []
     position, quat = body.pos.copy(), body.quat.copy()
@@ -251,7 +326,7 @@ def _body_frames(
 
     for joint_id in range(body.jntadr[0], body.jntadr[0] + body.jntnum[0]):
         joint = model.joint(joint_id)
-        joint_name = joint.name or f"joint{joint_id}"
+        joint_name = _joint_name(model, joint_id)
         kind = mujoco.mjtJoint(int(joint.type[0]))
         if kind not in _JOINT_TYPES:
             raise ValueError(

@@ -295,7 +295,8 @@ def primitive_surface(robot: RobotConfig, links: Sequence[str]) -> Surface:
         links: Names of the links.
 
     Raises:
-        ValueError: If a link is not the robot's, or the links have no primitives.
+        ValueError: If a link is not the robot's, the links have no primitives, or a
+            link, covered or not, has a collision shape that is none.
     """
     patches = [primitive_patch(shape) for shape in robot.primitives]
     return Surface(robot, links, patches, outside_primitives(robot, robot.primitives))

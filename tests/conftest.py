@@ -99,11 +99,7 @@ def small_robot(tmp_path: Path) -> Callable[..., RobotConfig]:
             name="small",
             model_path=path,
             base="base",
-            default_pose={},
-            gains={},
-            feet=(),
             skin_links=("base",),
-            untargeted_links=(),
         )
 
     return build

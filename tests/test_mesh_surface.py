@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from egoskin.robots import H1_2
+from egoskin.robots import H1_2, RobotConfig
 from egoskin.sensors.mesh_surface import (
     mesh_surface,
     meshes_in_folder,
@@ -291,6 +291,40 @@ def test_sensors_are_placed_on_meshes(bare_robot):
     assert 30 < len(skin) < 45
     assert skin.provenance["meshes"] == {"base": ["hull.stl", "core.stl"]}
     assert skin.provenance["rejected"]["base"] == pytest.approx(0.2, abs=0.03)
+
+
+def test_a_link_whose_shape_is_no_primitive_takes_a_mesh(small_robot):
+    robot = small_robot(
+        "<geom size='.2'/>"
+        "<body name='b' pos='1 0 0'><geom type='cylinder' size='.1 .3'/></body>"
+    )
+    with pytest.raises(ValueError, match=r"link 'b' .* kind cylinder.*meshes=\{'b':"):
+        place_sensors(robot, 50)
+    tube = trimesh.creation.cylinder(0.1, 0.6)
+    with pytest.raises(ValueError, match="link 'b' has a collision shape"):
+        place_sensors(robot, 50, meshes={"base": [ball(0.2)]})
+    skin = place_sensors(robot, 50, links=["base", "b"], meshes={"b": [tube]})
+    on_base = np.array(skin.links) == "base"
+    assert 0 < on_base.sum() < 50
+    distance = distance_to(robot.primitives_on(["base"])[0], skin.position[on_base])
+    np.testing.assert_allclose(distance, 0, atol=2e-6)
+    _, distance, _ = tube.nearest.on_surface(skin.position[~on_base])
+    np.testing.assert_allclose(distance, 0, atol=2e-6)
+
+
+def test_links_that_collide_as_meshes_wear_sensors_on_them(mjcf):
+    robot = RobotConfig(
+        name="bricks", model_path=mjcf, base="base", skin_links=("base", "b")
+    )
+    with pytest.raises(ValueError, match=r"link 'base' .* of kind mesh"):
+        place_sensors(robot, 30)
+    meshes = meshes_of_mjcf(mjcf, group=2)
+    skin = place_sensors(robot, 30, meshes=meshes)
+    assert set(skin.links) == {"base", "b"}
+    for link, on_link in meshes.items():
+        at = skin.position[np.array(skin.links) == link]
+        distance = [mesh.nearest.on_surface(at)[1] for mesh in on_link]
+        np.testing.assert_allclose(np.min(distance, axis=0), 0, atol=2e-6)
 
 
 def test_meshes_of_unknown_or_empty_links_are_refused(bare_robot):

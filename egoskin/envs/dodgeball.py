@@ -145,6 +145,9 @@ class DodgeballEnv(EnvBase):
         row_offset: Global index of the first row.
         num_threads: Physics threads; results do not depend on it.
         hold: Whether the robot is held rigid in its start pose.
+
+    Raises:
+        ValueError: If the robot's base does not float, or a joint is no hinge.
     """
 
     physics_class: type[Physics] = Physics
@@ -161,6 +164,7 @@ class DodgeballEnv(EnvBase):
         num_threads: int = 1,
         hold: bool = False,
     ) -> None:
+        robot.check_floating_base()
         super().__init__(device="cpu", batch_size=torch.Size([num_envs]))
         self.robot, self.config = robot, config
         self._seed, self._hold, self._num_threads = seed, hold, num_threads

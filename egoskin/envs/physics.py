@@ -129,7 +129,11 @@ def build_scene(
     Returns:
         The model. Position actuators carry the PD law
         torque = clip(kp (q* - q) - kd qdot, +-limit), evaluated in every substep.
+
+    Raises:
+        ValueError: If the robot's base does not float, or a joint is no hinge.
     """
+    robot.check_floating_base()
     spec = robot.spec()
     option = spec.option
     option.timestep = config.timestep

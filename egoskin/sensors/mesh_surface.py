@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
-from egoskin.robots import RobotConfig
+from egoskin.robots import RobotConfig, body_name
 from egoskin.surface import (
     Patch,
     Surface,
@@ -133,7 +133,7 @@ def meshes_of_mjcf(path: Path, group: int | None = None) -> dict[str, list[Trime
             model.mesh_face[face : face + model.mesh_facenum[asset]],
             metadata={"name": _asset_name(model, asset)},
         )
-        meshes.setdefault(model.body(body).name, []).append(mesh)
+        meshes.setdefault(body_name(model, body), []).append(mesh)
     if not meshes:
         where = "" if group is None else f" in group {group}"
         raise ValueError(f"{path} has no mesh geoms{where}")
@@ -224,8 +224,8 @@ def mesh_surface(robot: RobotConfig, links: Sequence[str], meshes: Meshes) -> Su
         meshes: Meshes of the robot; those of other links hide what they cover.
 
     Raises:
-        ValueError: If a mesh's link or a link is not the robot's, or the links carry
-            no shape.
+        ValueError: If a mesh's link or a link is not the robot's, the links carry no
+            shape, or a link without meshes has a collision shape that is no primitive.
     """
     for link in meshes:
         if link not in robot.links:
@@ -246,7 +246,7 @@ def mesh_surface(robot: RobotConfig, links: Sequence[str], meshes: Meshes) -> Su
     )
     faces = np.arange(base.size // 3).reshape(-1, 3)
     whole = _trimesh().Trimesh(base.reshape(-1, 3), faces, process=False)
-    rest = [shape for shape in robot.primitives if shape.link not in meshes]
+    rest = robot.primitives_on([link for link in robot.links if link not in meshes])
     outside = outside_primitives(robot, rest)
 
     def sees(points: np.ndarray, normals: np.ndarray, stand_off: float) -> np.ndarray:

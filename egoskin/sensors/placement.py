@@ -207,7 +207,8 @@ def place_sensors(
 
     Raises:
         ValueError: If an argument is out of its range, a link or pattern is not the
-            robot's, the links show no surface, or the sensors do not fit.
+            robot's, the links show no surface, a link without meshes has a collision
+            shape that is no primitive, or the sensors do not fit.
     """
     _check(num_sensors, seed, method, spacing, stand_off)
     covered = tuple(robot.skin_links if links is None else links)
