@@ -227,28 +227,18 @@ class _Loop:
     def _serial(self) -> Row:
         """Return what no other thread or process can do meanwhile, however many.
 
-        That is the CPU time of this process's first thread, but for its looks at the
-        workers; the ratio is to the CPU time of all workers.
+        That is the CPU time of this process's first thread: while others collect, one
+        half of the workers steps. The ratio is to the CPU time of all workers.
         """
         pool, serial, ratios = self._pool, [], []
-        wait, waited = pool._wait, 0.0
-
-        def count(*args: Any) -> None:
-            nonlocal waited
-            begin = time.thread_time()
-            wait(*args)
-            waited += time.thread_time() - begin
-
-        pool._wait = count
         for i in range(self.config.rounds):
             show(f"round {i + 1}/{self.config.rounds}: serial share")
-            root, waited = self._restore(pool), 0.0
+            root = self._restore(pool)
             alone, others = time.thread_time(), _cpu_time(_processes()[1:])
             self._train(root)
-            serial.append(time.thread_time() - alone - waited)
+            serial.append(time.thread_time() - alone)
             ratios.append(serial[-1] / (_cpu_time(_processes()[1:]) - others))
         show("")
-        pool._wait = wait
         return Row(
             name=f"serial_{self._coverage}",
             value=1e6
