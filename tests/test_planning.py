@@ -44,9 +44,9 @@ def make(policy: Policy, config: EnvConfig, rows: int) -> TransformedEnv:
     )
 
 
-def find(policy: Policy, search: SearchConfig = SEARCH, reach: float = 2.0) -> Ceiling:
+def find(policy: Policy, search: SearchConfig = SEARCH) -> Ceiling:
     return find_ceiling(
-        policy, task(policy), search, bank_seed=0, throws=THROWS, reach=reach
+        policy, task(policy), search, bank_seed=0, throws=THROWS, reach=2.0
     )
 
 
@@ -123,8 +123,11 @@ def test_a_search_repeats(policy: Policy):
 
 
 def test_balls_that_never_come_into_reach_are_an_error(policy: Policy):
-    with pytest.raises(ValueError, match="came within 1e-06 m of a sensor"):
-        find(policy, reach=1e-6)
+    # No episode lasts until the fiftieth.
+    with pytest.raises(ValueError, match="came within 2 m of a sensor"):
+        find_ceiling(
+            policy, task(policy), SEARCH, bank_seed=0, throws=4, reach=2.0, ball=50
+        )
 
 
 @pytest.mark.parametrize("change", [{"samples": 3}, {"hold": 0}, {"stand_s": -1.0}])
