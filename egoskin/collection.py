@@ -62,12 +62,11 @@ def collect(
     root = _cat([walk.root for walk in walks])
     flat = agent.critic(_joined(_in_turn([walk.frames for walk in walks])))
     rollout = flat.reshape(shape[:2])
-    following = agent.critic(agent.encode(_sense(agent, root)))["state_value"]
+    following = _value(agent, _readable(agent, root))
     next_value = torch.cat((rollout["state_value"][1:], following[None]))
     ended = _cat(_in_turn([walk.ended for walk in walks]))
     if len(ended):
-        last = agent.critic(agent.encode(_sense(agent, ended)))["state_value"]
-        next_value[_timed_out(rollout)] = last
+        next_value[_timed_out(rollout)] = _value(agent, ended)
     rollout["next_state_value"] = next_value
     steps = zip(*(walk.infos for walk in walks), strict=True)
     infos = [_cat(halves) for halves in steps]
@@ -128,7 +127,7 @@ def _walk(
     """
     frames, ended, infos = [], [], []
     for now in noise:
-        state = root.select(*agent.read_keys).reshape(-1).split(part)
+        state = _readable(agent, root).split(part)
         parts = zip(state, now.split(part), strict=True)
         frame = _joined([_act(agent, *each) for each in parts])
         root["action"] = frame["action"].reshape(*root.batch_size, -1).to(root.device)
@@ -137,7 +136,7 @@ def _walk(
         for key in ("reward", "done", "terminated"):
             frame[key] = after[key].to(noise.device)
         frames.append(frame)
-        ended.append(after.select(*agent.read_keys)[_timed_out(after)])
+        ended.append(_readable(agent, after)[_timed_out(after)])
         infos.append(after.select(*info_keys))
     return _Walk(root, frames, ended, infos)
 
@@ -159,10 +158,19 @@ def _act(agent: Agent, state: TensorDictBase, noise: Tensor) -> TensorDict:
     return frame.update(features.select(*agent.norms))
 
 
+def _readable(agent: Agent, root: TensorDictBase) -> TensorDictBase:
+    """Return what an agent's senses read of an environment's output, ``[n]``."""
+    return root.select(*agent.read_keys).reshape(-1)
+
+
 def _sense(agent: Agent, state: TensorDictBase) -> TensorDict:
-    """Return what the agent's networks read, ``[N]``, on its device."""
-    device = agent.head.log_std.device
-    return agent.sense(state.select(*agent.read_keys).reshape(-1).to(device))
+    """Return what the agent's networks read of a state ``[n]``, on its device."""
+    return agent.sense(state.to(agent.head.log_std.device))
+
+
+def _value(agent: Agent, state: TensorDictBase) -> Tensor:
+    """Return the values of a state ``[n]``, ``[n, 1]``."""
+    return agent.critic(agent.encode(_sense(agent, state)))["state_value"]
 
 
 def _timed_out(steps: TensorDictBase) -> Tensor:

@@ -373,9 +373,10 @@ class WorkerPool(ParallelEnv):
         raise WorkerError("the channel to a worker broke; all were ended")
 
     def _death(self, worker: int) -> str:
-        if worker in self._hung:
-            return f"hung while it started: {self._hung[worker]}"
-        report = self._report(self._worker_indices[worker])
+        number = self._worker_indices[worker]
+        if number in self._hung:
+            return f"hung while it started: {self._hung[number]}"
+        report = self._report(number)
         if report.exists():
             return f"raised\n{report.read_text()}"
         code = self._workers[worker].exitcode

@@ -428,8 +428,8 @@ class ProximitySensor(RowTransform):
         row = 0.0 * (joint_pos.sum(-1) + base_pose.sum(-1))
         row = row + 0.0 / base_pose[:, 3:].square().sum(-1)
         own = 0.0 * object_pose.sum(-1)
-        if not all(isinstance(shape, Sphere) for shape in self.objects):
-            sphere = [isinstance(shape, Sphere) for shape in self.objects]
+        sphere = [isinstance(shape, Sphere) for shape in self.objects]
+        if not all(sphere):
             length = object_pose[..., 3:].square().sum(-1)
             length = length.masked_fill(torch.tensor(sphere).to(length.device), 1.0)
             own = own + 0.0 / length
