@@ -177,7 +177,11 @@ class Analysis:
         }
 
     def _solid_angle_seen(self, i: int, clearance: float) -> float | None:
-        """Share of the directions in which a ball is seen by a clearance [m]."""
+        """Share of the directions in which a ball is seen by a clearance [m].
+
+        Of those from which one `comes`: the longer the range, the fewer lead over the
+        floor.
+        """
         comes = self.comes(i)
         # A cell of an equirectangular map has an area in proportion to cos(elevation).
         solid = torch.from_numpy(np.cos(direction_grid()[1])).reshape(-1)[comes]
@@ -270,6 +274,8 @@ def analyse(
     """
     if not coverages or not ranges:
         raise ValueError("an analysis needs at least one coverage and one range")
+    if len(set(ranges)) < len(ranges):
+        raise ValueError(f"a range is given twice: {list(ranges)}")
     if not all(0 < r < math.inf for r in ranges):
         raise ValueError(f"ranges must be positive and finite, got {list(ranges)}")
     if np.isinf(skin.range).any():

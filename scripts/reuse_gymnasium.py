@@ -23,7 +23,7 @@ from torch import Tensor
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 from torchrl.envs import Compose, GymEnv, StepCounter, TransformedEnv
 
-from egoskin.robots import build_chain
+from egoskin.chains import build_chain
 from egoskin.sensors import FieldSensor, Proximity, Skin
 from egoskin.shapes import Sphere
 from egoskin.transform import RowTransform

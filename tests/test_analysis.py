@@ -392,6 +392,7 @@ def test_nothing_is_seen_after_the_contact(thrown):
     [
         ({"ranges": [1.0, -1.0]}, "must be positive and finite"),
         ({"ranges": [math.inf]}, "must be positive and finite"),
+        ({"ranges": [0.5, 1.0, 0.5]}, "a range is given twice"),
         ({"ranges": []}, "at least one coverage and one range"),
         ({"coverages": {}}, "at least one coverage and one range"),
         ({"num_throws": 0}, "num_throws must be at least 1"),

@@ -13,8 +13,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from egoskin.chains import build_chain
 from egoskin.kinematics import LinkKinematics
-from egoskin.robots import build_chain
 
 DTYPES = [torch.float32, torch.float64]
 # Rounding of chains that reach a few metres, with room for a dozen products.

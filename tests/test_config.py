@@ -57,6 +57,20 @@ def test_what_needs_a_skin_is_refused_without_one(coverage, options, named):
         SensorConfig(coverage=coverage, **options)
 
 
+@pytest.mark.parametrize(
+    ("coverage", "options", "named"),
+    [
+        ("field", {"ray": Ray(grid=(4, 4))}, "ray"),
+        ("none", {"ray": Ray(grid=(4, 4))}, "ray"),
+        ("ray", {"field": Field(half_angle_deg=60)}, "field"),
+    ],
+)
+def test_options_of_another_coverage_are_refused(coverage, options, named):
+    text = f"{named} options need coverage={named}, not {coverage}"
+    with pytest.raises(ValueError, match=text):
+        SensorConfig(coverage=coverage, **options)
+
+
 @pytest.mark.parametrize("options", [{}, {"per_object": True}, {"reduce": "min"}])
 @pytest.mark.parametrize("kind", ["proximity", "binary"])
 def test_a_mixed_skin_signals_sensor_by_sensor(mixed, random_state, kind, options):

@@ -12,8 +12,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from egoskin.chains import build_chain
 from egoskin.kinematics import quat_to_matrix, rotate
-from egoskin.robots import H1_2, build_chain
+from egoskin.robots import H1_2
 from egoskin.sensors import Field, FieldSensor, Ray, Skin
 from egoskin.shapes import Box, Shape, Sphere, shape_of
 from sensing import (

@@ -14,8 +14,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from egoskin.chains import build_chain
 from egoskin.compilation import can_compile, load_library
-from egoskin.robots import H1_2, build_chain
+from egoskin.robots import H1_2
 from egoskin.sensors import Field, FieldSensor, Ray, RaySensor, Skin
 from egoskin.shapes import Box, Sphere
 from sensing import KEYS, SEED, assert_same_bits, measure

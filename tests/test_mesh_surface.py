@@ -330,6 +330,8 @@ def test_links_that_collide_as_meshes_wear_sensors_on_them(mjcf):
 def test_meshes_of_unknown_or_empty_links_are_refused(bare_robot):
     with pytest.raises(ValueError, match="no link 'arm' to carry a mesh"):
         mesh_surface(bare_robot, ["base"], {"arm": [ball(0.1)]})
+    with pytest.raises(ValueError, match="meshes: none for 'base': leave it out"):
+        mesh_surface(bare_robot, ["base"], {"base": []})
     flat = trimesh.Trimesh(
         [[0, 0, 0], [1, 0, 0], [2, 0, 0]], [[0, 1, 2]], process=False
     )

@@ -280,7 +280,7 @@ def test_darts_stick_unless_they_meet_one_that_stuck_before(seed, n, most):
         ({"num_sensors": 0}, "must be positive, got 0"),
         ({"seed": -1}, "seed of a placement must not be negative, got -1"),
         ({"links": ["torso_link", "chest"]}, "no link 'chest'"),
-        ({"links": []}, "carry no collision shape"),
+        ({"links": []}, "at least one link to cover"),
         ({"method": "grid"}, "method must be .* got 'grid'"),
         ({"num_sensors": None}, "num_sensors=None needs a spacing"),
         ({"spacing": 0.1}, "goes with method='poisson_disk'"),

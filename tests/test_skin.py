@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from egoskin.robots import H1_2
-from egoskin.sensors import Ray, Skin
+from egoskin.sensors import Field, Ray, Skin
 from egoskin.sensors.config import SkinConfig
 from egoskin.sensors.gentact import save_gentact
 
@@ -130,6 +130,20 @@ def test_an_infinite_range_numpys_integers_and_a_path_are_saved_as_json(tmp_path
     assert loaded.coverage == skin.coverage
     assert loaded.provenance == {"of": str(tmp_path)}
     assert save_gentact(skin, tmp_path / "skin.csv") == ("coverage", "range")
+
+
+def test_types_keep_their_names_and_new_ones_are_numbered():
+    content = skin_content(SENSOR | {"type": "type_2"}, SENSOR | {"type": "palm"})
+    content["types"] = {"palm": {"coverage": "ray"}, "type_2": {"coverage": "field"}}
+    skin = Skin.from_dict(content)
+    skin = replace(skin, coverage=(*skin.coverage[:1], Field(half_angle_deg=30)))
+    types = skin.to_dict()["types"]
+    assert {name: type_["coverage"] for name, type_ in types.items()} == {
+        "type_2": "field",
+        "type_1": "field",
+    }
+    assert Skin.from_dict(skin.to_dict()).coverage == skin.coverage
+    assert [s["type"] for s in skin.to_dict()["sensors"]] == ["type_2", "type_1"]
 
 
 def test_a_saved_skin_is_the_same_skin(skin, tmp_path):

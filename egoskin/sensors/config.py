@@ -133,6 +133,12 @@ class SensorConfig:
                         f"{name} has no effect with coverage={self.coverage}, which "
                         "has no skin"
                     )
+        for name, default in (("field", Field()), ("ray", Ray())):
+            if name != self.coverage and getattr(self, name) != default:
+                raise ValueError(
+                    f"{name} options need coverage={name}, not {self.coverage} (types "
+                    "of a skin file have options of their own)"
+                )
         if self.validity and self.signal == "binary":
             raise ValueError("a binary signal is its own validity: leave validity off")
         if self.localization.over_range and math.isinf(self.range):

@@ -30,8 +30,8 @@ class FieldSensor(ProximitySensor):
 
     Reads ``base_pose [*B, 7]``, ``joint_pos [*B, J]``, ``object_pose [*B, O, 7]`` and
     ``object_active [*B, O]``. Writes ``distance [*B, S]`` [m], infinite where nothing
-    is in range and NaN where the input is, and ``object_detected [*B, O]``, whether
-    any sensor detects the object. A sensor inside an object reads 0. Distances are
+    is in range and NaN where the input is not finite, and ``object_detected [*B, O]``,
+    whether any sensor detects the object. A sensor inside an object reads 0. Distances are
     those of the state given: forward kinematics from the joint positions. (A sensor
     that measures to the centre reads the distance to it, inside as well.)
 
@@ -48,7 +48,7 @@ class FieldSensor(ProximitySensor):
             the straight path to its closest point is free. Empty: transparent.
         per_object: Write ``distance [*B, S, O]``, objects told apart.
         compile: Use C++ kernels for balls and a transparent robot; results are the
-            same.
+            same (float64: to the last bit or two).
         in_keys: Keys of the four inputs, in the order above.
         out_keys: Keys of the two outputs, in the order above.
 

@@ -19,7 +19,8 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
-from egoskin.robots import RobotConfig, body_name
+from egoskin.chains import body_name
+from egoskin.robots import RobotConfig
 from egoskin.surface import (
     Patch,
     Surface,
@@ -227,7 +228,9 @@ def mesh_surface(robot: RobotConfig, links: Sequence[str], meshes: Meshes) -> Su
         ValueError: If a mesh's link or a link is not the robot's, the links carry no
             shape, or a link without meshes has a collision shape that is no primitive.
     """
-    for link in meshes:
+    for link, on_link in meshes.items():
+        if not on_link:
+            raise ValueError(f"meshes: none for {link!r}: leave it out")
         if link not in robot.links:
             raise ValueError(
                 f"{robot.name} has no link {link!r} to carry a mesh; its links are "

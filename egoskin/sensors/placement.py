@@ -212,6 +212,8 @@ def place_sensors(
     """
     _check(num_sensors, seed, method, spacing, stand_off)
     covered = tuple(robot.skin_links if links is None else links)
+    if not covered:
+        raise ValueError("place_sensors needs at least one link to cover")
     weights = _link_weights(covered, density or {})
     if meshes is None:
         surface = primitive_surface(robot, covered)

@@ -38,9 +38,9 @@ class RaySensor(ProximitySensor):
 
     Reads ``base_pose [*B, 7]``, ``joint_pos [*B, J]``, ``object_pose [*B, O, 7]`` and
     ``object_active [*B, O]``. Writes ``distance [*B, S, K]`` [m] (with ``reduce``
-    ``[*B, S]``), infinite where nothing is hit in range and NaN where the input is,
-    and ``object_detected [*B, O]``, whether any beam hits the object. A sensor inside
-    an object reads 0 on every beam. Distances are those of the state given.
+    ``[*B, S]``), infinite where nothing is hit in range and NaN where the input is
+    not finite, and ``object_detected [*B, O]``, whether any beam hits the object. A
+    sensor inside an object reads 0 on every beam. Distances are those of the state given.
 
     Only pairs of sensor and object whose bounding sphere reaches into the field of
     view are computed: a few per cent. The result is that of computing all.
@@ -57,7 +57,7 @@ class RaySensor(ProximitySensor):
         per_object: Objects told apart in a last dimension ``O``.
         cull: Skip pairs that cannot hit; results are the same.
         compile: Use C++ kernels for balls and a transparent robot; results are the
-            same.
+            same (float64: to the last bit or two).
         in_keys: Keys of the four inputs, in the order above.
         out_keys: Keys of the two outputs, in the order above.
 

@@ -7,6 +7,7 @@ the top, one sensor on each line.
 from __future__ import annotations
 
 import difflib
+import itertools
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -143,6 +144,8 @@ class Skin:
     """Turn of each sensor's frame about its normal [deg], ``[S]``; 0 by default."""
     radius: np.ndarray = field(default_factory=lambda: np.empty(0))
     """Radius of each sensor itself [m], ``[S]``; NaN if unknown."""
+    types: Mapping[str, Coverage] = field(default_factory=dict)
+    """Names of coverages, for the reader of the file; others are numbered."""
     provenance: Mapping[str, Any] = field(default_factory=dict)
     """How the skin was made, for the reader of the file."""
 
@@ -290,6 +293,7 @@ class Skin:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the skin as plain JSON values."""
+        names = {c: name for name, c in self.types.items()}
         types: dict[Coverage, str] = {}
         sensors = []
         for i, (link, coverage) in enumerate(
@@ -308,8 +312,12 @@ class Skin:
                     # JSON has no number for it.
                     entry[name] = "inf" if value == math.inf else value
             if coverage is not None:
-                number = len(types) + 1
-                entry["type"] = types.setdefault(coverage, f"type_{number}")
+                if coverage not in types:
+                    free = (f"type_{i}" for i in itertools.count(1))
+                    taken = {*types.values(), *names.values()}
+                    number = next(name for name in free if name not in taken)
+                    types[coverage] = names.get(coverage, number)
+                entry["type"] = types[coverage]
             sensors.append(entry)
         named = {
             name: {"coverage": type(c).__name__.lower(), **asdict(c)}
@@ -366,6 +374,7 @@ class Skin:
             range=column("range", np.nan),
             roll_deg=column("roll_deg", 0.0),
             radius=column("radius", np.nan),
+            types=types,
             provenance=content.get("provenance", {}),
         )
 
