@@ -31,8 +31,8 @@ class FieldSensor(ProximitySensor):
     Reads ``base_pose [*B, 7]``, ``joint_pos [*B, J]``, ``object_pose [*B, O, 7]`` and
     ``object_active [*B, O]``. Writes ``distance [*B, S]`` [m], infinite where nothing
     is in range and NaN where the input is not finite, and ``object_detected [*B, O]``,
-    whether any sensor detects the object. A sensor inside an object reads 0. Distances are
-    those of the state given: forward kinematics from the joint positions. (A sensor
+    whether any sensor detects the object. A sensor inside an object reads 0. Distances
+    are those of the state given: forward kinematics from the joint positions. (A sensor
     that measures to the centre reads the distance to it, inside as well.)
 
     A sensor with a half angle below 180 degrees sees an object if the object's

@@ -40,7 +40,8 @@ class RaySensor(ProximitySensor):
     ``object_active [*B, O]``. Writes ``distance [*B, S, K]`` [m] (with ``reduce``
     ``[*B, S]``), infinite where nothing is hit in range and NaN where the input is
     not finite, and ``object_detected [*B, O]``, whether any beam hits the object. A
-    sensor inside an object reads 0 on every beam. Distances are those of the state given.
+    sensor inside an object reads 0 on every beam. Distances are those of the state
+    given.
 
     Only pairs of sensor and object whose bounding sphere reaches into the field of
     view are computed: a few per cent. The result is that of computing all.
