@@ -172,11 +172,12 @@ class ProximitySensor(RowTransform):
         # Columns of the sensor frames in the link frames, [3 (axis), 3, S, 1].
         constant("_axes", skin.rotation().transpose(2, 1, 0)[..., None], torch.float64)
         constant("_range", skin.range[:, None], torch.float64)
-        # No object whose centre is farther from the base than this, plus its own
-        # radius, is in range in any pose of the robot [m].
+        # No object whose centre is farther from the base than this is in range in any
+        # pose of the robot [m], [O].
         reach = np.array(self._kinematics.reach())[self._link.numpy()]
         reach += np.linalg.norm(skin.position, axis=-1)
-        self._farthest = float((reach + skin.reach()).max()) + _SLACK
+        farthest = float((reach + skin.reach()).max()) + _SLACK
+        self._farthest = [farthest + shape.bounding_radius for shape in objects]
         self._kernels: Kernels | None = None
 
     def _use_kernels(self, kind: Literal["field", "ray"], **constants: Any) -> None:
@@ -204,6 +205,7 @@ class ProximitySensor(RowTransform):
             "offset": self._offset[..., 0].t().numpy(),
             "axes": self._axes[..., 0].permute(2, 0, 1).numpy(),
             "range": self._range.numpy(),
+            "farthest": np.array(self._farthest),
         }
         self._kernels = Kernels(kind, self._kinematics, balls, {**own, **constants})
 
@@ -443,8 +445,7 @@ class ProximitySensor(RowTransform):
         active: Tensor,
     ) -> Tensor:
         """Rows with an active object that may be in range, or with NaN, ``[n]``."""
-        bounds = [shape.bounding_radius for shape in self.objects]
-        limit = self._farthest + object_pose.new_tensor(bounds)
+        limit = object_pose.new_tensor(self._farthest)
         away = (object_pose[..., :3] - base_pose[:, None, :3]).square().sum(-1)
         away = away + self._poison(base_pose, joint_pos, object_pose)
         return (~(away > limit * limit) & active).any(1).nonzero()[:, 0]

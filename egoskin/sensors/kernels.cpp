@@ -39,6 +39,7 @@ struct Tables {
   const void *axes;            // of the sensor frame, one a row       [sensors, 3, 3]
   const void *range;           //                                      [sensors]
   const void *radius, *squared, *bound; // of each object              [objects]
+  const void *farthest;        // from the base that it is in range    [objects]
   // Field.
   const void *cos_half;        // null: every sensor sees all around   [sensors]
   const uint8_t *to_centre;    // null: all measure to the surface     [sensors]
@@ -158,34 +159,6 @@ template <class T> void transpose(V<T> (&x)[W]) {
   }
 }
 
-// Writes `count` numbers of each row, `stride` apart: vector i holds all numbers i.
-template <class T>
-void write_rows(const V<T> *numbers, int64_t count, int64_t rows, T *out,
-                int64_t stride) {
-  int64_t i = 0;
-  for (; i + W <= count; i += W) {
-    V<T> tile[W];
-    std::copy_n(numbers + i, W, tile);
-    // Rows are too many streams for the processor to foresee: two tiles ahead.
-    T *to = out + i;
-#pragma GCC unroll 16
-    for (int row = 0; row < W; row++)
-      __builtin_prefetch(to + row * stride + 2 * W, 1);
-    transpose<T>(tile);
-    if (rows == W) {
-      // Unrolled, so that the tile stays in registers.
-#pragma GCC unroll 16
-      for (int row = 0; row < W; row++)
-        std::memcpy(to + row * stride, &tile[row], sizeof(tile[row]));
-    } else {
-      for (int64_t row = 0; row < rows; row++)
-        std::memcpy(to + row * stride, &tile[row], sizeof(tile[row]));
-    }
-  }
-  for (; i < count; i++)
-    for (int64_t row = 0; row < rows; row++) out[row * stride + i] = numbers[i][row];
-}
-
 // sincos of compilation.py.
 template <class T> void sincos(V<T> x, V<T> &sine, V<T> &cosine) {
   constexpr int terms = sizeof(T) == 8 ? 9 : 5;
@@ -216,7 +189,8 @@ template <class T> struct Frame {
 // What is known of a block of rows.
 template <class T> struct Block {
   explicit Block(const Tables &t)
-      : turns(t.steps), frames(t.steps + 1), centre(t.objects * t.links), active(t.objects) {}
+      : turns(t.steps), frames(t.steps + 1), centre(t.objects * t.links),
+        active(t.objects) {}
 
   struct Turn {
     V<T> joint, sine, cosine;
@@ -237,12 +211,14 @@ template <class T> const T *as(const void *pointer) {
 
 enum Input { BASE, JOINT_POS, OBJECT_POSE, ACTIVE };
 
-// A block's part of the inputs; rows behind the last repeat it.
+// A block of rows and its part of the inputs; lanes behind the last row repeat it.
 struct Rows {
-  Rows(const Inputs &in, int64_t first) : in(in) {
+  // The rows from number `first` of a list on.
+  Rows(const Inputs &in, const std::vector<int64_t> &list, size_t first)
+      : in(in), count(std::min<int64_t>(W, list.size() - first)) {
+    for (int i = 0; i < W; i++) row[i] = list[std::min(first + i, list.size() - 1)];
     for (int input = 0; input < 4; input++)
-      for (int i = 0; i < W; i++)
-        offset[input][i] = std::min(first + i, in.rows - 1) * in.stride[input];
+      for (int i = 0; i < W; i++) offset[input][i] = row[i] * in.stride[input];
   }
 
   // One number of each row.
@@ -261,29 +237,86 @@ struct Rows {
   }
 
   const Inputs &in;
-  int64_t offset[4][W];
+  int count;
+  int64_t row[W], offset[4][W];
 };
 
-// Whether all numbers are neither NaN nor infinite, as most are: by their exponents.
-template <class T> bool finite(const Inputs &in, Input input, int64_t count) {
+// Writes `count` numbers of each row, `stride` apart: vector i holds all numbers i.
+template <class T>
+void write_rows(const V<T> *numbers, int64_t count, const Rows &rows, T *out,
+                int64_t stride) {
+  int64_t i = 0;
+  for (; i + W <= count; i += W) {
+    V<T> tile[W];
+    std::copy_n(numbers + i, W, tile);
+    // Rows are too many streams for the processor to foresee: two tiles ahead.
+    T *to = out + i;
+#pragma GCC unroll 16
+    for (int k = 0; k < W; k++)
+      __builtin_prefetch(to + rows.row[k] * stride + 2 * W, 1);
+    transpose<T>(tile);
+    // Lanes behind the last row write it again. Unrolled: the tile stays in registers.
+#pragma GCC unroll 16
+    for (int k = 0; k < W; k++)
+      std::memcpy(to + rows.row[k] * stride, &tile[k], sizeof(tile[k]));
+  }
+  for (; i < count; i++)
+    for (int k = 0; k < rows.count; k++) out[rows.row[k] * stride + i] = numbers[i][k];
+}
+
+// Whether `count` numbers of each row are neither NaN nor infinite, as most are: by
+// their exponents.
+template <class T>
+inline bool finite(const Inputs &in, Input input, int64_t first, int64_t count) {
   using Bits = std::conditional_t<sizeof(T) == 8, uint64_t, uint32_t>;
   const T infinity = std::numeric_limits<T>::infinity();
   Bits exponent, found = 0;
   std::memcpy(&exponent, &infinity, sizeof(T));
-  // Rows without a gap are one.
-  const bool dense = in.stride[input] == count;
-  const int64_t length = dense ? in.rows * count : count;
-  for (int64_t row = 0; row < (dense ? 1 : in.rows); row++) {
-    const Bits *data = as<Bits>(in.data[input]) + row * in.stride[input];
-    for (int64_t i = 0; i < length; i++)
+  const Bits *data = as<Bits>(in.data[input]) + first;
+  if (in.stride[input] == count) {
+    // Rows without a gap are one.
+    for (int64_t i = 0; i < in.rows * count; i++)
       found |= (data[i] & exponent) == exponent ? Bits(1) : Bits(0);
+    return !found;
   }
+  for (int64_t row = 0; row < in.rows; row++, data += in.stride[input])
+    for (int64_t i = 0; i < count; i++)
+      found |= (data[i] & exponent) == exponent ? Bits(1) : Bits(0);
   return !found;
 }
 
 template <class T> bool finite(const Tables &t, const Inputs &in) {
-  return finite<T>(in, BASE, 7) && finite<T>(in, JOINT_POS, t.joints) &&
-         finite<T>(in, OBJECT_POSE, 7 * t.objects);
+  bool all = finite<T>(in, BASE, 0, 7) && finite<T>(in, JOINT_POS, 0, t.joints);
+  for (int64_t object = 0; object < t.objects; object++)
+    all = all && finite<T>(in, OBJECT_POSE, 7 * object, 7);
+  return all;
+}
+
+// ProximitySensor._rows_in_reach: rows in which an active object may be in range,
+// whatever the pose of the robot, or is NaN. In all others nothing is sensed.
+template <class T>
+std::vector<int64_t> rows_in_reach(const Tables &t, const Inputs &in, bool finite) {
+  std::vector<int64_t> rows(in.rows);
+  size_t count = 0;
+  for (int64_t row = 0; row < in.rows; row++) {
+    const T *base = as<T>(in.data[BASE]) + row * in.stride[BASE];
+    const T *pose = as<T>(in.data[OBJECT_POSE]) + row * in.stride[OBJECT_POSE];
+    const uint8_t *active = as<uint8_t>(in.data[ACTIVE]) + row * in.stride[ACTIVE];
+    T turn = 0;
+    for (int i = 3; i < 7; i++) turn += base[i] * base[i];
+    bool near = false;
+    for (int64_t object = 0; object < t.objects; object++, pose += 7) {
+      const T farthest = as<T>(t.farthest)[object];
+      T away = 0;
+      for (int i = 0; i < 3; i++) away += (pose[i] - base[i]) * (pose[i] - base[i]);
+      const bool beyond = (away > farthest * farthest) & (turn > 0) & finite;
+      near |= bool(active[object]) & !beyond;
+    }
+    rows[count] = row;
+    count += near;
+  }
+  rows.resize(count);
+  return rows;
 }
 
 // LinkKinematics: the frames of all steps.
@@ -372,15 +405,15 @@ void field(const Tables &t, const Inputs &in, T *out, uint8_t *detected) {
   Block<T> block(t);
   block.finite = finite<T>(t, in);
   std::vector<V<T>> nearest(t.sensors);
-  for (int64_t row = 0; row < in.rows; row += W) {
-    int64_t count = std::min<int64_t>(W, in.rows - row);
-    const Rows rows(in, row);
+  const std::vector<int64_t> reached = rows_in_reach<T>(t, in, block.finite);
+  for (size_t first = 0; first < reached.size(); first += W) {
+    const Rows rows(in, reached, first);
     place_frames<T>(t, rows, block);
     place_objects<T>(t, rows, block);
     for (int64_t object = 0; object < t.objects; object++) {
       auto on = block.active[object] != T(0);
       auto found = on & ~on;
-      bool first = t.apart || object == 0;
+      const bool only = t.apart || object == 0;
       for (int64_t sensor = 0; sensor < t.sensors; sensor++) {
         V<T> v[3];
         to_centre<T>(t, block, object, sensor, v);
@@ -399,26 +432,36 @@ void field(const Tables &t, const Inputs &in, T *out, uint8_t *detected) {
         auto gone = (distance > as<T>(t.range)[sensor]) | ~on;
         distance = gone ? filled<T>(inf) : distance;
         found |= distance != inf;
-        nearest[sensor] = first ? distance : least<T>(nearest[sensor], distance);
+        nearest[sensor] = only ? distance : least<T>(nearest[sensor], distance);
       }
-      for (int64_t i = 0; i < count; i++)
-        detected[(row + i) * t.objects + object] = found[i] != 0;
+      for (int i = 0; i < rows.count; i++)
+        detected[rows.row[i] * t.objects + object] = found[i] != 0;
       if (t.apart)
-        write_rows<T>(nearest.data(), t.sensors, count,
-                      out + (object * in.rows + row) * t.sensors, t.sensors);
+        write_rows<T>(nearest.data(), t.sensors, rows,
+                      out + object * in.rows * t.sensors, t.sensors);
     }
-    if (!t.apart)
-      write_rows<T>(nearest.data(), t.sensors, count, out + row * t.sensors, t.sensors);
+    if (!t.apart) write_rows<T>(nearest.data(), t.sensors, rows, out, t.sensors);
   }
+  // All other rows.
+  T *next = out;
+  for (int64_t plane = 0; plane < (t.apart ? t.objects : 1); plane++)
+    for (int64_t row : reached) {
+      T *read = out + (plane * in.rows + row) * t.sensors;
+      std::fill(next, read, inf);
+      next = read + t.sensors;
+    }
+  std::fill(next, out + (t.apart ? t.objects : 1) * in.rows * t.sensors, inf);
 }
 
 // ProximitySensor.poses_b: position [rows, sensors, 3], rotation [rows, sensors, 3, 3].
 template <class T>
 void poses(const Tables &t, const Inputs &in, T *position, T *rotation) {
   Block<T> block(t);
-  for (int64_t row = 0; row < in.rows; row += W) {
-    int64_t count = std::min<int64_t>(W, in.rows - row);
-    place_frames<T>(t, Rows(in, row), block);
+  std::vector<int64_t> all(in.rows);
+  std::iota(all.begin(), all.end(), 0);
+  for (size_t begin = 0; begin < all.size(); begin += W) {
+    const Rows rows(in, all, begin);
+    place_frames<T>(t, rows, block);
     // As many sensors as make whole vectors of a row.
     for (int64_t first = 0; first < t.sensors; first += W) {
       int64_t some = std::min<int64_t>(W, t.sensors - first);
@@ -436,9 +479,8 @@ void poses(const Tables &t, const Inputs &in, T *position, T *rotation) {
           }
         }
       }
-      int64_t place = row * t.sensors + first;
-      write_rows<T>(&p[0][0], 3 * some, count, position + 3 * place, 3 * t.sensors);
-      write_rows<T>(&r[0][0][0], 9 * some, count, rotation + 9 * place, 9 * t.sensors);
+      write_rows<T>(&p[0][0], 3 * some, rows, position + 3 * first, 3 * t.sensors);
+      write_rows<T>(&r[0][0][0], 9 * some, rows, rotation + 9 * first, 9 * t.sensors);
     }
   }
 }
@@ -543,55 +585,62 @@ void each_reading(const Tables &t, const std::vector<Pair<T>> &pairs, V<T> *read
   }
 }
 
-// RaySensor: the block's rows, and then each of its readings that is not infinite.
-template <class T, class Begin, class Deliver>
-void rays(const Tables &t, const Inputs &in, uint8_t *detected, Begin begin,
-          Deliver deliver) {
+// RaySensor: the readings that are not infinite, in the order of the grid.
+template <class T, class Deliver>
+void rays(const Tables &t, const Inputs &in, uint8_t *detected, Deliver deliver) {
   Block<T> block(t);
   std::vector<Pair<T>> pairs[W];
   const int64_t vectors = (t.beams * t.sub_beams + W - 1) / W;
   std::vector<V<T>> buffer(2 * vectors);
   block.finite = finite<T>(t, in);
-  std::fill_n(detected, in.rows * t.objects, uint8_t(0));
-  for (int64_t row = 0; row < in.rows; row += W) {
-    int64_t count = std::min<int64_t>(W, in.rows - row);
-    const Rows rows(in, row);
+  const std::vector<int64_t> reached = rows_in_reach<T>(t, in, block.finite);
+  for (size_t first = 0; first < reached.size(); first += W) {
+    const Rows rows(in, reached, first);
     place_frames<T>(t, rows, block);
     place_objects<T>(t, rows, block);
-    find_pairs<T>(t, block, count, pairs);
-    begin(row, count);
-    for (int64_t i = row; i < row + count; i++)
-      each_reading<T>(t, pairs[i - row], buffer.data(), buffer.data() + vectors,
-                      detected + i * t.objects,
+    find_pairs<T>(t, block, rows.count, pairs);
+    for (int i = 0; i < rows.count; i++)
+      each_reading<T>(t, pairs[i], buffer.data(), buffer.data() + vectors,
+                      detected + rows.row[i] * t.objects,
                       [&](const Pair<T> &pair, const T *reading, T nearest) {
-                        deliver(i, pair, reading, nearest);
+                        deliver(rows.row[i], pair, reading, nearest);
                       });
   }
 }
 
-// A large grid, written from its first number to its last and past the cache, which
-// it would empty: so the processor need not read what it overwrites.
+// A large array, written from its first number to its last: past the cache, which it
+// would empty, so that the processor need not read what it overwrites.
 template <class T> class Stream {
 public:
-  // Whether a grid is one to stream: far larger than a cache, and of whole lines.
-  static bool serves(const T *out, int64_t beams, int64_t size) {
+  // Whether an array is one to write past the cache: far larger than it, and of pieces
+  // that are whole lines.
+  static bool serves(const T *out, int64_t piece, int64_t size) {
 #ifdef __SSE2__
-    return size * sizeof(T) > MANY && beams * sizeof(T) % LINE == 0 &&
+    return size * sizeof(T) > MANY && piece * sizeof(T) % LINE == 0 &&
            reinterpret_cast<uintptr_t>(out) % LINE == 0;
 #else
     return false;
 #endif
   }
 
-  explicit Stream(T *out) : next(out) {}
+  Stream(T *out, bool past_cache) : next(out), past_cache(past_cache) {}
 
-  void fill(const T *end, T value) {
+  void fill(T *end, T value) {
+    if (!past_cache) {
+      std::fill(next, end, value);
+      next = end;
+      return;
+    }
     T line[LINE / sizeof(T)];
     std::fill_n(line, LINE / sizeof(T), value);
     while (next < end) write(line);
   }
 
   void copy(const T *from, int64_t count) {
+    if (!past_cache) {
+      next = std::copy_n(from, count, next);
+      return;
+    }
     for (const T *end = next + count; next < end; from += LINE / sizeof(T)) write(from);
   }
 
@@ -605,6 +654,7 @@ public:
 private:
   static constexpr size_t MANY = 32 << 20, LINE = 64; // [bytes]
   T *next;
+  bool past_cache;
 
   void write(const T *line) {
 #ifdef __SSE2__
@@ -623,31 +673,17 @@ void ray(const Tables &t, const Inputs &in, T *out, uint8_t *detected) {
   const T inf = std::numeric_limits<T>::infinity();
   const int64_t beams = t.reduce ? 1 : t.beams, size = t.sensors * beams;
   const int64_t planes = t.apart ? t.objects : 1, plane = in.rows * size;
-  const bool stream = Stream<T>::serves(out, beams, planes * plane);
+  const bool past_cache = Stream<T>::serves(out, beams, planes * plane);
   std::vector<Stream<T>> streams;
-  for (int64_t i = 0; i < planes; i++) streams.emplace_back(out + i * plane);
-  rays<T>(
-      t, in, detected,
-      [&](int64_t row, int64_t count) {
-        for (int64_t i = 0; !stream && i < planes; i++)
-          std::fill_n(out + i * plane + row * size, count * size, inf);
-      },
-      [&](int64_t row, const Pair<T> &pair, const T *reading, T nearest) {
-        const int64_t i = t.apart ? pair.object : 0;
-        T *place = out + i * plane + row * size + pair.sensor * beams;
-        if (stream) {
-          streams[i].fill(place, inf);
-          streams[i].copy(reading, beams);
-        } else if (t.reduce) {
-          *place = nearest;
-        } else {
-          std::copy_n(reading, beams, place);
-        }
-      });
-  if (stream) {
-    for (int64_t i = 0; i < planes; i++) streams[i].fill(out + (i + 1) * plane, inf);
-    Stream<T>::finish();
-  }
+  for (int64_t i = 0; i < planes; i++) streams.emplace_back(out + i * plane, past_cache);
+  rays<T>(t, in, detected,
+          [&](int64_t row, const Pair<T> &pair, const T *reading, T nearest) {
+            const int64_t i = t.apart ? pair.object : 0;
+            streams[i].fill(out + i * plane + row * size + pair.sensor * beams, inf);
+            streams[i].copy(t.reduce ? &nearest : reading, beams);
+          });
+  for (int64_t i = 0; i < planes; i++) streams[i].fill(out + (i + 1) * plane, inf);
+  Stream<T>::finish();
 }
 
 // RaySensor.hits: places in the grid, ascending, and readings; returns their number,
@@ -658,18 +694,17 @@ int64_t hits(const Tables &t, const Inputs &in, int64_t capacity, int64_t *place
   const T inf = std::numeric_limits<T>::infinity();
   std::vector<uint8_t> detected(in.rows * t.objects);
   int64_t found = 0;
-  rays<T>(
-      t, in, detected.data(), [](int64_t, int64_t) {},
-      [&](int64_t row, const Pair<T> &pair, const T *read, T) {
-        for (int64_t k = 0; k < t.beams; k++) {
-          if (read[k] == inf) continue;
-          if (found < capacity) {
-            place[found] = (row * t.sensors + pair.sensor) * t.beams + k;
-            reading[found] = read[k];
-          }
-          found++;
-        }
-      });
+  rays<T>(t, in, detected.data(),
+          [&](int64_t row, const Pair<T> &pair, const T *read, T) {
+            for (int64_t k = 0; k < t.beams; k++) {
+              if (read[k] == inf) continue;
+              if (found < capacity) {
+                place[found] = (row * t.sensors + pair.sensor) * t.beams + k;
+                reading[found] = read[k];
+              }
+              found++;
+            }
+          });
   return found;
 }
 

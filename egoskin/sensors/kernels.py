@@ -29,7 +29,7 @@ _COUNTS = (
 _ARRAYS = (
     *("joint", "parent", "frame", "link"),
     *("constant", "by_cos", "by_sin", "shift", "slide"),
-    *("offset", "axes", "range", "radius", "squared", "bound"),
+    *("offset", "axes", "range", "radius", "squared", "bound", "farthest"),
     *("cos_half", "to_centre"),
     *("reach", "pyramid", "directions", "grid", "depth"),
 )
@@ -129,7 +129,7 @@ class Kernels:
         Args:
             inputs: Base pose, joint positions, object poses, active flags.
             out: Readings [m], contiguous.
-            detected: ``[B, O]``, contiguous.
+            detected: ``[B, O]``, contiguous; false before.
         """
         self._call(self._kind, inputs, _address(out), _address(detected))
 
