@@ -37,13 +37,8 @@ class ProgressLine:
             f"success {success}  "
             f"reward {metrics['reward/mean']:+.4f}"
         )
-        for name, what in (
-            ("ball_speed", "ball speed"),
-            ("ball_core", "what of a ball touches"),
-            ("drift_price", "price of drift"),
-        ):
-            if metrics[f"ease/{name}"] < 1:
-                text += f"  {what} {metrics[f'ease/{name}']:.0%}"
+        if metrics["task/ball_speed"] < 1:
+            text += f"  ball speed {metrics['task/ball_speed']:.0%}"
         if self._live:
             print(f"\r{text}\x1b[K", end="", flush=True)
         elif now - self._shown >= _FILE_INTERVAL or frames >= self._total:

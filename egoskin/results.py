@@ -48,6 +48,9 @@ _NO_RECIPE = {
 _COVERAGES = ("oracle", "field", "ray", "none")
 _SIGNALS = ("localization", "proximity", "closeness", "binary")
 _CELL = {"env.sensor.coverage", "env.sensor.signal", "env.sensor.range"}
+# Options of stored runs that are no more, and their values without effect: steps over
+# which what of a ball touches grew, and the price of the distance from the start.
+_RETIRED = {"core_frames": [0, 0], "drift_frames": [0, 0]}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,6 +79,8 @@ class StoredRun:
     """Name of the folder."""
     config: TrainConfig
     """Its configuration."""
+    retired: dict[str, Any]
+    """What it used of options that are no more."""
     record: Record
     """How it was made."""
     frames: np.ndarray
@@ -94,8 +99,9 @@ class StoredRun:
     @property
     def recipe(self) -> str:
         """What else differs from the default, "" if nothing does."""
+        retired = [f"{name}={value}" for name, value in self.retired.items()]
         own = [x for x in self._changes() if not x.startswith("env.sensor.")]
-        return ", ".join(_short(own))
+        return ", ".join(retired + _short(own))
 
     def _changes(self) -> list[str]:
         """Return "field=value" of all that differs from the default and matters."""
@@ -264,9 +270,14 @@ def _load(path: Path) -> StoredRun:
     ).reshape(-1, 2)
     # No estimate before an episode could have lasted so long.
     curve = curve[np.isfinite(curve[:, 1])]
+    content = json.loads((path / "config.json").read_text())
+    content.pop("drift_start", None)
+    used = {name: content.pop(name, off) for name, off in _RETIRED.items()}
+    retired = {name: used[name] for name in used if used[name] != _RETIRED[name]}
     return StoredRun(
         name=path.name,
-        config=Run.open(path).config,
+        config=from_plain(TrainConfig, content, str(path / "config.json")),
+        retired=retired,
         record=from_plain(Record, json.loads(what.read_text()), str(what)),
         frames=curve[:, 0],
         success=curve[:, 1],

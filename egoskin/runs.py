@@ -39,7 +39,6 @@ from egoskin.checkpoint import PARTIAL, load_tensors, save_tensors, sync, write_
 from egoskin.cli import changed_fields, from_plain, to_plain
 from egoskin.compilation import can_compile
 from egoskin.draws import check_seed
-from egoskin.envs.dodgeball import Ease
 from egoskin.events import EventFile
 from egoskin.make import EnvConfig, check_num_workers
 from egoskin.policies import CHECKPOINT_NAME
@@ -62,19 +61,6 @@ class TrainConfig:
     slow_start_frames: int = 12_288_000
     """Environment steps over which that share grows to 1 (a curriculum); 0: the full
     speed from the start, as in the paper."""
-    core_frames: tuple[int, int] = (5_851_429, 20_480_000)
-    """Environment steps up to which only the centre of a ball touches the robot, and
-    from which on all of it does; a core that grows in between (a curriculum). The
-    sensors always feel the whole ball. (0, 0): all of it from the start, as in the
-    paper."""
-    drift_start: float = 0.1
-    """Share of its price (`task.reward.drift_distance`) that the distance from the
-    start costs at first: dodging is found sooner where drift is cheap, and where it
-    stays cheap a robot that leaps about blindly does as well as one that feels."""
-    drift_frames: tuple[int, int] = (6_000_000, 14_000_000)
-    """Environment steps up to which it costs that share, and from which on all; a
-    share that grows in between (a curriculum). (0, 0): all from the start, as in the
-    paper."""
     seed: int = 0
     """Seed of everything random: throws, starts, networks, actions."""
     total_frames: int = 65_536_000
@@ -115,14 +101,6 @@ class TrainConfig:
             raise ValueError(
                 f"slow_start_frames must not be negative, got {self.slow_start_frames}"
             )
-        if not 0 <= self.drift_start <= 1:
-            raise ValueError(f"drift_start must be from 0 to 1, got {self.drift_start}")
-        for name in ("core_frames", "drift_frames"):
-            first, last = getattr(self, name)
-            if not 0 <= first <= last:
-                raise ValueError(
-                    f"{name} must be neither negative nor falling, got {first} {last}"
-                )
         if self.learner_threads is not None and self.learner_threads < 1:
             raise ValueError(
                 f"learner_threads must be at least 1, got {self.learner_threads}"
@@ -144,13 +122,12 @@ class TrainConfig:
         """Environment steps of one rollout."""
         return self.num_envs * self.ppo.rollout_steps
 
-    def ease_at(self, frames: int) -> Ease:
-        """Return how easy the task is after a number of environment steps."""
-        return Ease(
-            ball_speed=_grown(frames, 0, self.slow_start_frames, self.slow_start),
-            ball_core=_grown(frames, *self.core_frames),
-            drift_price=_grown(frames, *self.drift_frames, self.drift_start),
-        )
+    def ball_speed_at(self, frames: int) -> float:
+        """Return the share of their speed that balls have after so many steps."""
+        if frames >= self.slow_start_frames:
+            return 1.0
+        done = frames / self.slow_start_frames
+        return self.slow_start + (1.0 - self.slow_start) * done
 
     def check_machine(self) -> None:
         """Raise ValueError for what this machine lacks: the device, a C++ compiler."""
@@ -397,13 +374,6 @@ class Run:
         """Close the logs."""
         if self._events is not None:
             self._events.close()
-
-
-def _grown(frames: int, first: int, last: int, start: float = 0.0) -> float:
-    """Return a share that is `start` up to a number of frames and 1 from another on."""
-    if not first < frames < last:
-        return 1.0 if frames >= last else start
-    return start + (1.0 - start) * (frames - first) / (last - first)
 
 
 def _version(package: str) -> str | None:

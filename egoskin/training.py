@@ -22,7 +22,6 @@ from egoskin.agents.ppo import PPO, NonFiniteError
 from egoskin.checkpoint import part, prefixed, save_tensors
 from egoskin.cli import to_plain
 from egoskin.collection import collect
-from egoskin.envs.dodgeball import Ease
 from egoskin.envs.rewards import TERMS
 from egoskin.make import load_env_state, make_env, save_env_state
 from egoskin.policies import (
@@ -79,18 +78,18 @@ class Trainer:
         self.frames = 0
         self.wall_s = 0.0
         self.root: TensorDictBase = TensorDict()
-        self._ease = Ease()
+        self._ball_speed = 1.0
 
-    def _ease_as_due(self) -> None:
-        """Let the task be as easy as is due by now."""
-        due = self.config.ease_at(self.frames)
-        if due != self._ease:
-            self.env.ease(due)
-            self._ease = due
+    def _throw_as_due(self) -> None:
+        """Let balls be as fast as is due by now."""
+        due = self.config.ball_speed_at(self.frames)
+        if due != self._ball_speed:
+            self.env.set_ball_speed(due)
+            self._ball_speed = due
 
     def start(self) -> None:
         """Begin a new run: first observations, first policy, first checkpoint."""
-        self._ease_as_due()
+        self._throw_as_due()
         self.root = self.env.reset()
         self.keep_policy()
         self.save()
@@ -103,7 +102,7 @@ class Trainer:
             WorkerError: If a worker ends.
         """
         start = time.perf_counter()
-        self._ease_as_due()
+        self._throw_as_due()
         rollout, self.root, infos = collect(
             self.env,
             self.agent,
@@ -127,7 +126,7 @@ class Trainer:
             "time/wall_s": self.wall_s,
             "time/steps_per_s": self.config.frames_per_batch / (end - start),
             "time/collect_share": (collected - start) / (end - start),
-            **{f"ease/{k}": v for k, v in dataclasses.asdict(self._ease).items()},
+            "task/ball_speed": self._ball_speed,
             **self._episode_metrics(TensorDict.maybe_dense_stack(infos)),
             **{f"ppo/{name}": value for name, value in learned.items()},
         }
@@ -197,7 +196,7 @@ class Trainer:
         torch.set_rng_state(tensors["random_state"])
         if self.device.type == "cuda":
             torch.cuda.set_rng_state(tensors["random_state_cuda"], self.device)
-        self._ease_as_due()
+        self._throw_as_due()
 
     def dump(self, error: NonFiniteError) -> Path:
         """Write what `scripts/replay.py` needs to meet an error again; return where."""

@@ -155,8 +155,6 @@ def main(args: list[str]) -> None:
                     # A task that grows harder, with balls that soon arrive.
                     slow_start=0.8,
                     slow_start_frames=frames,
-                    core_frames=(0, frames),
-                    drift_frames=(0, frames),
                 )
                 half = config.iterations // 2
                 equal &= agree(planned, Path(folder), title, half)

@@ -221,33 +221,6 @@ def test_a_ball_on_the_head_touches_the_head_alone(crown):
     assert not step(physics).object_hit.any()
 
 
-@pytest.mark.parametrize(
-    ("depth", "touching"), [(0.01, 1.0), (0.08, 0.5), (0.149, 0.0)]
-)
-def test_only_the_core_of_a_ball_touches(crown, depth, touching):
-    """A ball some way into the head is felt from a certain core on."""
-    radius = BALLS[0].radius
-    physics = make(1)
-    for share in (0.0, 0.5, 1.0, 0.5):
-        put(physics, height=0.5)
-        physics.set_object_core(share)
-        throw(physics, 0, np.add(crown, [0, 0, 0.5 + radius - depth]))
-        assert bool(step(physics).object_hit[0, 0]) == (share >= touching)
-
-
-def test_a_ball_that_was_a_core_is_a_whole_ball_again(crown):
-    eased, whole = make(2), make(2)
-    eased.set_object_core(0.3)
-    step(eased)
-    eased.set_object_core(1.0)
-    for physics in (eased, whole):
-        put(physics)
-        throw(physics, 0, np.add(crown, [0.05, 0, 0.2]), (0.0, 0, -3))
-        for _ in range(20):
-            step(physics)
-    assert torch.equal(eased.state(), whole.state())
-
-
 @pytest.mark.parametrize("where", ["first", "second", "neither"])
 def test_a_contact_in_a_single_substep_is_seen(crown, where):
     # The ball crosses half a metre in a substep (60 m/s at 120 Hz), weightless and

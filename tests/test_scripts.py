@@ -12,7 +12,6 @@ import subprocess
 import sys
 import time
 from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import astuple, fields
 from pathlib import Path
 
 import pytest
@@ -20,7 +19,6 @@ import torch
 
 import egoskin
 from egoskin.checkpoint import load_tensors
-from egoskin.envs.dodgeball import Ease
 from egoskin.runs import TrainConfig
 from egoskin.workers import WorkerPool
 
@@ -91,33 +89,24 @@ def test_a_run_folder_holds_what_is_needed_to_understand_it(trained: Path):
     assert names == ["000000000000", f"{4 * BATCH:012d}"]
 
 
-def test_the_task_is_easy_at_first(tmp_path: Path, monkeypatch):
-    eased = []
-    ease = WorkerPool.ease
+def test_balls_are_slow_at_first(tmp_path: Path, monkeypatch):
+    shares = []
+    set_ball_speed = WorkerPool.set_ball_speed
     monkeypatch.setattr(
-        *(WorkerPool, "ease"),
-        lambda pool, share: eased.append(astuple(share)) or ease(pool, share),
+        *(WorkerPool, "set_ball_speed"),
+        lambda pool, share: shares.append(share) or set_ball_speed(pool, share),
     )
-    args = ("--slow-start-frames", 2 * BATCH, "--core-frames", BATCH, 3 * BATCH)
-    args += ("--drift-frames", 0, 3 * BATCH, "--total-frames", 5 * BATCH)
+    args = ("--slow-start-frames", 2 * BATCH, "--total-frames", 4 * BATCH)
     done = run("ppo.py", *SMALL, "--run-dir", tmp_path / "run", *args)
     assert done.returncode == 0, done.stderr
-    due = [(0.4, 0.0, 0.1), (0.7, 0.0, 0.4), (1.0, 0.5, 0.7), (1.0, 1.0, 1.0)]
-    assert eased == [pytest.approx(shares) for shares in due]
-    logged = [
-        tuple(float(row[f"ease/{field.name}"]) for field in fields(Ease))
-        for row in metrics(tmp_path / "run")
-    ]
-    assert logged == [pytest.approx(shares) for shares in [*due, due[-1]]]
-    eased = "ball speed 40%  what of a ball touches 0%  price of drift 10%"
-    assert eased in done.stdout
+    assert shares == pytest.approx([0.4, 0.7, 1.0])
+    logged = [float(row["task/ball_speed"]) for row in metrics(tmp_path / "run")]
+    assert logged == pytest.approx([0.4, 0.7, 1.0, 1.0])
+    assert "ball speed 40%" in done.stdout
 
 
-def test_what_grows_may_grow_at_once():
-    config = TrainConfig(core_frames=(5, 5), drift_frames=(7, 7), slow_start_frames=0)
-    assert astuple(config.ease_at(4)) == (1.0, 0.0, 0.1)
-    assert astuple(config.ease_at(5)) == (1.0, 1.0, 0.1)
-    assert astuple(config.ease_at(7)) == (1.0, 1.0, 1.0)
+def test_balls_may_be_fast_at_once():
+    assert TrainConfig(slow_start_frames=0).ball_speed_at(0) == 1.0
 
 
 @pytest.mark.parametrize(
@@ -126,14 +115,9 @@ def test_what_grows_may_grow_at_once():
         {"slow_start": 0.0},
         {"slow_start": 1.5},
         {"slow_start_frames": -1},
-        {"core_frames": (-1, 1)},
-        {"core_frames": (2, 1)},
-        {"drift_start": -0.1},
-        {"drift_start": 1.1},
-        {"drift_frames": (2, 1)},
     ],
 )
-def test_an_easy_start_outside_its_range_is_refused(field: dict):
+def test_a_slow_start_outside_its_range_is_refused(field: dict):
     with pytest.raises(ValueError, match=next(iter(field))):
         TrainConfig(**field)
 

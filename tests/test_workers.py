@@ -18,7 +18,6 @@ from torchrl.envs import Transform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from egoskin import watchdog
-from egoskin.envs.dodgeball import Ease
 from egoskin.make import (
     EnvConfig,
     load_env_state,
@@ -107,7 +106,7 @@ def test_every_worker_slows_its_balls(skin):
     try:
         whole = pool.reset().reshape(-1)["signal"]
         pool.set_seed(5, static_seed=True)
-        pool.ease(Ease(ball_speed=0.5))
+        pool.set_ball_speed(0.5)
         half = pool.reset().reshape(-1)["signal"]
     finally:
         pool.close()

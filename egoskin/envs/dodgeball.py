@@ -23,18 +23,6 @@ _PASSED_DISTANCE = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ease:
-    """What is easier at the start of a training: shares of the task's own figures."""
-
-    ball_speed: float = 1.0
-    """Of the speed drawn, from the next throw on."""
-    ball_core: float = 1.0
-    """Of a ball's radius: what touches the robot. The sensors feel the whole ball."""
-    drift_price: float = 1.0
-    """Of the price of the distance from the start (`RewardConfig.drift_distance`)."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class DodgeballConfig:
     """The task: robot actuation, throws, rewards, start and end of an episode."""
 
@@ -179,7 +167,6 @@ class DodgeballEnv(EnvBase):
         self._joint_range = torch.from_numpy(robot.joint_range).float()
         self._may_touch_floor = torch.tensor([n in robot.feet for n in robot.links])
         self._ball_speed = 1.0
-        self._reward = config.reward
         self._rows = torch.arange(num_envs) + row_offset
         balls = config.throws.num_balls
         zeros = torch.zeros(num_envs, dtype=torch.int64)
@@ -267,13 +254,12 @@ class DodgeballEnv(EnvBase):
             )
         return self._physics
 
-    def ease(self, ease: Ease) -> None:
-        """Make the task easier, for the start of a training; no part of the state."""
-        self._ball_speed = ease.ball_speed
-        self.physics.set_object_core(ease.ball_core)
-        reward = self.config.reward
-        price = ease.drift_price * reward.drift_distance
-        self._reward = replace(reward, drift_distance=price)
+    def set_ball_speed(self, share: float) -> None:
+        """Throw with a share of the speed drawn, from the next throw on.
+
+        For the start of a training; no part of the state.
+        """
+        self._ball_speed = share
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
@@ -391,7 +377,7 @@ class DodgeballEnv(EnvBase):
             state.base_pose.new_tensor([0, 0, -1.0]).expand(len(action), 3),
         )
         terms = reward_terms(
-            self._reward,
+            self.config.reward,
             gravity_b=gravity_b,
             joint_deviation=state.joint_pos - self._default,
             power=result.power,

@@ -28,8 +28,6 @@ from egoskin.shapes import Sphere
 _BALL_BIT, _FLOOR_BIT = 1, 2
 # Inactive objects wait here, far above everything [m].
 _PARKING = np.array([0.0, 0.0, 1000.0])
-# MuJoCo has no spheres without a radius: a point has this share of it.
-_LEAST_CORE = 0.01
 # A faster robot than this has left physics behind: the row is reset and counted.
 _MAX_SPEED = 200.0
 
@@ -384,14 +382,6 @@ class Physics:
             object_pose=torch.cat((object_pos, object_quat), -1),
             object_lin_vel_w=qvel[:, self._object_v].unflatten(-1, (-1, 3)).clone(),
         )
-
-    def set_object_core(self, share: float) -> None:
-        """Let only a core of each object collide: a share in [0, 1] of its radius."""
-        ids = [self.model.geom(f"object_{i}").id for i in range(self.num_objects)]
-        share = max(share, _LEAST_CORE)
-        for name in ("geom_size", "geom_rbound"):
-            values = self._batch.expand(name)
-            values[:, ids] = share * getattr(self.model, name)[ids]
 
     def state(self) -> Tensor:
         """Return everything needed to continue bit for bit, ``[B, n]`` float64."""

@@ -28,7 +28,7 @@ class RewardConfig:
     """Times the mechanical power, sum |torque x velocity| [W]."""
     drift_speed: float = -0.01
     """Drift: times the squared planar speed of the base [m^2/s^2]."""
-    drift_distance: float = -0.3
+    drift_distance: float = -0.1
     """Drift: times the squared planar distance from the start [m^2], at most 4."""
     action_rate: float = -5e-4
     """Times the mean squared change of the action since the last step."""
