@@ -37,8 +37,6 @@ class ProgressLine:
             f"success {success}  "
             f"reward {metrics['reward/mean']:+.4f}"
         )
-        if metrics["task/ball_speed"] < 1:
-            text += f"  ball speed {metrics['task/ball_speed']:.0%}"
         if self._live:
             print(f"\r{text}\x1b[K", end="", flush=True)
         elif now - self._shown >= _FILE_INTERVAL or frames >= self._total:

@@ -49,8 +49,9 @@ _COVERAGES = ("oracle", "field", "ray", "none")
 _SIGNALS = ("localization", "proximity", "closeness", "binary")
 _CELL = {"env.sensor.coverage", "env.sensor.signal", "env.sensor.range"}
 # Options of stored runs that are no more, and their values without effect: steps over
-# which what of a ball touches grew, and the price of the distance from the start.
-_RETIRED = {"core_frames": [0, 0], "drift_frames": [0, 0]}
+# which what of a ball touches grew, the price of the distance from the start (from
+# "drift_start" on), and the speed of the balls (from "slow_start", 0.4 of it, on).
+_RETIRED = {"core_frames": [0, 0], "drift_frames": [0, 0], "slow_start_frames": 0}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -272,6 +273,7 @@ def _load(path: Path) -> StoredRun:
     curve = curve[np.isfinite(curve[:, 1])]
     content = json.loads((path / "config.json").read_text())
     content.pop("drift_start", None)
+    content.pop("slow_start", None)
     used = {name: content.pop(name, off) for name, off in _RETIRED.items()}
     retired = {name: used[name] for name in used if used[name] != _RETIRED[name]}
     return StoredRun(

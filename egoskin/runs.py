@@ -55,12 +55,6 @@ class TrainConfig:
     """Robot, task, skin, sensors."""
     ppo: PPOConfig = field(default_factory=PPOConfig)
     """Networks and PPO."""
-    slow_start: float = 0.4
-    """Share of their speed that balls are thrown with at first. Evaluation always
-    throws at the full speed."""
-    slow_start_frames: int = 12_288_000
-    """Environment steps over which that share grows to 1 (a curriculum); 0: the full
-    speed from the start, as in the paper."""
     seed: int = 0
     """Seed of everything random: throws, starts, networks, actions."""
     total_frames: int = 65_536_000
@@ -93,14 +87,6 @@ class TrainConfig:
                     f"{name} must be at least 1, got {getattr(self, name)}"
                 )
         check_seed(self.seed)
-        if not 0 < self.slow_start <= 1:
-            raise ValueError(
-                f"slow_start must be above 0 and at most 1, got {self.slow_start}"
-            )
-        if self.slow_start_frames < 0:
-            raise ValueError(
-                f"slow_start_frames must not be negative, got {self.slow_start_frames}"
-            )
         if self.learner_threads is not None and self.learner_threads < 1:
             raise ValueError(
                 f"learner_threads must be at least 1, got {self.learner_threads}"
@@ -121,13 +107,6 @@ class TrainConfig:
     def frames_per_batch(self) -> int:
         """Environment steps of one rollout."""
         return self.num_envs * self.ppo.rollout_steps
-
-    def ball_speed_at(self, frames: int) -> float:
-        """Return the share of their speed that balls have after so many steps."""
-        if frames >= self.slow_start_frames:
-            return 1.0
-        done = frames / self.slow_start_frames
-        return self.slow_start + (1.0 - self.slow_start) * done
 
     def check_machine(self) -> None:
         """Raise ValueError for what this machine lacks: the device, a C++ compiler."""

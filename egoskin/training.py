@@ -78,18 +78,9 @@ class Trainer:
         self.frames = 0
         self.wall_s = 0.0
         self.root: TensorDictBase = TensorDict()
-        self._ball_speed = 1.0
-
-    def _throw_as_due(self) -> None:
-        """Let balls be as fast as is due by now."""
-        due = self.config.ball_speed_at(self.frames)
-        if due != self._ball_speed:
-            self.env.set_ball_speed(due)
-            self._ball_speed = due
 
     def start(self) -> None:
         """Begin a new run: first observations, first policy, first checkpoint."""
-        self._throw_as_due()
         self.root = self.env.reset()
         self.keep_policy()
         self.save()
@@ -102,7 +93,6 @@ class Trainer:
             WorkerError: If a worker ends.
         """
         start = time.perf_counter()
-        self._throw_as_due()
         rollout, self.root, infos = collect(
             self.env,
             self.agent,
@@ -126,7 +116,6 @@ class Trainer:
             "time/wall_s": self.wall_s,
             "time/steps_per_s": self.config.frames_per_batch / (end - start),
             "time/collect_share": (collected - start) / (end - start),
-            "task/ball_speed": self._ball_speed,
             **self._episode_metrics(TensorDict.maybe_dense_stack(infos)),
             **{f"ppo/{name}": value for name, value in learned.items()},
         }
@@ -196,7 +185,6 @@ class Trainer:
         torch.set_rng_state(tensors["random_state"])
         if self.device.type == "cuda":
             torch.cuda.set_rng_state(tensors["random_state_cuda"], self.device)
-        self._throw_as_due()
 
     def dump(self, error: NonFiniteError) -> Path:
         """Write what `scripts/replay.py` needs to meet an error again; return where."""

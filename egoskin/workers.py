@@ -269,10 +269,6 @@ class WorkerPool(ParallelEnv):
         with self._death_explained():
             return super().reset(tensordict, **kwargs)
 
-    def set_ball_speed(self, share: float) -> None:
-        """Throw with a share of the speed drawn, in every worker's environment."""
-        self._ask("set_ball_speed", share)
-
     def _ask(self, method: str, *args: object) -> list:
         """Return what a method of every worker's environment answers."""
         if self.is_closed:

@@ -149,13 +149,7 @@ def main(args: list[str]) -> None:
                     env=env, seed=config.seed, num_envs=num_envs, ppo=_LATE
                 )
                 frames = config.iterations * base.frames_per_batch
-                planned = dataclasses.replace(
-                    base,
-                    total_frames=frames,
-                    # A task that grows harder, with balls that soon arrive.
-                    slow_start=0.8,
-                    slow_start_frames=frames,
-                )
+                planned = dataclasses.replace(base, total_frames=frames)
                 half = config.iterations // 2
                 equal &= agree(planned, Path(folder), title, half)
     if not equal:

@@ -19,8 +19,6 @@ import torch
 
 import egoskin
 from egoskin.checkpoint import load_tensors
-from egoskin.runs import TrainConfig
-from egoskin.workers import WorkerPool
 
 ROOT = Path(__file__).parents[1]
 SMALL = ["--num-envs", "32", "--num-workers", "2", "--ppo.num-mini-batches", "2"]
@@ -87,39 +85,6 @@ def test_a_run_folder_holds_what_is_needed_to_understand_it(trained: Path):
     assert list(trained.glob("events.out.tfevents.*"))
     names = [path.stem for path in sorted((trained / "policies").iterdir())]
     assert names == ["000000000000", f"{4 * BATCH:012d}"]
-
-
-def test_balls_are_slow_at_first(tmp_path: Path, monkeypatch):
-    shares = []
-    set_ball_speed = WorkerPool.set_ball_speed
-    monkeypatch.setattr(
-        *(WorkerPool, "set_ball_speed"),
-        lambda pool, share: shares.append(share) or set_ball_speed(pool, share),
-    )
-    args = ("--slow-start-frames", 2 * BATCH, "--total-frames", 4 * BATCH)
-    done = run("ppo.py", *SMALL, "--run-dir", tmp_path / "run", *args)
-    assert done.returncode == 0, done.stderr
-    assert shares == pytest.approx([0.4, 0.7, 1.0])
-    logged = [float(row["task/ball_speed"]) for row in metrics(tmp_path / "run")]
-    assert logged == pytest.approx([0.4, 0.7, 1.0, 1.0])
-    assert "ball speed 40%" in done.stdout
-
-
-def test_balls_may_be_fast_at_once():
-    assert TrainConfig(slow_start_frames=0).ball_speed_at(0) == 1.0
-
-
-@pytest.mark.parametrize(
-    "field",
-    [
-        {"slow_start": 0.0},
-        {"slow_start": 1.5},
-        {"slow_start_frames": -1},
-    ],
-)
-def test_a_slow_start_outside_its_range_is_refused(field: dict):
-    with pytest.raises(ValueError, match=next(iter(field))):
-        TrainConfig(**field)
 
 
 def test_a_resumed_run_equals_one_that_never_stopped(trained: Path, tmp_path: Path):

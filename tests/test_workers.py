@@ -27,7 +27,6 @@ from egoskin.make import (
 )
 from egoskin.robots import H1_2
 from egoskin.sensors import place_sensors
-from egoskin.sensors.config import SensorConfig
 from egoskin.workers import (
     WorkerError,
     WorkerPool,
@@ -93,26 +92,6 @@ def test_a_saved_state_continues_bit_for_bit_on_other_workers(skin):
     finally:
         pool.close()
     assert_same(expected, found)
-
-
-def test_every_worker_slows_its_balls(skin):
-    pool = make_env(
-        EnvConfig(sensor=SensorConfig(coverage="oracle")),
-        skin,
-        num_envs=NUM_ENVS,
-        seed=5,
-        num_workers=2,
-    )
-    try:
-        whole = pool.reset().reshape(-1)["signal"]
-        pool.set_seed(5, static_seed=True)
-        pool.set_ball_speed(0.5)
-        half = pool.reset().reshape(-1)["signal"]
-    finally:
-        pool.close()
-    changed = half != whole
-    assert (changed.sum(-1) == 3).all()
-    torch.testing.assert_close(half[changed], 0.5 * whole[changed])
 
 
 def test_the_pool_passes_torchrls_own_check(skin):

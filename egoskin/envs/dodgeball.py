@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -166,7 +166,6 @@ class DodgeballEnv(EnvBase):
         self._action_scale = torch.from_numpy(scale).float()
         self._joint_range = torch.from_numpy(robot.joint_range).float()
         self._may_touch_floor = torch.tensor([n in robot.feet for n in robot.links])
-        self._ball_speed = 1.0
         self._rows = torch.arange(num_envs) + row_offset
         balls = config.throws.num_balls
         zeros = torch.zeros(num_envs, dtype=torch.int64)
@@ -254,13 +253,6 @@ class DodgeballEnv(EnvBase):
             )
         return self._physics
 
-    def set_ball_speed(self, share: float) -> None:
-        """Throw with a share of the speed drawn, from the next throw on.
-
-        For the start of a training; no part of the state.
-        """
-        self._ball_speed = share
-
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
             self._seed = seed
@@ -328,7 +320,6 @@ class DodgeballEnv(EnvBase):
             counters["episode"][padded],
             throw[padded],
         )
-        draw = replace(draw, speed=self._ball_speed * draw.speed)
         release = self.thrower.release(
             draw, state.base_pose, state.base_lin_vel_w, state.joint_pos
         )
