@@ -428,7 +428,7 @@ def _metres(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f} m"
 
 
-_OTHER = "Other recipes"
+_DEFAULT, _OTHER = "The default recipe", "Other recipes"
 
 _HEAD = """# Results
 
@@ -452,22 +452,28 @@ def report(runs: Sequence[StoredRun], pictures: dict[str, str], notes: str) -> s
         pictures: File of the learning curves of each section, by its title.
         notes: What is written by hand, "" for nothing.
     """
-    parts = [_HEAD]
-    for title, group in sections(runs).items():
-        parts.append(f"## {title}\n\n![Learning curves]({pictures[title]})\n")
-        parts.append(table(group) + "\n")
-        if title == _OTHER:
-            parts.append("What of them is not the default:\n")
-            names = recipe_names(runs).items()
-            parts += [f"* recipe {name}: `{recipe}`" for recipe, name in names]
-            parts.append("")
+
+    def section(title: str) -> list[str]:
+        group = sections(runs).get(title)
+        if group is None:
+            return []
+        picture = f"![Learning curves]({pictures[title]})"
+        return [f"## {title}\n\n{picture}\n", table(group) + "\n"]
+
     rigid = max(run.evaluation["rigid_success"] for run in runs)
-    parts.append(
+    parts = [
+        _HEAD,
+        *section(_DEFAULT),
         "The robot held rigid in its default pose succeeds in at most "
-        f"{_percent(rigid)} of the throws of these banks.\n"
-    )
+        f"{_percent(rigid)} of the throws of these banks.\n",
+    ]
     if notes:
         parts.append(notes.strip() + "\n")
+    if others := section(_OTHER):
+        names = recipe_names(runs).items()
+        parts += [*others, "What of them is not the default:\n"]
+        parts += [f"* recipe {name}: `{recipe}`" for recipe, name in names]
+        parts.append("")
     parts.append("## The runs\n")
     lines = [
         _row("run", "command", "commit", "seed", "frames", "wall time", "machine"),
@@ -506,7 +512,7 @@ def sections(runs: Sequence[StoredRun]) -> dict[str, dict[str, list[StoredRun]]]
     names = recipe_names(runs)
     result: dict[str, dict[str, list[StoredRun]]] = {}
     for (recipe, cell), group in cells(runs).items():
-        title = _OTHER if recipe else "The default recipe"
+        title = _OTHER if recipe else _DEFAULT
         name = f"{cell}; recipe {names[recipe]}" if recipe else cell
         result.setdefault(title, {})[name] = group
     return result
