@@ -30,7 +30,7 @@ from `egoskin.sensors.tactile`, in tasks of your own
 ``contact_force``           ``[*B, L, 3]`` yours [N]                     tactile
 ``contact_free``            ``[*B, 1]``   bool: untouched so far        -
 from `egoskin.observations`
-``observation``             ``[*B, 6+2J]`` proprioception               actor, critic
+``observation``             ``[*B, 6+2J]`` body; 6+3J: and last action  actor, critic
 ``privileged_observation``  ``[*B, P]``   told in training only         critic
 ``signal``                  ``[*B, 7 O]`` an oracle's: the truth        actor, critic
 from `egoskin.agents.networks.Agent`

@@ -31,7 +31,7 @@ from egoskin.approaches import (
     unit_vectors,
 )
 from egoskin.draws import check_seed
-from egoskin.envs.throws import ThrowConfig
+from egoskin.envs.throws import QUARTERS, ThrowConfig, quarter_of
 from egoskin.robots import RobotConfig
 from egoskin.sensors import Skin
 from egoskin.sensors.coverage import Coverage
@@ -39,8 +39,6 @@ from egoskin.shapes import Sphere
 
 CLEARANCES = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
 """Clearances at which the share of directions seen by then is reported [m]."""
-SECTORS = ("front", "left", "back", "right")
-"""Quarters of azimuth, each centred on its direction."""
 BANDS = (0.0, 0.8, 1.2, 1.6, math.inf)
 """Heights of contact above ground that are told apart [m]: legs to head."""
 
@@ -207,12 +205,12 @@ class Analysis:
                 "95%": high,
             }
 
-        quarter = (self.throw_azimuth[touches] / (math.pi / 2)).round().long() % 4
+        quarter = quarter_of(self.throw_azimuth[touches])
         height = self.contact_height[touches]
         return {
             "warning": group(torch.ones_like(seen)),
             "warning_by_azimuth": {
-                name: group(quarter == k) for k, name in enumerate(SECTORS)
+                name: group(quarter == k) for k, name in enumerate(QUARTERS)
             },
             "warning_by_height": {
                 f"{low:g}-{high:g}": group((height >= low) & (height < high))

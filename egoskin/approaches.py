@@ -20,12 +20,11 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from egoskin.envs.throws import GRAVITY, ThrowConfig, Thrower
-from egoskin.kinematics import LinkKinematics
 from egoskin.robots import RobotConfig
 from egoskin.sensors import FieldSensor, Ray, RaySensor, Skin
 from egoskin.sensors.coverage import Coverage
 from egoskin.shapes import Sphere
-from egoskin.surface import distance_to, sample_surface
+from egoskin.surface import default_frames, distance_to, sample_surface
 from egoskin.transform import RowTransform
 
 THROW_STEP = 0.002
@@ -54,10 +53,8 @@ class StandingRobot:
         self.joint_pos = torch.from_numpy(robot.default_joint_pos).float()
         self.origin = np.array([0.0, 0.0, robot.default_base_height])
         self.base_pose = torch.tensor([*self.origin, 1.0, 0.0, 0.0, 0.0]).float()
-        joint_pos = torch.from_numpy(robot.default_joint_pos)[None]
-        position, rotation = LinkKinematics(robot.chain, robot.links).poses_b(joint_pos)
-        self.link_position = position[0].numpy() + self.origin
-        self.link_rotation = rotation[0].numpy()
+        position, self.link_rotation = default_frames(robot)
+        self.link_position = position + self.origin
         # Their "link frame" is now the world.
         self._shapes = []
         for shape in robot.primitives:
@@ -166,20 +163,17 @@ def _sensors(
     The range is NaN where the sensor has none.
     """
     full = skin.filled(coverage, max_range)
-    groups: dict[object, list[int]] = {}
-    for index, own in enumerate(full.coverage):
-        kind = (own.grid, own.sub_beams) if isinstance(own, Ray) else None
-        groups.setdefault(kind, []).append(index)
     body = robot.primitives if occlusion else ()
     parts: list[RowTransform] = []
-    for kind, group in groups.items():
-        args = full.select(group), robot.chain, [ball], max_range
+    groups = full.groups()
+    for part in map(full.select, groups):
+        args = part, robot.chain, [ball], max_range
         parts.append(
             RaySensor(*args, reduce="min", body=body)
-            if kind
+            if isinstance(part.coverage[0], Ray)
             else FieldSensor(*args, body=body)
         )
-    order = [index for group in groups.values() for index in group]
+    order = [index for group in groups for index in group]
     return parts, torch.from_numpy(skin.range[order]).float()
 
 

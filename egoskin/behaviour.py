@@ -17,7 +17,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from egoskin.envs.throws import Draw, Thrower
+from egoskin.envs.throws import QUARTERS, Thrower, quarter_of
 from egoskin.evaluation import Estimate, Evaluation, evaluate, play_bank, wilson
 from egoskin.kinematics import LinkKinematics, rotate
 from egoskin.make import EnvConfig
@@ -29,7 +29,6 @@ _AGES = (1.0, 2.0, 3.0)
 # Bounds of the groups by height aimed at [m], by speed at arrival [m/s] and by time
 # since the throw before [s]: about a third of the standard throws in each.
 _HEIGHTS, _SPEEDS, _GAPS = (0.9, 1.2), (5.3, 6.7), (1.33, 1.67)
-_QUARTERS = ("front", "left", "back", "right")
 # A point of a foot this close to the floor stands on it [m] (contacts give way a
 # little, so zero is too strict).
 _ON_FLOOR = 0.005
@@ -42,8 +41,8 @@ class Group:
     name: str
     """What they have in common."""
     success: Estimate | None
-    """Share of the episodes whose first ball is one of them without contact, fall or
-    divergence for 3 s; None if there are none."""
+    """Share of the episodes whose first ball is one of them that succeed, as in
+    `Evaluation`; None if there are none."""
     episodes: int
     """Number of these episodes."""
     first_hits: float | None
@@ -245,7 +244,7 @@ class Watcher:
         """Return how the throws of each kind fared."""
         height, speed = self._thrower.at_standing_robot(self._draw)
         result = {
-            "direction": self._split(_quarter(self._draw), _QUARTERS),
+            "direction": self._split(quarter_of(self._draw.azimuth), QUARTERS),
             "height aimed at": self._split(*_bands(height, _HEIGHTS, "m")),
             "speed at arrival": self._split(*_bands(speed, _SPEEDS, "m/s")),
             "since last throw": self._split(*self._gaps()),
@@ -337,13 +336,6 @@ class _Feet:
         stays = (start[..., 2] < _ON_FLOOR) & (end[..., 2] < _ON_FLOOR)
         way = (end - start)[..., :2].norm(dim=-1)
         return way.where(stays, math.nan)
-
-
-def _quarter(draw: Draw) -> Tensor:
-    """Return the index in `_QUARTERS` of where each ball comes from, ``[n]`` int64."""
-    # Azimuth is positive to the left.
-    turns = (draw.azimuth + math.pi / 4) % (2 * math.pi) / (math.pi / 2)
-    return turns.long().clamp(max=3)
 
 
 def _bands(

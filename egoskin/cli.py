@@ -64,12 +64,23 @@ def from_plain(kind: type[T], content: Any, what: str) -> T:
     Raises:
         ValueError: If a field is unknown or of the wrong type; the text names it.
     """
-    hooks = {float: float, Path: Path}
+    hooks = {float: _float, Path: _path}
     config = dacite.Config(type_hooks=hooks, cast=[tuple], strict=True)
     try:
         return dacite.from_dict(kind, content, config)
     except dacite.DaciteError as error:
         raise ValueError(f"{what}: {error}") from error
+
+
+def _float(value: Any) -> Any:
+    """Return a number as float, "inf" too; anything else is left to be refused."""
+    whole = isinstance(value, int) and not isinstance(value, bool)
+    return float(value) if whole or value in ("inf", "-inf") else value
+
+
+def _path(value: Any) -> Any:
+    """Return a text as path; anything else is left to be refused."""
+    return Path(value) if isinstance(value, str) else value
 
 
 def changed_fields(old: Any, new: Any, prefix: str = "") -> list[str]:

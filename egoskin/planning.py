@@ -7,7 +7,7 @@ body and the time that was left allow it.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import cast
 
 import torch
@@ -16,9 +16,9 @@ from torch import Tensor
 from torchrl.envs import Compose, TransformedEnv
 
 from egoskin.envs.dodgeball import DodgeballEnv
-from egoskin.envs.throws import Thrower
 from egoskin.make import EnvConfig, default_num_workers, make_worker_env
 from egoskin.policies import Policy
+from egoskin.sensors import Skin
 from egoskin.sensors.config import SensorConfig
 
 # Share of the plans that the next ones are drawn around, and how much of their mean and
@@ -135,10 +135,20 @@ def find_ceiling(
         What becomes of the balls that came within reach before the episode ended.
 
     Raises:
-        ValueError: If there is no such throw.
+        ValueError: If there is no such throw, or the sensors are corrupted: each copy
+            of a throw would wear other ones.
     """
+    if config.sensor.corruption != "none":
+        raise ValueError(
+            "a ceiling is searched with ideal sensors, but the policy's have "
+            f"corruption={config.sensor.corruption}"
+        )
+    # No plan is cut short by the age limit.
+    task = config.task
+    length = task.episode_length_s + search.stand_s
+    longer = replace(config, task=replace(task, episode_length_s=length))
 
-    def make(rows: int) -> TransformedEnv:
+    def make(rows: int, config: EnvConfig) -> TransformedEnv:
         return make_worker_env(
             config,
             policy.skin,
@@ -148,11 +158,11 @@ def find_ceiling(
             keep_raw=True,
         )
 
-    start = _until_in_reach(make(throws), policy, config, reach, ball)
+    start = _until_in_reach(make(throws, config), policy, config, reach, ball)
     n, samples = len(start.throw), search.samples
     if n == 0:
         raise ValueError(f"none of {throws} balls came within {reach:g} m of a sensor")
-    env, starts = make(n * samples), start.repeated(samples)
+    env, starts = make(n * samples, longer), start.repeated(samples)
     env.reset()
     steps = round(search.stand_s * config.task.physics.control_hz)
     mean = torch.zeros(n, search.entries, len(config.robot_config.joints))
@@ -188,7 +198,7 @@ def find_ceiling(
         spread.clamp_(min=_LEAST_SPREAD)
         if on_iteration is not None:
             on_iteration(iteration, best)
-    thrower = Thrower(config.task.throws, config.robot_config, 1.0)
+    thrower = _task(env).thrower
     zero = torch.zeros_like(start.throw)
     height, _ = thrower.at_standing_robot(
         thrower.draw(bank_seed, start.throw, zero, zero + ball - 1)
@@ -203,9 +213,14 @@ def _until_in_reach(
     throws = env.batch_size[0]
     sensor = SensorConfig(coverage="field", signal="binary", range=reach)
     balls = config.task.throws.balls
+    skin = policy.skin
+    # Where the sensors are, not what each of them sees.
+    bare = Skin(
+        robot=skin.robot, links=skin.links, position=skin.position, normal=skin.normal
+    )
     transforms = sensor.transforms(
         config.robot_config,
-        policy.skin,
+        bare,
         balls,
         dt=1 / config.task.physics.control_hz,
     )

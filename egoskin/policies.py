@@ -25,6 +25,8 @@ from egoskin.sparse import SparseSource
 
 CHECKPOINT_NAME = "checkpoint.safetensors"
 """Name of the latest checkpoint in a run folder."""
+# Names of what a policy file leaves out start with it.
+_CRITIC = "critic."
 _SHIPPED = Path(__file__).parent / "assets" / "policies"
 
 
@@ -146,12 +148,17 @@ def agent_tensors(agent: Agent) -> dict[str, Tensor]:
 
 @torch.no_grad()
 def load_agent_tensors(agent: Agent, tensors: Mapping[str, Tensor], what: str) -> None:
-    """Copy tensors into an agent.
+    """Copy tensors into an agent; without any of its critic, that stays as it is.
 
     Raises:
-        ValueError: If a name or shape does not fit.
+        ValueError: If a name or shape does not fit, or a tensor is missing.
     """
     own = agent_tensors(agent)
+    missing = own.keys() - tensors.keys()
+    if not any(name.startswith(_CRITIC) for name in tensors):
+        missing = {name for name in missing if not name.startswith(_CRITIC)}
+    if missing:
+        raise ValueError(f"{what}: tensor {min(missing)!r} of the networks is missing")
     for name, value in tensors.items():
         if name not in own or own[name].shape != value.shape:
             raise ValueError(f"{what}: tensor {name!r} does not fit the networks")
@@ -163,7 +170,7 @@ def save_policy(path: Path, agent: Agent, spec: PolicySpec) -> None:
     tensors = {
         name: value
         for name, value in agent_tensors(agent).items()
-        if not name.startswith("critic.")
+        if not name.startswith(_CRITIC)
     }
     save_tensors(path, prefixed("agent", tensors), {"policy": spec.header()})
 

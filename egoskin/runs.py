@@ -363,7 +363,7 @@ def _version(package: str) -> str | None:
 
 
 def _git_state() -> dict[str, Any] | None:
-    """Commit of the source tree and whether it was changed; None outside git."""
+    """Commit of the source tree and whether it was changed; None if git has none."""
 
     def git(*args: str) -> str:
         return subprocess.run(
@@ -374,6 +374,8 @@ def _git_state() -> dict[str, Any] | None:
         ).stdout.strip()
 
     try:
+        # An installed copy may lie inside a repository of something else.
+        git("ls-files", "--error-unmatch", str(Path(__file__)))
         return {
             "commit": git("rev-parse", "HEAD"),
             "changed": bool(git("status", "--porcelain", "--untracked-files=no")),

@@ -16,6 +16,7 @@ import torch
 
 from egoskin.kinematics import LinkKinematics
 from egoskin.robots import Primitive, RobotConfig
+from egoskin.shapes import shape_of
 
 # A sampled point is inside another primitive if it is deeper than this [m].
 _INSIDE = 1e-6
@@ -72,14 +73,9 @@ def distance_to(shape: Primitive, points: np.ndarray) -> np.ndarray:
     Returns:
         Distance [m], ``[n]``.
     """
-    local = (points - shape.position) @ shape.rotation
-    if shape.kind == "box":
-        q = np.abs(local) - shape.size
-        return np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(-1), 0)
-    if shape.kind == "capsule":
-        half = shape.size[1]
-        local[:, 2] -= np.clip(local[:, 2], -half, half)
-    return np.linalg.norm(local, axis=-1) - shape.size[0]
+    local = torch.from_numpy((points - shape.position) @ shape.rotation)
+    solid = shape_of(shape.kind, shape.size.tolist())
+    return solid.signed_distance(*local.unbind(-1)).numpy()
 
 
 def _sample_primitive(

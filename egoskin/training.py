@@ -153,16 +153,14 @@ class Trainer:
 
     def save(self) -> None:
         """Write a checkpoint from which `load` continues bit for bit."""
-        random = {"random_state": torch.get_rng_state()}
-        if self.device.type == "cuda":
-            random["random_state_cuda"] = torch.cuda.get_rng_state(self.device)
         self.run.save_checkpoint(
             {
                 **self._learner_tensors(),
                 **prefixed("env", save_env_state(self.env, self.root)),
                 "survival/at_risk": self.survival.at_risk,
                 "survival/ended": self.survival.ended,
-                **random,
+                # Noise and minibatches are drawn on the CPU, whatever the device.
+                "random_state": torch.get_rng_state(),
             },
             {
                 "policy": self._spec_now().header(),
@@ -183,8 +181,6 @@ class Trainer:
         self.survival.ended.copy_(tensors["survival/ended"])
         self.frames, self.wall_s = header["frames"], header["wall_s"]
         torch.set_rng_state(tensors["random_state"])
-        if self.device.type == "cuda":
-            torch.cuda.set_rng_state(tensors["random_state_cuda"], self.device)
 
     def dump(self, error: NonFiniteError) -> Path:
         """Write what `scripts/replay.py` needs to meet an error again; return where."""
@@ -219,11 +215,15 @@ class Trainer:
 def open_trainer(run: Run, num_threads: int = 1) -> Iterator[Trainer]:
     """Yield the trainer of a run, at its start or its checkpoint; close all after.
 
+    PyTorch then uses as many threads as the run's ``learner_threads`` says.
+
     Args:
         run: A new run or one to go on with.
         num_threads: Physics threads of each worker; results do not depend on it.
     """
     config = run.config
+    if config.learner_threads is not None:
+        torch.set_num_threads(config.learner_threads)
     # It imports while the rest is made.
     start_server()
     skin = Skin.load(run.skin_path)

@@ -243,7 +243,15 @@ class StatefulTransform(_KeyedTransform):
             ended = None if before is None else [x[index] for x in before]
             started = self.start(index, [x[index] for x in inputs], ended)
             values = [_spread(x, rows, total) for x in started]
-        self._last = self._state_of(values)
+        state = self._state_of(values)
+        if partial is not None and before is not None:
+            # The other rows keep theirs, for when they are reset.
+            rows, _ = partial
+            state = [
+                old.index_copy(0, rows, new[rows])
+                for old, new in zip(before, state, strict=True)
+            ]
+        self._last = state
         self._write(tensordict_reset, values)
         return tensordict_reset
 

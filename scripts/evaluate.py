@@ -70,21 +70,24 @@ def share(value: float | None) -> str:
     return "     -" if value is None else f"{100 * value:6.2f} %"
 
 
-def table(result: Evaluation, title: str) -> str:
-    """Return the figures as text."""
+def table(result: Evaluation, title: str, age: float) -> str:
+    """Return the figures as text, with the age of success [s]."""
 
     def interval(value: Estimate, scale: float, unit: str) -> str:
         mean, low, high = (scale * v for v in (value.mean, value.low, value.high))
         return f"{mean:6.2f} {unit}  ({low:.2f} to {high:.2f})"
 
+    ends = {
+        "a ball": result.ended_by_ball,
+        "a fall": result.ended_by_fall,
+        "self-contact": result.ended_by_self_contact,
+        "divergence": result.diverged,
+    }
     rows = [
-        ("success (no contact for 3 s)", interval(result.success, 100, "%")),
+        (f"success (no contact for {age:g} s)", interval(result.success, 100, "%")),
         ("  same bank, robot held rigid", share(result.rigid_success)),
         ("survival time (at most 10 s)", interval(result.survival_time, 1, "s")),
-        ("ended within 3 s by a ball", share(result.ended_by_ball)),
-        ("ended within 3 s by a fall", share(result.ended_by_fall)),
-        ("ended within 3 s by self-contact", share(result.ended_by_self_contact)),
-        ("ended within 3 s by divergence", share(result.diverged)),
+        *((f"ended within {age:g} s by {how}", share(x)) for how, x in ends.items()),
         ("first balls avoided", share(result.avoided.first_ball)),
         ("later balls avoided", share(result.avoided.later_balls)),
     ]
@@ -185,7 +188,8 @@ def main(args: list[str]) -> None:
         f"{config.policy}: {policy.spec.frames:,} frames; bank {config.bank_seed} of "
         f"{counted(config.episodes, 'episode')}, {config.throw} throw, physics at "
     )
-    print(table(result, title + physics_rate(env_config)))
+    age = env_config.task.success_s
+    print(table(result, title + physics_rate(env_config), age))
     content = dataclasses.asdict(result)
     if behaviour is not None:
         print(behaviour_table(behaviour))
@@ -194,7 +198,7 @@ def main(args: list[str]) -> None:
         content["check_substeps"] = config.check_substeps
     for name, (changed, how) in changes.items():
         rate = physics_rate(changed) + ", sensors numb" * changed.sensor.numb
-        print("\n" + table(again[name], title + rate))
+        print("\n" + table(again[name], title + rate, age))
         lost = 100 * (result.success.mean - again[name].success.mean)
         print(f"  success lost {how}: {lost:.2f} points")
         content[name] = dataclasses.asdict(again[name])

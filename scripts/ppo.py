@@ -47,14 +47,13 @@ def main(args: list[str]) -> None:
     """Run the command."""
     config = parse_config(args)
     config.check_machine()
-    if config.learner_threads is not None:
-        torch.set_num_threads(config.learner_threads)
     run = Run.create(config) if config.resume is None else Run(config.resume, config)
     workers = check_num_workers(config.num_envs, config.num_workers)
+    threads = config.learner_threads or torch.get_num_threads()
     print(
         f"run {run.path}: {counted(config.num_envs, 'agent')} on "
         f"{counted(workers, 'worker')}, learner on {config.device} with "
-        f"{counted(torch.get_num_threads(), 'thread')}"
+        f"{counted(threads, 'thread')}"
     )
     compiles = run.config.compile_kernels and run.config.env.sensor.uses_skin
     if compiles and not is_compiled(SOURCE):

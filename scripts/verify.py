@@ -134,8 +134,6 @@ def agree(config: TrainConfig, folder: Path, title: str, half: int) -> bool:
 def main(args: list[str]) -> None:
     """Run the command."""
     config = tyro.cli(VerifyConfig, args=args)
-    if config.learner_threads is not None:
-        torch.set_num_threads(config.learner_threads)
     noisy = dataclasses.replace(config.env.sensor, corruption="time_of_flight")
     skins = {
         "skin as given": config.env,
@@ -146,7 +144,11 @@ def main(args: list[str]) -> None:
         for title, env in skins.items():
             for num_envs in (config.num_envs, config.odd_num_envs):
                 base = TrainConfig(
-                    env=env, seed=config.seed, num_envs=num_envs, ppo=_LATE
+                    env=env,
+                    seed=config.seed,
+                    num_envs=num_envs,
+                    learner_threads=config.learner_threads,
+                    ppo=_LATE,
                 )
                 frames = config.iterations * base.frames_per_batch
                 planned = dataclasses.replace(base, total_frames=frames)

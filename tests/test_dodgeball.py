@@ -217,6 +217,10 @@ def test_a_diverged_row_is_reset_alone(value, tmp_path, monkeypatch):
     assert bad["diverged"][:, 0].tolist() == (~others).tolist()
     assert bad["terminated"][row]
     assert not bad["truncated"][row]
+    # Nothing else is said of it: what it touches then means nothing.
+    assert not bad["hit"][row] | bad["fallen"][row] | bad["object_hit"][row].any()
+    for key in ("balls_arrived", "balls_avoided"):
+        assert not bad[key][row].any()
     for key, tensor in got.items(True, True):
         assert tensor.isfinite().all(), key
     # A new episode, for this row alone, that goes on as any other.

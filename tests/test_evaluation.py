@@ -81,6 +81,22 @@ def test_figures_of_six_episodes_by_hand():
     assert result.avoided.later_balls == pytest.approx(5 / 6)
 
 
+def test_success_is_read_at_the_age_of_the_task():
+    # At 60 Hz 1 s are 60 steps: the ball at 60 comes in time to fail, that at 61 not.
+    played = Episodes(
+        steps=torch.tensor([60, 61]),
+        hit=flags(1, 1),
+        fallen=flags(0, 0),
+        diverged=flags(0, 0),
+        self_contact=flags(0, 0),
+        arrived=torch.zeros(2, 2),
+        avoided=torch.zeros(2, 2),
+    )
+    assert summarize(played, played, DodgeballConfig()).success.mean == 0
+    early = summarize(played, played, DodgeballConfig(success_s=1.0))
+    assert early.success.mean == early.ended_by_ball == 0.5
+
+
 def test_nothing_arrived_is_not_a_share():
     none = torch.zeros(1, dtype=torch.bool)
     empty = Episodes(
@@ -97,8 +113,16 @@ def test_nothing_arrived_is_not_a_share():
 
 def test_the_standard_throw_replaces_the_throw_of_the_run():
     own = ThrowConfig(lead=0.0, flight="straight", speed=(1.0, 2.0))
-    task = DodgeballConfig(throws=own, action_scale=0.3, self_contact_ends=True)
+    task = DodgeballConfig(
+        throws=own,
+        action_scale=0.3,
+        self_contact_ends=True,
+        success_s=1.0,
+        start_joint_noise=0.5,
+    )
     standard = standard_task(EnvConfig(task=task))
+    assert standard.task.success_s == 3.0
+    assert standard.task.start_joint_noise == DodgeballConfig().start_joint_noise
     assert not standard.task.self_contact_ends
     assert standard.task.throws == ThrowConfig()
     assert standard.task.action_scale == 0.3

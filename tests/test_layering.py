@@ -24,7 +24,7 @@ ALLOWED = {
     "shapes": {"compilation"},
     "draws": set(),
     "kinematics": {"compilation"},
-    "surface": {"robots", "kinematics"},
+    "surface": {"robots", "shapes", "kinematics"},
     "transform": {"kinematics"},
     "observations": {"kinematics", "transform"},
     "envs": {"robots", "shapes", "draws", "kinematics", "surface", "envs"},

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from torchrl.envs import TransformedEnv
@@ -113,6 +114,44 @@ def test_the_step_of_a_hit_is_not_survived(policy: Policy):
     steps = int(survived[row])
     assert _play(env, policy, start, empty, steps)[0][row]
     assert not _play(env, policy, start, empty, steps + 1)[0][row]
+
+
+def test_an_age_limit_is_no_fall(policy: Policy, ceiling: Ceiling):
+    # Every plan crosses it: the balls come into reach from about 0.35 to 1 s on.
+    long = task(policy)
+    short = replace(long, task=replace(long.task, episode_length_s=1.05))
+    bank = {"bank_seed": 0, "throws": THROWS, "reach": 2.0}
+    found = find_ceiling(policy, short, SEARCH, **bank)
+    assert torch.equal(found.policy.stood, ceiling.policy.stood)
+    assert found.policy.stood.any()
+
+
+def test_plans_start_where_the_reach_says_whatever_the_sensors_own_range(
+    policy: Policy,
+):
+    config = task(policy)
+    skin = replace(policy.skin, range=np.full(len(policy.skin), 0.3))
+    other = Policy(policy._agent, replace(policy.spec, skin=skin))
+    steps = [
+        _until_in_reach(make(policy, config, 4), who, config, 2.0).simulation["step"]
+        for who in (policy, other)
+    ]
+    assert len(steps[0]) == 4
+    assert torch.equal(*steps)
+
+
+def test_corrupted_sensors_are_refused(policy: Policy):
+    config = task(policy)
+    sensor = replace(config.sensor, corruption="acoustic")
+    with pytest.raises(ValueError, match=r"ideal sensors.*acoustic"):
+        find_ceiling(
+            policy,
+            replace(config, sensor=sensor),
+            SEARCH,
+            bank_seed=0,
+            throws=1,
+            reach=2.0,
+        )
 
 
 def test_a_search_repeats(policy: Policy):

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 import egoskin
+from egoskin.checkpoint import load_tensors, save_tensors
 from egoskin.evaluation import evaluate, standard_task
 from egoskin.policies import shipped_policies
 
@@ -30,6 +31,17 @@ def test_a_shipped_policy_acts_in_the_environment_it_was_trained_in(name):
     assert not env.step(td)["next", "diverged"].any()
     # Small enough to ship: a network of the paper's size, not a checkpoint.
     assert (ASSETS / f"{name}.safetensors").stat().st_size < 200_000
+
+
+@pytest.mark.parametrize(
+    "name", ["head.log_std", "head.body.inputs.0.weight", "norms.signal.mean"]
+)
+def test_a_file_that_lacks_a_tensor_is_refused(name, tmp_path):
+    tensors, header = load_tensors(ASSETS / "field_proximity.safetensors")
+    del tensors[f"agent/{name}"]
+    save_tensors(tmp_path / "half.safetensors", tensors, header)
+    with pytest.raises(ValueError, match=rf"half.*'{name}' of the networks is missing"):
+        egoskin.load_policy(tmp_path / "half.safetensors")
 
 
 def test_a_file_that_is_there_comes_before_a_name(tmp_path, monkeypatch):

@@ -136,6 +136,21 @@ def test_a_timeout_bootstraps_from_its_terminal_observation():
     assert "next" not in rollout.keys()
 
 
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+def test_an_agent_learns_on_its_device_from_an_environment_on_the_cpu(device: str):
+    if device == "cuda" and not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    env = truncating_spec(CountingEnv())
+    keys = ["observation"]
+    agent = Agent({"observation": 1}, keys, keys, 1, NetworkConfig()).to(device)
+    rollout, root, _ = collect(env, agent, env.reset(), 4)
+    assert rollout.device is not None
+    assert rollout.device.type == rollout["action_log_prob"].device.type == device
+    assert root["observation"].device.type == "cpu"
+    metrics = PPO(agent, PPOConfig(num_mini_batches=2)).update(rollout)
+    assert 0 < metrics["kl"] < 1
+
+
 def test_advantages_of_a_timeout_and_a_termination_by_hand():
     env, agent = truncating_spec(CountingEnv()), counting_agent()
     rollout, _, _ = collect(env, agent, env.reset(), 4)
@@ -308,6 +323,19 @@ def test_gradients_of_actor_and_critic_are_clipped_separately():
         assert norm == pytest.approx(1e-3, rel=1e-3)
 
 
+def test_a_gradient_that_is_not_finite_is_left_to_be_named():
+    agent = bandit_agent()
+    ppo = PPO(agent, PPOConfig())
+    bad = agent.head.body.tail[3].bias
+    bad.register_hook(
+        lambda gradient: gradient.index_fill(0, torch.tensor([1]), torch.nan)
+    )
+    with pytest.raises(NonFiniteError, match="actor gradient norm nan"):
+        ppo.update(bandit_rollout(agent))
+    found = [n for n, p in agent.named_parameters() if p.grad.isnan().any()]
+    assert found == ["head.body.tail.3.bias"]
+
+
 def test_a_loss_that_is_not_finite_stops_before_the_weights_change():
     agent = bandit_agent()
     ppo = PPO(agent, PPOConfig())
@@ -350,6 +378,8 @@ def test_shares_of_a_minibatch_add_up_to_the_whole(threads: int):
         {"noise_correlation": 1.0},
         {"noise_correlation_start": -1},
         {"entropy_frames": 0},
+        {"learning_rate": 0.1},
+        {"learning_rate": 1e-6},
     ],
 )
 def test_values_outside_their_range_are_refused(field: dict):

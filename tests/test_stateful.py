@@ -259,6 +259,25 @@ def test_an_explicit_partial_reset_keeps_the_state_of_other_rows(build):
 
 
 @every_transform
+def test_a_row_reset_after_another_goes_on_from_its_own_state(build):
+    # Row by row, or both at once, without a step between.
+    envs = make(build, 3), make(build, 3)
+    for env in envs:
+        for _ in range(3):
+            env.reset()
+
+    def mask(*rows: int) -> TensorDict:
+        flags = torch.zeros(3, 1, dtype=torch.bool)
+        flags[list(rows)] = True
+        return TensorDict({"_reset": flags}, [3])
+
+    apart, together = envs
+    apart.reset(mask(0))
+    one, both = apart.reset(mask(2)), together.reset(mask(0, 2))
+    assert_same_bits(one[2:], both[2:], build().out_keys)
+
+
+@every_transform
 @pytest.mark.parametrize("told_by", ["done", "is_init"])
 def test_stored_steps_give_what_the_environment_gave(build, told_by):
     env = make(build, 5)

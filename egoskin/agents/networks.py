@@ -1,4 +1,4 @@
-"""Actor and critic networks: the only file that names what they read.
+"""Actor and critic networks, and the normalisers of what they read.
 
 Each network takes a *list* of keys. Their tensors are never concatenated: the first
 layer is a sum of one linear map for each key, which equals one linear map of the
@@ -324,7 +324,7 @@ class Agent(nn.Module):
 
     @property
     def read_keys(self) -> list[str]:
-        """Keys of the environment's output that `encode` reads."""
+        """Keys of the environment's output that `sense` reads."""
         return list(
             dict.fromkeys(
                 read
@@ -366,7 +366,9 @@ class Agent(nn.Module):
                 inputs.set_non_tensor(key, value)
             else:
                 inputs[key] = value if norm is None else norm(value)
-        return TensorDict({"inputs": inputs}, features.batch_size)
+        return TensorDict(
+            {"inputs": inputs}, features.batch_size, device=features.device
+        )
 
 
 def input_keys(keys: Sequence[str]) -> list[NestedKey]:

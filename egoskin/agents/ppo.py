@@ -99,6 +99,12 @@ class PPOConfig:
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise ValueError(f"{name} must be positive, got {value}")
+        low, high = _LR_BOUNDS
+        if self.desired_kl is not None and not low <= self.learning_rate <= high:
+            raise ValueError(
+                f"a learning_rate that is adapted (desired_kl) must be between {low:g} "
+                f"and {high:g}, got {self.learning_rate}"
+            )
         for name in ("gamma", "gae_lambda", "value_lambda"):
             value = getattr(self, name)
             if value is not None and not 0 <= value <= 1:
@@ -316,8 +322,7 @@ class PPO:
         for network, part in zip(networks, gradient, strict=True):
             assert network.grad is not None
             network.grad.copy_(part)
-            limit = self.config.max_grad_norm
-            norms.append(nn.utils.clip_grad_norm_(network, limit))
+            norms.append(nn.utils.get_total_norm([network.grad]))
         actor_norm, critic_norm = norms
         # A loss that is not finite shows in a gradient norm that is not.
         if not torch.isfinite(actor_norm + critic_norm):
@@ -327,6 +332,9 @@ class PPO:
                 f"critic gradient norm {float(critic_norm)}",
                 _rows(data, index),
             )
+        for network, norm in zip(networks, norms, strict=True):
+            limit = self.config.max_grad_norm
+            nn.utils.clip_grads_with_norm_(network, limit, norm)
         self.optimizer.step()
         norm = nn.utils.get_total_norm(networks)
         if not torch.isfinite(norm):

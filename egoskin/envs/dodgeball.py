@@ -345,14 +345,16 @@ class DodgeballEnv(EnvBase):
         counters["step"] += 1
         state = self.physics.read()
 
-        hit_by = result.object_hit & counters["active"]
+        # What a failed simulation touches means nothing.
+        sound = ~result.diverged[:, None]
+        hit_by = result.object_hit & counters["active"] & sound
         hit = hit_by.any(-1)
-        fallen = (result.floor_contact & ~self._may_touch_floor).any(-1)
+        fallen = (result.floor_contact & ~self._may_touch_floor & sound).any(-1)
         terminated = hit | fallen | result.diverged
         if config.self_contact_ends:
             terminated |= result.self_contact
         truncated = (counters["step"] >= config.episode_steps) & ~terminated
-        self._count_balls(state, hit_by)
+        self._count_balls(state, hit_by, sound)
         # Of the balls in flight until here: a throw makes the flag a new ball's.
         arrived = counters["passed"].clone()
 
@@ -394,7 +396,7 @@ class DodgeballEnv(EnvBase):
         out["done"] = (terminated | truncated)[:, None]
         return out
 
-    def _count_balls(self, state: PhysicsState, hit_by: Tensor) -> None:
+    def _count_balls(self, state: PhysicsState, hit_by: Tensor, sound: Tensor) -> None:
         """Take landed balls out of play; count the balls that came and those avoided.
 
         A ball has arrived when it touches the robot or when it has passed: it lands,
@@ -406,7 +408,7 @@ class DodgeballEnv(EnvBase):
         far = gap.square().sum(-1) > _PASSED_DISTANCE**2
         landed = state.object_pose[..., 2] <= self.config.throws.radius
         leaving = ((gap * closing).sum(-1) > 0) & far
-        fresh = counters["active"] & ~counters["passed"]
+        fresh = counters["active"] & ~counters["passed"] & sound
         avoided = fresh & (landed | leaving) & ~hit_by
         arrived = avoided | (fresh & hit_by)
         first = counters["is_first"]

@@ -7,6 +7,7 @@ pose the robot has at release. One bank of draws therefore serves every policy.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
@@ -116,6 +117,16 @@ class Draw:
     """Time until the next throw [s]."""
     target: Tensor
     """Two uniform numbers in [0, 1) that choose the point aimed at, ``[n, 2]``."""
+
+
+QUARTERS = ("front", "left", "back", "right")
+"""Quarters of azimuth, each centred on its direction."""
+
+
+def quarter_of(azimuth: Tensor) -> Tensor:
+    """Return the index in `QUARTERS` of directions [rad], ``[n]`` int64."""
+    # Azimuth is positive to the left.
+    return (azimuth / (math.pi / 2)).round().long() % 4
 
 
 @dataclass(frozen=True, kw_only=True)

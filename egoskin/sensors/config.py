@@ -292,13 +292,10 @@ class SensorConfig:
 
         One transform computes one kind; most skins have one, with no suffix.
         """
-        groups: dict[object, list[int]] = {}
-        for index, own in enumerate(self.filled(skin).coverage):
-            kind = (own.grid, own.sub_beams) if isinstance(own, Ray) else "field"
-            groups.setdefault(kind, []).append(index)
+        groups = self.filled(skin).groups()
         if len(groups) == 1:
-            return {"": list(range(len(skin)))}
-        return {f"_{i}": index for i, index in enumerate(groups.values())}
+            return {"": groups[0]}
+        return {f"_{i}": index for i, index in enumerate(groups)}
 
     def detecting(self, skin: Skin, state: TensorDictBase) -> np.ndarray:
         """Return which sensors detect something in one row, ``[S]`` bool.

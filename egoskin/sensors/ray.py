@@ -316,7 +316,7 @@ class SparseRays:
     @torch.no_grad()
     def __call__(self, tensordict: TensorDictBase) -> SparseRows:
         """Return the signal of each row ``[B]``, on the device of the tensordict."""
-        given = [tensordict.get(key) for key in self.in_keys]
+        given = [tensordict[key] for key in self.in_keys]
         state = [x.cpu() for x in given]
         place, distance = self._sensor.hits(*state)
         nothing = self._reading.signal(distance.new_full((1, 1), torch.inf))

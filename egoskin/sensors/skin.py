@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from egoskin.sensors.coverage import KINDS, Coverage
+from egoskin.sensors.coverage import KINDS, Coverage, Ray
 
 _FORMAT = "egoskin-skin-1"
 _CONVENTIONS = {
@@ -285,6 +285,17 @@ class Skin:
             coverage=tuple(c or coverage for c in self.coverage),
             range=np.where(np.isnan(self.range), max_range, self.range),
         )
+
+    def groups(self) -> list[list[int]]:
+        """Return the sensors of a `filled` skin that one transform computes together.
+
+        Those are of one kind: fields, or grids of beams of one size.
+        """
+        groups: dict[object, list[int]] = {}
+        for index, own in enumerate(self.coverage):
+            kind = (own.grid, own.sub_beams) if isinstance(own, Ray) else "field"
+            groups.setdefault(kind, []).append(index)
+        return list(groups.values())
 
     def reach(self) -> np.ndarray:
         """Return how far each sensor of a `filled` skin sees at most [m], ``[S]``."""
