@@ -92,7 +92,13 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         ) from error
     if _HEADER not in metadata:
         raise ValueError(f"{path} was not written by egoskin")
-    return tensors, json.loads(metadata[_HEADER])
+    try:
+        header = json.loads(metadata[_HEADER])
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{path} is damaged: its header is not JSON") from error
+    if not isinstance(header, dict):
+        raise ValueError(f"{path} is damaged: its header is no object")
+    return tensors, header
 
 
 def prefixed(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

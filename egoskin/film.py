@@ -13,6 +13,8 @@ import imageio_ffmpeg
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
+from egoskin.cli import check_output
+
 # The last picture stands for this long [s].
 _LAST_PICTURE = 1.0
 # One palette of 256 colours for the whole film: without it a GIF flickers.
@@ -142,8 +144,7 @@ def check_path(path: Path, suffixes: Sequence[str]) -> None:
     """Raise ValueError if no such file can be written: its folder or its ending."""
     if path.suffix.lower() not in suffixes:
         raise ValueError(f"{path} must end in {' or '.join(suffixes)}")
-    if not path.parent.is_dir():
-        raise ValueError(f"{path}: there is no folder {path.parent}")
+    check_output(path, str(path))
 
 
 def save_film(path: Path, frames: Sequence[Frame], fps: float) -> None:

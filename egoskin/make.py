@@ -20,7 +20,7 @@ from torchrl.envs import (
 from egoskin.checkpoint import part, prefixed
 from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
 from egoskin.observations import Numb, Oracle, Privileged, Proprioception
-from egoskin.robots import ROBOTS, RobotConfig
+from egoskin.robots import ROBOTS, RobotConfig, RobotName
 from egoskin.sensors import History, Skin
 from egoskin.sensors.config import SensorConfig, SkinConfig
 from egoskin.sensors.geometry import STATE_KEYS
@@ -53,7 +53,7 @@ _NETWORK_KEYS = ("observation", "privileged_observation", "signal")
 class EnvConfig:
     """Robot, task, skin, sensors: everything an environment is made of."""
 
-    robot: Literal["h1_2"] = "h1_2"
+    robot: RobotName = "h1_2"
     """Robot by name."""
     task: DodgeballConfig = dataclasses.field(default_factory=DodgeballConfig)
     """The dodgeball task."""
@@ -236,22 +236,29 @@ def make_env(
     )
 
 
-def check_num_workers(num_envs: int, num_workers: int | None) -> int:
+def check_num_workers(
+    num_envs: int, num_workers: int | None, name: str = "num_envs"
+) -> int:
     """Return the number of workers.
+
+    Args:
+        num_envs: Number of agents.
+        num_workers: Number of workers; None for the default.
+        name: How the number of agents was called, for the error text.
 
     Raises:
         ValueError: If it does not divide the number of agents; the text lists what
             does.
     """
     if num_envs < 1:
-        raise ValueError(f"num_envs must be at least 1, got {num_envs}")
+        raise ValueError(f"{name} must be at least 1, got {num_envs}")
     if num_workers is None:
         return default_num_workers(num_envs)
     if num_workers < 1 or num_envs % num_workers:
         limit = max(64, num_workers)
         fit = [n for n in range(1, min(num_envs, limit) + 1) if num_envs % n == 0]
         raise ValueError(
-            f"num_workers must divide num_envs ({num_envs}), got {num_workers}; "
+            f"num_workers must divide {name} ({num_envs}), got {num_workers}; "
             f"valid: {', '.join(map(str, fit))}"
         )
     return num_workers

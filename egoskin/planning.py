@@ -143,6 +143,11 @@ def find_ceiling(
             "a ceiling is searched with ideal sensors, but the policy's have "
             f"corruption={config.sensor.corruption}"
         )
+    hz = config.task.physics.control_hz
+    if (steps := round(search.stand_s * hz)) < 1:
+        raise ValueError(
+            f"stand_s must be at least one control step, got {search.stand_s}"
+        )
     # No plan is cut short by the age limit.
     task = config.task
     length = task.episode_length_s + search.stand_s
@@ -164,7 +169,6 @@ def find_ceiling(
         raise ValueError(f"none of {throws} balls came within {reach:g} m of a sensor")
     env, starts = make(n * samples, longer), start.repeated(samples)
     env.reset()
-    steps = round(search.stand_s * config.task.physics.control_hz)
     mean = torch.zeros(n, search.entries, len(config.robot_config.joints))
     spread = torch.full_like(mean, search.spread)
     generator = torch.Generator().manual_seed(search.seed)

@@ -113,8 +113,18 @@ class PolicySpec:
         missing = [f.name for f in dataclasses.fields(cls) if f.name not in header]
         if missing:
             raise ValueError(f"{what} holds no policy: {missing[0]!r} is missing")
+        sizes, numbers = header["sizes"], (header["num_actions"], header["frames"])
+        named = isinstance(sizes, dict)
+        numbers = (*numbers, *(sizes.values() if named else ()))
+        if not named or not all(isinstance(number, int) for number in numbers):
+            raise ValueError(
+                f"{what} holds no policy: sizes, num_actions and frames must be numbers"
+            )
+        env = from_plain(EnvConfig, header["env"], what)
+        if lacking := set(env.critic_keys) - sizes.keys():
+            raise ValueError(f"{what} holds no policy: no size of {min(lacking)!r}")
         return cls(
-            env=from_plain(EnvConfig, header["env"], what),
+            env=env,
             skin=Skin.from_dict(header["skin"]),
             network=from_plain(NetworkConfig, header["network"], what),
             sizes=header["sizes"],
@@ -163,6 +173,13 @@ def load_agent_tensors(agent: Agent, tensors: Mapping[str, Tensor], what: str) -
         if name not in own or own[name].shape != value.shape:
             raise ValueError(f"{what}: tensor {name!r} does not fit the networks")
         own[name].copy_(value)
+
+
+def check_finite(tensors: Mapping[str, Tensor], what: str) -> None:
+    """Raise ValueError if a tensor holds NaN or infinity; the text names it."""
+    for name, value in tensors.items():
+        if not value.isfinite().all():
+            raise ValueError(f"{what} is damaged: tensor {name!r} is not finite")
 
 
 def save_policy(path: Path, agent: Agent, spec: PolicySpec) -> None:
@@ -250,6 +267,7 @@ def load_policy(path: str | Path) -> Policy:
         path = path / CHECKPOINT_NAME
     tensors, header = load_tensors(path)
     spec = PolicySpec.from_header(header.get("policy", {}), str(path))
-    agent = spec.build_agent()
-    load_agent_tensors(agent, part("agent", tensors), str(path))
+    agent, own = spec.build_agent(), part("agent", tensors)
+    check_finite(own, str(path))
+    load_agent_tensors(agent, own, str(path))
     return Policy(agent, spec)

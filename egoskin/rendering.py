@@ -441,7 +441,11 @@ class _Canvas:
         self._option, self._perturb = mujoco.MjvOption(), mujoco.MjvPerturb()
         self._rect = mujoco.MjrRect(0, 0, *size)
         scale = mujoco.mjtFontScale.mjFONTSCALE_100
-        self._context = mujoco.MjrContext(model, scale.value)
+        try:
+            self._context = mujoco.MjrContext(model, scale.value)
+        except mujoco.FatalError as error:
+            self._gl.free()
+            raise ValueError(f"no picture of {size} pixels here: {error}") from error
         offscreen = mujoco.mjtFramebuffer.mjFB_OFFSCREEN
         mujoco.mjr_setBuffer(offscreen.value, self._context)
 

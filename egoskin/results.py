@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from egoskin.cli import changed_fields, from_plain, to_plain
+from egoskin.cli import changed_fields, from_plain, read_json, to_plain
 from egoskin.runs import Run, TrainConfig
 
 # Environment steps between the stored lines of metrics (about 250 in the paper's 1000
@@ -196,7 +196,7 @@ def record(run: Run, frames: int) -> Record:
     file = run.path / "versions.json"
     if not file.is_file():
         raise ValueError(f"{run.path} has not been started: it has no versions.json")
-    starts = json.loads(file.read_text())
+    starts = read_json(file)
     with open(run.path / "metrics.csv", newline="") as source:
         rows = [r for r in csv.DictReader(source) if int(r["frames"]) <= frames]
     script, *args = starts[0]["command"]
@@ -271,7 +271,7 @@ def _load(path: Path) -> StoredRun:
     ).reshape(-1, 2)
     # No estimate before an episode could have lasted so long.
     curve = curve[np.isfinite(curve[:, 1])]
-    content = json.loads((path / "config.json").read_text())
+    content = read_json(path / "config.json")
     content.pop("drift_start", None)
     content.pop("slow_start", None)
     used = {name: content.pop(name, off) for name, off in _RETIRED.items()}
@@ -280,10 +280,10 @@ def _load(path: Path) -> StoredRun:
         name=path.name,
         config=from_plain(TrainConfig, content, str(path / "config.json")),
         retired=retired,
-        record=from_plain(Record, json.loads(what.read_text()), str(what)),
+        record=from_plain(Record, read_json(what), str(what)),
         frames=curve[:, 0],
         success=curve[:, 1],
-        evaluation=json.loads(evaluations[-1].read_text()),
+        evaluation=read_json(evaluations[-1]),
     )
 
 

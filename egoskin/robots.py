@@ -12,6 +12,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Literal
 
 import mujoco
 import numpy as np
@@ -344,5 +345,7 @@ H1_2 = RobotConfig(
 )
 """Unitree H1-2 without hands, wrists locked: 21 joints."""
 
+RobotName = Literal["h1_2"]
+"""Robots that can be chosen by name."""
 ROBOTS = {H1_2.name: H1_2}
 """Robots by name, for configurations and policy files."""

@@ -7,9 +7,11 @@
     checkpoint.safetensors   everything needed to go on, at most a minute old
     policies/<frames>.safetensors   self-contained policies, from the first on
     not-finite-<frames>.safetensors   an update that failed, for scripts/replay.py
+    lock                     held by the process that trains
 
-Contract: a checkpoint is written atomically, and metrics written after it are dropped
-on resume, so that a log has neither a gap nor a repetition.
+Contract: a checkpoint is written atomically, metrics written after it are dropped on
+resume, and one process trains at a time, so that a log has neither a gap nor a
+repetition.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ import argparse
 import csv
 import dataclasses
 import datetime
+import fcntl
 import importlib.metadata
 import io
 import json
@@ -25,7 +28,8 @@ import os
 import platform
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -36,7 +40,14 @@ from torch import Tensor
 
 from egoskin.agents.ppo import PPOConfig
 from egoskin.checkpoint import PARTIAL, load_tensors, save_tensors, sync, write_file
-from egoskin.cli import changed_fields, from_plain, to_plain
+from egoskin.cli import (
+    changed_fields,
+    check_counts,
+    check_numbers,
+    from_plain,
+    read_json,
+    to_plain,
+)
 from egoskin.compilation import can_compile
 from egoskin.draws import check_seed
 from egoskin.events import EventFile
@@ -81,16 +92,9 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         """Raise ValueError for values with which no run can start."""
-        for name in ("total_frames", "snapshot_frames"):
-            if getattr(self, name) < 1:
-                raise ValueError(
-                    f"{name} must be at least 1, got {getattr(self, name)}"
-                )
+        check_numbers(to_plain(self))
+        check_counts(self, "total_frames", "snapshot_frames", "learner_threads")
         check_seed(self.seed)
-        if self.learner_threads is not None and self.learner_threads < 1:
-            raise ValueError(
-                f"learner_threads must be at least 1, got {self.learner_threads}"
-            )
         if not self.checkpoint_interval > 0:
             raise ValueError(
                 f"checkpoint_interval must be positive, got {self.checkpoint_interval}"
@@ -211,9 +215,10 @@ class Run:
             stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
             path = Path("runs") / f"{stamp}-{kind}-seed{config.seed}"
         if path.exists() and (not path.is_dir() or any(path.iterdir())):
+            go_on = (path / "config.json").is_file()
             raise ValueError(
-                f"{path} exists already; choose another --run-dir, or go on with it "
-                f"by --resume {path}"
+                f"{path} exists already; choose another --run-dir"
+                + f", or go on with it by --resume {path}" * go_on
             )
         if config.compile_kernels is None:
             config = dataclasses.replace(config, compile_kernels=can_compile())
@@ -234,11 +239,7 @@ class Run:
         file = path / "config.json"
         if not file.is_file():
             raise ValueError(f"{path} is no run folder: it has no config.json")
-        try:
-            content = json.loads(file.read_text())
-        except json.JSONDecodeError as error:
-            raise ValueError(f"{file} is not JSON: {error}") from error
-        return cls(path, from_plain(TrainConfig, content, str(file)))
+        return cls(path, from_plain(TrainConfig, read_json(file), str(file)))
 
     def write_config(self) -> None:
         """Write the configuration (again, with a later end)."""
@@ -250,7 +251,7 @@ class Run:
     def record_start(self) -> None:
         """Append versions, machine, git state and command of this start."""
         file = self.path / "versions.json"
-        starts = json.loads(file.read_text()) if file.exists() else []
+        starts = read_json(file) if file.exists() else []
         starts.append(
             {
                 "time": datetime.datetime.now(datetime.timezone.utc).isoformat(),
@@ -289,6 +290,22 @@ class Run:
     def _metrics_path(self) -> Path:
         return self.path / "metrics.csv"
 
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep other processes from training this run; the system ends it with ours.
+
+        Raises:
+            ValueError: If one does already.
+        """
+        with open(self.path / "lock", "w") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise ValueError(
+                    f"{self.path} is being trained by another process"
+                ) from None
+            yield
+
     def is_new(self) -> bool:
         """Whether there is nothing to go on from, though it may have been started."""
         return not (self.checkpoint_path.exists() or self._metrics_path.exists())
@@ -313,6 +330,7 @@ class Run:
 
     def start_metrics(self, frames: int) -> None:
         """Open the logs, dropping what was logged after a number of frames."""
+        (self.path / "policies").mkdir(exist_ok=True)
         for left in self.path.rglob(PARTIAL):
             left.unlink()
         if self._metrics_path.exists():

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -27,6 +28,7 @@ from egoskin.make import load_env_state, make_env, save_env_state
 from egoskin.policies import (
     PolicySpec,
     agent_tensors,
+    check_finite,
     load_agent_tensors,
     save_policy,
     sparse_sources,
@@ -170,11 +172,16 @@ class Trainer:
             },
         )
 
-    def load(self) -> None:
-        """Continue from the run's checkpoint."""
-        tensors, header = self.run.load_checkpoint()
+    def load(self, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:
+        """Continue from a checkpoint of the run.
+
+        Raises:
+            ValueError: If its agent is another one, or damaged.
+        """
         what = str(self.run.checkpoint_path)
-        load_agent_tensors(self.agent, part("agent", tensors), what)
+        agent = part("agent", tensors)
+        check_finite(agent, what)
+        load_agent_tensors(self.agent, agent, what)
         self.ppo.load_state(part("optimizer", tensors), header["learning_rate"])
         self.root = load_env_state(self.env, part("env", tensors))
         self.survival.at_risk.copy_(tensors["survival/at_risk"])
@@ -220,38 +227,44 @@ def open_trainer(run: Run, num_threads: int = 1) -> Iterator[Trainer]:
     Args:
         run: A new run or one to go on with.
         num_threads: Physics threads of each worker; results do not depend on it.
+
+    Raises:
+        ValueError: If the run is being trained already, or cannot be gone on with.
     """
     config = run.config
     if config.learner_threads is not None:
         torch.set_num_threads(config.learner_threads)
-    # It imports while the rest is made.
-    start_server()
-    skin = Skin.load(run.skin_path)
-    compile_kernels = bool(config.compile_kernels)
-    sources = sparse_sources(config.env, skin, compile_kernels)
-    env = make_env(
-        config.env,
-        skin,
-        num_envs=config.num_envs,
-        seed=config.seed,
-        num_workers=config.num_workers,
-        num_threads=num_threads,
-        sparse=bool(sources),
-        compile_kernels=compile_kernels,
-    )
-    try:
-        trainer = Trainer(run, env, skin, sources)
-        if run.is_new():
-            trainer.start()
-        else:
-            trainer.load()
-        run.write_config()
-        run.record_start()
-        run.start_metrics(trainer.frames)
-        yield trainer
-    finally:
-        run.close()
-        env.close()
+    with run.locked():
+        # What cannot be read is told of before the workers start.
+        skin = Skin.load(run.skin_path)
+        checkpoint = None if run.is_new() else run.load_checkpoint()
+        # It imports while the rest is made.
+        start_server()
+        compile_kernels = bool(config.compile_kernels)
+        sources = sparse_sources(config.env, skin, compile_kernels)
+        env = make_env(
+            config.env,
+            skin,
+            num_envs=config.num_envs,
+            seed=config.seed,
+            num_workers=config.num_workers,
+            num_threads=num_threads,
+            sparse=bool(sources),
+            compile_kernels=compile_kernels,
+        )
+        try:
+            trainer = Trainer(run, env, skin, sources)
+            if checkpoint is None:
+                trainer.start()
+            else:
+                trainer.load(*checkpoint)
+            run.write_config()
+            run.record_start()
+            run.start_metrics(trainer.frames)
+            yield trainer
+        finally:
+            run.close()
+            env.close()
 
 
 def train(

@@ -23,7 +23,7 @@ from benchmarks.loop import LoopConfig, loop
 from benchmarks.physics import PhysicsBench, physics_rows
 from benchmarks.report import report
 from benchmarks.sensors import SensorBench, sensor_rows
-from egoskin.cli import clear_errors
+from egoskin.cli import check_output, clear_errors
 
 
 def main(args: list[str]) -> None:
@@ -36,6 +36,7 @@ def main(args: list[str]) -> None:
         "gradients": GradientBench,
     }
     config = tyro.extras.subcommand_cli_from_dict(benches, args=args)
+    check_output(config.json, "--json")
     if isinstance(config, LoopConfig):
         rows = loop(config)
     elif isinstance(config, PhysicsBench):

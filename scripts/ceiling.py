@@ -22,7 +22,7 @@ from typing import Annotated
 import tyro
 from torch import Tensor
 
-from egoskin.cli import clear_errors, counted
+from egoskin.cli import check_counts, check_output, clear_errors, counted
 from egoskin.draws import check_seed
 from egoskin.evaluation import standard_task
 from egoskin.planning import Ceiling, Outcome, SearchConfig, find_ceiling
@@ -55,15 +55,10 @@ class CeilingConfig:
     def __post_init__(self) -> None:
         """Raise ValueError for values with which nothing can be searched."""
         check_seed(self.bank_seed, "bank_seed")
-        for name in ("throws", "ball"):
-            if getattr(self, name) < 1:
-                raise ValueError(
-                    f"{name} must be at least 1, got {getattr(self, name)}"
-                )
+        check_counts(self, "throws", "ball")
         if not self.reach > 0:
             raise ValueError(f"reach must be positive, got {self.reach}")
-        if self.json is not None and not self.json.parent.is_dir():
-            raise ValueError(f"--json: there is no folder {self.json.parent}")
+        check_output(self.json, "--json")
 
 
 def groups(result: Ceiling) -> list[dict[str, float | int]]:

@@ -42,7 +42,7 @@ from egoskin.cli import clear_errors, counted, to_plain
 from egoskin.envs.physics import PhysicsConfig
 from egoskin.envs.throws import ThrowConfig
 from egoskin.film import check_path
-from egoskin.robots import ROBOTS
+from egoskin.robots import ROBOTS, RobotName
 from egoskin.sensors import Field, Ray
 from egoskin.sensors.config import SkinConfig
 
@@ -56,7 +56,7 @@ BLIND, NOWHERE = "#c1272d", "#e6e6e6"
 class CoverageConfig:
     """Show what a skin sees, before any training: a picture, a table and JSON."""
 
-    robot: Literal["h1_2"] = "h1_2"
+    robot: RobotName = "h1_2"
     """Robot by name."""
     skin: SkinConfig = dataclasses.field(default_factory=SkinConfig)
     """Where the sensors sit; what a sensor's file says of its type and range holds."""

@@ -19,7 +19,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from egoskin.behaviour import Behaviour, Motion, behave
-from egoskin.cli import clear_errors, counted
+from egoskin.cli import check_counts, check_output, clear_errors, counted
 from egoskin.draws import check_seed
 from egoskin.evaluation import Estimate, Evaluation, evaluate, standard_task
 from egoskin.make import EnvConfig, check_num_workers
@@ -56,13 +56,9 @@ class EvaluateConfig:
     def __post_init__(self) -> None:
         """Raise ValueError for values with which nothing can be played."""
         check_seed(self.bank_seed, "bank_seed")
-        check_num_workers(self.episodes, self.num_workers)
-        if self.check_substeps is not None and self.check_substeps < 1:
-            raise ValueError(
-                f"check_substeps must be at least 1, got {self.check_substeps}"
-            )
-        if self.json is not None and not self.json.parent.is_dir():
-            raise ValueError(f"--json: there is no folder {self.json.parent}")
+        check_counts(self, "episodes", "check_substeps")
+        check_num_workers(self.episodes, self.num_workers, "episodes")
+        check_output(self.json, "--json")
 
 
 def share(value: float | None) -> str:

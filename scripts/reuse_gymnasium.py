@@ -19,6 +19,7 @@ import gymnasium
 import mujoco
 import numpy as np
 import torch
+import tyro
 from torch import Tensor
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 from torchrl.envs import Compose, GymEnv, StepCounter, TransformedEnv
@@ -136,4 +137,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

@@ -21,7 +21,7 @@ import tyro
 from tensordict import TensorDict
 from torch import Tensor
 
-from egoskin.cli import clear_errors
+from egoskin.cli import check_counts, clear_errors
 from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
 from egoskin.robots import H1_2
 from egoskin.sensors import FieldSensor, Ray, RaySensor, place_sensors
@@ -41,6 +41,10 @@ class ReplayConfig:
     """Robots ``B`` in a new recording."""
     num_steps: int = 60
     """Control steps ``T`` in a new recording."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for counts that record nothing."""
+        check_counts(self, "num_envs", "num_steps")
 
 
 def record(folder: Path, num_envs: int, num_steps: int) -> None:

@@ -15,6 +15,7 @@ import egoskin  # noqa: F401  (before torch: it says how torch's threads wait)
 import numpy as np
 import pytorch_kinematics as pk
 import torch
+import tyro
 from tensordict import TensorDict
 from torchrl.envs import Compose
 
@@ -109,4 +110,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

@@ -30,7 +30,7 @@ from egoskin.cli import clear_errors, counted
 from egoskin.film import check_path, save_picture
 from egoskin.kinematics import LinkKinematics
 from egoskin.rendering import CameraConfig, Painter
-from egoskin.robots import ROBOTS, RobotConfig
+from egoskin.robots import ROBOTS, RobotConfig, RobotName
 from egoskin.sensors import Skin
 from egoskin.sensors.coverage import Coverage
 from egoskin.sensors.gentact import load_gentact, save_gentact
@@ -70,7 +70,7 @@ class Place:
 
     out: Path
     """Skin file to write (JSON)."""
-    robot: Literal["h1_2"] = "h1_2"
+    robot: RobotName = "h1_2"
     """Robot by name."""
     num_sensors: int | None = 64
     """Number of sensors; None: as many as the spacing lets in."""
@@ -126,7 +126,7 @@ class Import:
     """File exported from GenTact."""
     out: Path
     """Skin file to write (JSON)."""
-    robot: Literal["h1_2"] = "h1_2"
+    robot: RobotName = "h1_2"
     """Robot by name."""
     scale: float | None = None
     """Metres of one unit of the file; None: that of the dialect."""

@@ -25,7 +25,7 @@ import tyro
 
 from egoskin.agents.ppo import PPOConfig
 from egoskin.checkpoint import load_tensors
-from egoskin.cli import clear_errors, counted
+from egoskin.cli import check_counts, clear_errors, counted
 from egoskin.make import EnvConfig
 from egoskin.runs import Run, TrainConfig, parse_config
 from egoskin.training import open_trainer, train
@@ -52,7 +52,7 @@ class VerifyConfig:
     seed: int = 0
     """Seed of the trainings."""
     env: Annotated[EnvConfig, tyro.conf.arg(name="")] = field(default_factory=EnvConfig)
-    """Robot, task, skin, sensors; the same with a corrupted skin is tried as well."""
+    """Robot, task, skin, sensors; with corrupted ones, where they can be, as well."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for sizes that cannot be split."""
@@ -62,6 +62,8 @@ class VerifyConfig:
             raise ValueError(
                 f"num_envs must be a multiple of 4 from 16 on, got {self.num_envs}"
             )
+
+        check_counts(self, "learner_threads")
 
     @property
     def odd_num_envs(self) -> int:
@@ -134,11 +136,11 @@ def agree(config: TrainConfig, folder: Path, title: str, half: int) -> bool:
 def main(args: list[str]) -> None:
     """Run the command."""
     config = tyro.cli(VerifyConfig, args=args)
-    noisy = dataclasses.replace(config.env.sensor, corruption="time_of_flight")
-    skins = {
-        "skin as given": config.env,
-        "corrupted skin": dataclasses.replace(config.env, sensor=noisy),
-    }
+    skins = {"skin as given": config.env}
+    sensor = config.env.sensor
+    if sensor.uses_skin and sensor.signal != "localization":
+        noisy = dataclasses.replace(sensor, corruption="time_of_flight")
+        skins["corrupted skin"] = dataclasses.replace(config.env, sensor=noisy)
     equal = True
     with tempfile.TemporaryDirectory(prefix="egoskin-verify-") as folder:
         for title, env in skins.items():

@@ -7,8 +7,9 @@ from typing import Any
 
 import pytest
 
-from egoskin.cli import from_plain, to_plain
+from egoskin.cli import check_output, clear_errors, from_plain, read_json, to_plain
 from egoskin.runs import TrainConfig
+from egoskin.workers import WorkerError
 
 
 def test_a_configuration_comes_back(tmp_path):
@@ -31,3 +32,38 @@ def test_a_value_of_the_wrong_type_is_named(value: Any):
         from_plain(TrainConfig, plain, "my.json")
     with pytest.raises(ValueError, match=r"my\.json: .*run_dir"):
         from_plain(TrainConfig, {"run_dir": 3}, "my.json")
+    with pytest.raises(ValueError, match=r"my\.json: expected an object, got list"):
+        from_plain(TrainConfig, [], "my.json")
+
+
+def test_what_is_no_number_is_refused_wherever_it_stands():
+    for field in ("env.task.reward.survival", "ppo.entropy_coeff"):
+        plain = to_plain(TrainConfig())
+        *parents, name = field.split(".")
+        inner = plain
+        for parent in parents:
+            inner = inner[parent]
+        inner[name] = math.nan
+        with pytest.raises(ValueError, match=f"{field} must be a number, got nan"):
+            from_plain(TrainConfig, plain, "here")
+
+
+def test_a_file_that_cannot_be_written_is_told_of_before_the_work(tmp_path):
+    check_output(None, "--json")
+    check_output(tmp_path / "new.json", "--json")
+    with pytest.raises(ValueError, match=r"--json: there is no folder .*none"):
+        check_output(tmp_path / "none" / "new.json", "--json")
+    with pytest.raises(ValueError, match=r"--json: .* is a folder"):
+        check_output(tmp_path, "--json")
+
+
+def test_a_file_that_is_no_json_is_named(tmp_path):
+    for content in (b"{", b"\xff\xfe"):
+        (tmp_path / "bad.json").write_bytes(content)
+        with pytest.raises(ValueError, match=r"bad\.json is not JSON"):
+            read_json(tmp_path / "bad.json")
+
+
+def test_a_worker_that_ends_is_one_line():
+    with pytest.raises(SystemExit, match="error: worker 0 died"), clear_errors():
+        raise WorkerError("worker 0 died")

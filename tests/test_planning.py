@@ -169,6 +169,12 @@ def test_balls_that_never_come_into_reach_are_an_error(policy: Policy):
         )
 
 
+def test_a_plan_lasts_a_control_step_at_least(policy: Policy):
+    short = SearchConfig(stand_s=0.001)
+    with pytest.raises(ValueError, match="stand_s must be at least one control step"):
+        find_ceiling(policy, task(policy), short, bank_seed=0, throws=1, reach=2.0)
+
+
 @pytest.mark.parametrize("change", [{"samples": 3}, {"hold": 0}, {"stand_s": -1.0}])
 def test_searches_that_cannot_be_are_refused(change: dict):
     with pytest.raises(ValueError, match=next(iter(change))):

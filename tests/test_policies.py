@@ -44,6 +44,18 @@ def test_a_file_that_lacks_a_tensor_is_refused(name, tmp_path):
         egoskin.load_policy(tmp_path / "half.safetensors")
 
 
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("sizes", {}), ("sizes", "many"), ("num_actions", "21"), ("frames", None)],
+)
+def test_a_header_that_describes_no_policy_is_refused(field, value, tmp_path):
+    tensors, header = load_tensors(ASSETS / "field_proximity.safetensors")
+    header["policy"][field] = value
+    save_tensors(tmp_path / "odd.safetensors", tensors, header)
+    with pytest.raises(ValueError, match=r"odd.* holds no policy"):
+        egoskin.load_policy(tmp_path / "odd.safetensors")
+
+
 def test_a_file_that_is_there_comes_before_a_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "localization").write_bytes(b"mine")

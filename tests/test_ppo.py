@@ -380,6 +380,7 @@ def test_shares_of_a_minibatch_add_up_to_the_whole(threads: int):
         {"entropy_frames": 0},
         {"learning_rate": 0.1},
         {"learning_rate": 1e-6},
+        {"clip_epsilon": float("inf")},
     ],
 )
 def test_values_outside_their_range_are_refused(field: dict):

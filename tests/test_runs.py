@@ -13,6 +13,7 @@ import pytest
 import torch
 
 import egoskin
+from egoskin.checkpoint import load_tensors, save_tensors
 from egoskin.make import EnvConfig
 from egoskin.runs import Run, TrainConfig
 from egoskin.sensors.config import SensorConfig
@@ -40,6 +41,33 @@ def test_a_run_learns_with_its_own_number_of_threads(config: TrainConfig):
             assert torch.get_num_threads() == trainer.ppo.shares == 3
     finally:
         torch.set_num_threads(before)
+
+
+def test_one_process_trains_a_run_at_a_time(config: TrainConfig):
+    run = Run.create(config)
+    with open_trainer(run):
+        again = Run.open(run.path)
+        with (
+            pytest.raises(ValueError, match="is being trained by another process"),
+            open_trainer(again),
+        ):
+            pass
+    with again.locked():
+        pass
+
+
+def test_a_damaged_checkpoint_is_told_of(config: TrainConfig):
+    run = Run.create(config)
+    with open_trainer(run):
+        pass
+    tensors, header = load_tensors(run.checkpoint_path)
+    tensors["agent/head.log_std"][3] = torch.nan
+    save_tensors(run.checkpoint_path, tensors, header)
+    message = "damaged: tensor 'head.log_std' is not finite"
+    with pytest.raises(ValueError, match=message), open_trainer(Run.open(run.path)):
+        pass
+    with pytest.raises(ValueError, match=message):
+        egoskin.load_policy(run.path)
 
 
 def test_policies_are_kept_at_the_start_in_between_and_at_the_end(config: TrainConfig):

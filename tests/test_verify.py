@@ -22,16 +22,22 @@ def verify(monkeypatch, *args: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "sensor",
-    [[], ["--sensor.coverage", "ray", "--sensor.signal", "closeness"]],
-    ids=["field", "ray"],
+    ("sensor", "skins"),
+    [
+        ([], 2),
+        (["--sensor.coverage", "ray", "--sensor.signal", "closeness"], 2),
+        # Nothing that could be corrupted.
+        (["--sensor.signal", "localization"], 1),
+        (["--sensor.coverage", "none"], 1),
+    ],
+    ids=["field", "ray", "localization", "blind"],
 )
-def test_training_is_exact(sensor, monkeypatch, capsys):
+def test_training_is_exact(sensor, skins, monkeypatch, capsys):
     # 6 rollouts: the first throws land, rows reset at different times.
     verify(monkeypatch, "--num-envs", "64", "--iterations", "6", *sensor)
     text = capsys.readouterr().out
     assert "equal: training is exact" in text
-    assert text.count("resumed after 3 rollouts") == 2
+    assert text.count("resumed after 3 rollouts") == skins
     # 4 workers x 16 rows; the odd numbers of agents give 45, 15 and 9 rows.
     assert "5 workers x 9 rows, 2 physics threads" in text
 

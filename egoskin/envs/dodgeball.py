@@ -53,9 +53,10 @@ class DodgeballConfig:
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise ValueError(f"{name} must be positive, got {value}")
-        if not self.episode_length_s * self.physics.control_hz >= 1:
+        steps = self.episode_length_s * self.physics.control_hz
+        if not 1 <= steps < math.inf:
             raise ValueError(
-                f"episode_length_s must be at least one control step, got "
+                f"episode_length_s must be at least one control step and finite, got "
                 f"{self.episode_length_s}"
             )
         if self.self_contact_ends and not self.physics.self_collision:

@@ -126,6 +126,7 @@ class SensorConfig:
                 "validity": self.validity,
                 "corruption": self.corruption != "none",
                 "signal=localization": self.signal == "localization",
+                "numb": self.numb and self.coverage == "none",
             }
             for name, given in ignored.items():
                 if given:

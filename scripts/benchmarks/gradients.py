@@ -36,6 +36,8 @@ class GradientBench:
         """Raise ValueError for counts that compare nothing."""
         if self.rollouts < 3:
             raise ValueError(f"rollouts must be at least 3, got {self.rollouts}")
+        if not all(0 <= decay <= 1 for decay in self.lambdas):
+            raise ValueError(f"lambdas must be between 0 and 1, got {self.lambdas}")
 
 
 def gradient_rows(config: GradientBench) -> list[Row]:
@@ -47,8 +49,8 @@ def gradient_rows(config: GradientBench) -> list[Row]:
     """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "run"
+        stored = Run.open(config.run).config
         shutil.copytree(config.run, path)
-        stored = Run.open(path).config
         planned = dataclasses.replace(stored, resume=path)
         gradients = _gradients(config, Run(path, planned))
     reference = gradients[1.0]

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from benchmarks.report import Row, show
+from egoskin.cli import check_counts
 from egoskin.envs.physics import Physics, PhysicsConfig, build_scene
 from egoskin.envs.throws import ThrowConfig
 from egoskin.make import EnvConfig
@@ -33,6 +34,10 @@ class PhysicsBench:
     """How often each variant is measured, in turn."""
     json: Path | None = None
     """File to write the rows to."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for values that cannot be measured."""
+        check_counts(self, "num_envs", "steps", "rounds")
 
 
 def physics_rows(config: PhysicsBench) -> list[Row]:

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.report import Row, show
+from egoskin.cli import check_counts
 from egoskin.make import EnvConfig, make_worker_env
 from egoskin.robots import H1_2
 from egoskin.sensors import FieldSensor, Proximity, RaySensor, Skin
@@ -48,11 +49,7 @@ class SensorBench:
 
     def __post_init__(self) -> None:
         """Raise ValueError for values that cannot be measured."""
-        for name in ("num_envs", "snapshots", "rounds"):
-            if getattr(self, name) < 1:
-                raise ValueError(
-                    f"{name} must be at least 1, got {getattr(self, name)}"
-                )
+        check_counts(self, "num_envs", "snapshots", "rounds")
 
 
 State = tuple[Tensor, Tensor, Tensor, Tensor]
