@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 ARGS ?=
 # The policy of `make demo`, and an episode of its bank to film.
 POLICY ?= field_proximity
-EPISODE ?= 0
+EPISODE ?= 28
 
 .PHONY: train demo test test-slow test-memory verify check bench clean
 

@@ -436,11 +436,13 @@ Written by `python scripts/results.py write` from [results](../results/README.md
 is written by hand is in `results/notes.md`.
 
 Every figure is of the stored policy, mean action, on a bank of standard throws, with
-95 % intervals for each seed; over seeds the interquartile mean and, for the success,
-the interquartile range. *Falls* are the share of episodes ended by a fall within 3 s;
-the *way* is the mean displacement of the episodes that last 3 s. The curves are the
-estimate of success while training, exploration on, against the simulated time of all
-agents: interquartile mean and range over the seeds, as far as all seeds go.
+95 % intervals for each seed (over throws, not over trainings); over seeds the
+interquartile mean and, for the success, the interquartile range. Survival is at most
+10 s. Balls are *avoided* that land or fly on past the robot while the episode lasts, of
+those and the ones that touch it. *Falls* are the share of episodes ended by a fall
+within 3 s; the *way* is the mean displacement of the episodes that last 3 s. The curves
+are the estimate of success while training, exploration on, against the simulated time
+of all agents: interquartile mean and range over the seeds, as far as all seeds go.
 """
 
 

@@ -622,6 +622,7 @@ def test_the_reward_does_not_depend_on_balls_that_do_not_touch():
     [
         ({"action_scale": 0.0}, "action_scale must be positive, got 0.0"),
         ({"episode_length_s": 0.01}, "at least one control step, got 0.01"),
+        ({"episode_length_s": float("inf")}, "must be finite.*, got inf"),
         ({"start_joint_noise": -0.1}, "start_joint_noise must not be negative"),
         (
             {

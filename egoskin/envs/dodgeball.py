@@ -56,7 +56,7 @@ class DodgeballConfig:
         steps = self.episode_length_s * self.physics.control_hz
         if not 1 <= steps < math.inf:
             raise ValueError(
-                f"episode_length_s must be at least one control step and finite, got "
+                f"episode_length_s must be finite and at least one control step, got "
                 f"{self.episode_length_s}"
             )
         if self.self_contact_ends and not self.physics.self_collision:
