@@ -317,6 +317,8 @@ class SparseRays:
     def __call__(self, tensordict: TensorDictBase) -> SparseRows:
         """Return the signal of each row ``[B]``, on the device of the tensordict."""
         given = [tensordict[key] for key in self.in_keys]
+        device = given[0].device
+        assert device is not None
         state = [x.cpu() for x in given]
         place, distance = self._sensor.hits(*state)
         nothing = self._reading.signal(distance.new_full((1, 1), torch.inf))
@@ -327,7 +329,7 @@ class SparseRays:
             value=self._reading.signal(distance[None])[0],
             size=self.size,
             default=float(nothing),
-        ).to(given[0].device)
+        ).to(device)
 
 
 def _padded(directions: np.ndarray) -> np.ndarray:
