@@ -206,12 +206,14 @@ def standard_task(config: EnvConfig) -> EnvConfig:
     They start as the default ones, last 10 s at most and are a success at 3 s, and
     self-contact ends none.
     """
-    standard = DodgeballConfig(episode_length_s=_LONGEST)
-    names = ("throws", "episode_length_s", "success_s", "start_joint_noise")
+    standard = DodgeballConfig()
     task = dataclasses.replace(
         config.task,
+        throws=standard.throws,
+        start_joint_noise=standard.start_joint_noise,
+        episode_length_s=_LONGEST,
+        success_s=standard.success_s,
         self_contact_ends=False,
-        **{name: getattr(standard, name) for name in names},
     )
     return dataclasses.replace(config, task=task)
 

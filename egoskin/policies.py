@@ -113,10 +113,10 @@ class PolicySpec:
         missing = [f.name for f in dataclasses.fields(cls) if f.name not in header]
         if missing:
             raise ValueError(f"{what} holds no policy: {missing[0]!r} is missing")
-        sizes, numbers = header["sizes"], (header["num_actions"], header["frames"])
-        named = isinstance(sizes, dict)
-        numbers = (*numbers, *(sizes.values() if named else ()))
-        if not named or not all(isinstance(number, int) for number in numbers):
+        sizes = header["sizes"]
+        numbers = sizes.values() if isinstance(sizes, dict) else [None]
+        numbers = [*numbers, header["num_actions"], header["frames"]]
+        if not all(isinstance(number, int) for number in numbers):
             raise ValueError(
                 f"{what} holds no policy: sizes, num_actions and frames must be numbers"
             )
@@ -127,7 +127,7 @@ class PolicySpec:
             env=env,
             skin=Skin.from_dict(header["skin"]),
             network=from_plain(NetworkConfig, header["network"], what),
-            sizes=header["sizes"],
+            sizes=sizes,
             num_actions=header["num_actions"],
             frames=header["frames"],
         )

@@ -329,7 +329,10 @@ class Run:
         return load_tensors(self.checkpoint_path)
 
     def start_metrics(self, frames: int) -> None:
-        """Open the logs, dropping what was logged after a number of frames."""
+        """Open the logs, dropping what was logged after a number of frames.
+
+        The folder of the policies, if somebody removed it, is made again.
+        """
         (self.path / "policies").mkdir(exist_ok=True)
         for left in self.path.rglob(PARTIAL):
             left.unlink()

@@ -56,7 +56,7 @@ class EvaluateConfig:
     def __post_init__(self) -> None:
         """Raise ValueError for values with which nothing can be played."""
         check_seed(self.bank_seed, "bank_seed")
-        check_counts(self, "episodes", "check_substeps")
+        check_counts(self, "check_substeps")
         check_num_workers(self.episodes, self.num_workers, "episodes")
         check_output(self.json, "--json")
 

@@ -37,7 +37,7 @@ except ImportError:
 
 from egoskin.behaviour import behave
 from egoskin.checkpoint import write_file
-from egoskin.cli import check_counts, check_output, clear_errors, counted
+from egoskin.cli import check_output, clear_errors, counted
 from egoskin.draws import check_seed
 from egoskin.evaluation import standard_task
 from egoskin.make import check_num_workers
@@ -88,7 +88,6 @@ class Add:
     def __post_init__(self) -> None:
         """Raise ValueError for values with which nothing can be stored."""
         check_seed(self.bank_seed, "bank_seed")
-        check_counts(self, "episodes")
         check_num_workers(self.episodes, self.num_workers, "episodes")
         if self.name is not None and Path(self.name).name != self.name:
             raise ValueError(f"name must be the name of a folder, got {self.name!r}")

@@ -62,7 +62,6 @@ class VerifyConfig:
             raise ValueError(
                 f"num_envs must be a multiple of 4 from 16 on, got {self.num_envs}"
             )
-
         check_counts(self, "learner_threads")
 
     @property
