@@ -20,7 +20,7 @@ import pytorch_kinematics as pk
 import torch
 from torch import Tensor
 
-from egoskin.compilation import sincos
+from egoskin.rounding import sincos
 
 
 def pad_rows(rows: Tensor, multiple: int = 32) -> Tensor:

@@ -18,8 +18,8 @@ from torchrl.envs import EnvBase
 
 from egoskin.agents.networks import Agent, NetworkConfig, input_keys
 from egoskin.checkpoint import load_tensors, part, prefixed, save_tensors
-from egoskin.cli import from_plain, to_plain
 from egoskin.make import EnvConfig
+from egoskin.plain import from_plain, to_plain
 from egoskin.sensors import Skin
 from egoskin.sparse import SparseSource
 

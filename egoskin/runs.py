@@ -40,18 +40,12 @@ from torch import Tensor
 
 from egoskin.agents.ppo import PPOConfig
 from egoskin.checkpoint import PARTIAL, load_tensors, save_tensors, sync, write_file
-from egoskin.cli import (
-    changed_fields,
-    check_counts,
-    check_numbers,
-    from_plain,
-    read_json,
-    to_plain,
-)
+from egoskin.cli import check_counts
 from egoskin.compilation import can_compile
 from egoskin.draws import check_seed
 from egoskin.events import EventFile
 from egoskin.make import EnvConfig, check_num_workers
+from egoskin.plain import changed_fields, check_numbers, from_plain, read_json, to_plain
 from egoskin.policies import CHECKPOINT_NAME
 
 _PACKAGES = ("egoskin", "torch", "torchrl", "tensordict", "mujoco", "numpy")

@@ -31,7 +31,7 @@ import mujoco
 import torch
 from torch import Tensor
 
-from egoskin.compilation import exact_sqrt
+from egoskin.rounding import exact_sqrt
 
 # Keeps 0/0 out as a summand or a least value; any length or its square dwarfs it, and
 # float32 holds it.

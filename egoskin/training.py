@@ -21,10 +21,10 @@ from torch import Tensor
 from egoskin.agents.networks import Agent
 from egoskin.agents.ppo import PPO, NonFiniteError
 from egoskin.checkpoint import part, prefixed, save_tensors
-from egoskin.cli import to_plain
 from egoskin.collection import collect
 from egoskin.envs.rewards import TERMS
 from egoskin.make import load_env_state, make_env, save_env_state
+from egoskin.plain import to_plain
 from egoskin.policies import (
     PolicySpec,
     agent_tensors,

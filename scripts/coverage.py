@@ -38,10 +38,11 @@ except ImportError:
     raise SystemExit(2) from None
 
 from egoskin.analysis import Analysis, analyse
-from egoskin.cli import clear_errors, counted, to_plain
+from egoskin.cli import clear_errors, counted
 from egoskin.envs.physics import PhysicsConfig
 from egoskin.envs.throws import ThrowConfig
 from egoskin.film import check_path
+from egoskin.plain import to_plain
 from egoskin.robots import ROBOTS, RobotName
 from egoskin.sensors import Field, Ray
 from egoskin.sensors.config import SkinConfig

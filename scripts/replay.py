@@ -23,7 +23,8 @@ from torch import Tensor, nn
 from egoskin.agents.networks import Agent, input_keys
 from egoskin.agents.ppo import PPO, NonFiniteError, PPOConfig
 from egoskin.checkpoint import load_tensors, part
-from egoskin.cli import clear_errors, from_plain
+from egoskin.cli import clear_errors
+from egoskin.plain import from_plain
 from egoskin.policies import PolicySpec, load_agent_tensors
 
 

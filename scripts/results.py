@@ -42,17 +42,8 @@ from egoskin.draws import check_seed
 from egoskin.evaluation import standard_task
 from egoskin.make import check_num_workers
 from egoskin.policies import load_policy
-from egoskin.results import (
-    StoredRun,
-    curve,
-    load_runs,
-    record,
-    report,
-    same_but_length,
-    sections,
-    thin,
-    to_json,
-)
+from egoskin.report import curve, report, sections
+from egoskin.results import StoredRun, load_runs, record, same_but_length, thin, to_json
 from egoskin.runs import Run
 
 # Okabe and Ito's colours, told apart by colour-blind readers as well.

@@ -1,51 +1,11 @@
-"""Configurations as plain values: what comes back, and what is refused by name."""
+"""What the scripts share: errors before the work, and in one line."""
 
 from __future__ import annotations
 
-import math
-from typing import Any
-
 import pytest
 
-from egoskin.cli import check_output, clear_errors, from_plain, read_json, to_plain
-from egoskin.runs import TrainConfig
+from egoskin.cli import check_output, clear_errors
 from egoskin.workers import WorkerError
-
-
-def test_a_configuration_comes_back(tmp_path):
-    plain = to_plain(TrainConfig(run_dir=tmp_path))
-    plain["env"]["sensor"]["range"] = "inf"
-    plain["ppo"]["clip_epsilon"] = 1
-    config = from_plain(TrainConfig, plain, "here")
-    assert config.run_dir == tmp_path
-    assert config.env.sensor.range == math.inf
-    assert config.ppo.clip_epsilon == 1.0
-    assert isinstance(config.ppo.clip_epsilon, float)
-    assert to_plain(config) == plain
-
-
-@pytest.mark.parametrize("value", [None, [2.0], "abc", {}])
-def test_a_value_of_the_wrong_type_is_named(value: Any):
-    plain = to_plain(TrainConfig())
-    plain["env"]["sensor"]["range"] = value
-    with pytest.raises(ValueError, match=r"my\.json: .*env\.sensor\.range"):
-        from_plain(TrainConfig, plain, "my.json")
-    with pytest.raises(ValueError, match=r"my\.json: .*run_dir"):
-        from_plain(TrainConfig, {"run_dir": 3}, "my.json")
-    with pytest.raises(ValueError, match=r"my\.json: expected an object, got list"):
-        from_plain(TrainConfig, [], "my.json")
-
-
-def test_what_is_no_number_is_refused_wherever_it_stands():
-    for field in ("env.task.reward.survival", "ppo.entropy_coeff"):
-        plain = to_plain(TrainConfig())
-        *parents, name = field.split(".")
-        inner = plain
-        for parent in parents:
-            inner = inner[parent]
-        inner[name] = math.nan
-        with pytest.raises(ValueError, match=f"{field} must be a number, got nan"):
-            from_plain(TrainConfig, plain, "here")
 
 
 def test_a_file_that_cannot_be_written_is_told_of_before_the_work(tmp_path):
@@ -55,13 +15,6 @@ def test_a_file_that_cannot_be_written_is_told_of_before_the_work(tmp_path):
         check_output(tmp_path / "none" / "new.json", "--json")
     with pytest.raises(ValueError, match=r"--json: .* is a folder"):
         check_output(tmp_path, "--json")
-
-
-def test_a_file_that_is_no_json_is_named(tmp_path):
-    for content in (b"{", b"\xff\xfe"):
-        (tmp_path / "bad.json").write_bytes(content)
-        with pytest.raises(ValueError, match=r"bad\.json is not JSON"):
-            read_json(tmp_path / "bad.json")
 
 
 def test_a_worker_that_ends_is_one_line():

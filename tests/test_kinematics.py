@@ -12,7 +12,6 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from egoskin.compilation import sincos
 from egoskin.kinematics import (
     LinkKinematics,
     pad_rows,
@@ -21,6 +20,7 @@ from egoskin.kinematics import (
     rotate_inverse,
 )
 from egoskin.robots import H1_2
+from egoskin.rounding import sincos
 
 DTYPES = [torch.float32, torch.float64]
 # pytorch-kinematics holds the robot's constants in float32, whatever the joints are.

@@ -11,20 +11,22 @@ from typing import Any
 import numpy as np
 import pytest
 
-from egoskin.cli import to_plain
-from egoskin.results import (
-    Record,
-    cells,
+from egoskin.plain import to_plain
+from egoskin.report import (
     curve,
     interquartile_mean,
     interquartile_range,
-    load_runs,
     recipe_names,
-    record,
     report,
-    same_but_length,
     sections,
     table,
+)
+from egoskin.results import (
+    Record,
+    cells,
+    load_runs,
+    record,
+    same_but_length,
     thin,
     to_json,
 )

@@ -11,8 +11,8 @@ import torch
 from tensordict import NestedKey
 from torch import Tensor
 
-from egoskin.compilation import exact_sqrt
 from egoskin.robots import Primitive
+from egoskin.rounding import exact_sqrt
 from egoskin.sensors.coverage import Field
 from egoskin.sensors.geometry import (
     STATE_KEYS,

@@ -1,7 +1,7 @@
 """Where sensors and objects are relative to each other: what all coverages share.
 
 All is computed as a structure of arrays with the batch last (``[S, B]``), in the order
-of the skin, by +, -, x, /, `sincos` and `exact_sqrt` (`egoskin.compilation`) alone: a
+of the skin, by +, -, x, /, `sincos` and `exact_sqrt` (`egoskin.rounding`) alone: a
 row's result has the same bits whatever rows are computed with it, here or, for balls
 and a transparent robot, in C++ (`egoskin/sensors/kernels.cpp`).
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from egoskin.compilation import exact_sqrt
+from egoskin.rounding import exact_sqrt
 
 
 def test_square_roots_are_correctly_rounded():

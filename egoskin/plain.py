@@ -1,0 +1,96 @@
+"""Configurations as plain values, and JSON files of them."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+from typing import Any, TypeVar
+
+import dacite
+
+T = TypeVar("T")
+
+
+def read_json(path: Path) -> Any:
+    """Return the content of a JSON file.
+
+    Raises:
+        ValueError: If it is none; the text names it.
+    """
+    try:
+        return json.loads(path.read_text())
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is not JSON: {error}") from error
+
+
+def to_plain(value: Any) -> Any:
+    """Return a configuration as JSON values: dicts, lists, strings, numbers, None.
+
+    Infinite numbers become "inf", which JSON lacks.
+    """
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = dataclasses.fields(value)
+        return {f.name: to_plain(getattr(value, f.name)) for f in fields}
+    if isinstance(value, (tuple, list)):
+        return [to_plain(item) for item in value]
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, float) and math.isinf(value):
+        return str(value)
+    return value
+
+
+def check_numbers(content: Any, name: str = "") -> None:
+    """Raise ValueError if a plain value holds NaN; the text names where."""
+    if isinstance(content, dict):
+        for key, value in content.items():
+            check_numbers(value, f"{name}.{key}".lstrip("."))
+    elif isinstance(content, list):
+        for value in content:
+            check_numbers(value, name)
+    elif isinstance(content, float) and math.isnan(content):
+        raise ValueError(f"{name} must be a number, got nan")
+
+
+def from_plain(kind: type[T], content: Any, what: str) -> T:
+    """Return a configuration from the values that `to_plain` gave.
+
+    Args:
+        kind: Dataclass to build.
+        content: Plain values.
+        what: Where they came from, for the error text.
+
+    Raises:
+        ValueError: If a field is unknown or of the wrong type; the text names it.
+    """
+    if not isinstance(content, dict):
+        raise ValueError(f"{what}: expected an object, got {type(content).__name__}")
+    hooks = {float: _float, Path: _path}
+    config = dacite.Config(type_hooks=hooks, cast=[tuple], strict=True)
+    try:
+        return dacite.from_dict(kind, content, config)
+    except dacite.DaciteError as error:
+        raise ValueError(f"{what}: {error}") from error
+
+
+def _float(value: Any) -> Any:
+    """Return a number as float, "inf" too; anything else is left to be refused."""
+    whole = isinstance(value, int) and not isinstance(value, bool)
+    return float(value) if whole or value in ("inf", "-inf") else value
+
+
+def _path(value: Any) -> Any:
+    """Return a text as path; anything else is left to be refused."""
+    return Path(value) if isinstance(value, str) else value
+
+
+def changed_fields(old: Any, new: Any, prefix: str = "") -> list[str]:
+    """Return the dotted names of the fields in which two plain values differ."""
+    if not (isinstance(old, dict) and isinstance(new, dict)):
+        return [] if old == new else [prefix.rstrip(".")]
+    names = []
+    for key in sorted(old.keys() | new.keys()):
+        names += changed_fields(old.get(key), new.get(key), f"{prefix}{key}.")
+    return names

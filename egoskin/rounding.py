@@ -1,0 +1,51 @@
+"""Numbers that round alike everywhere: on any machine, compiled or not."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+
+def exact_sqrt(x: Tensor) -> Tensor:
+    """Return the correctly rounded square root, which PyTorch's own is not.
+
+    PyTorch takes that of Intel's MKL where it has it, in which one float32 root in
+    seven is off by the last bit; compiled, it is exact. Double precision, rounded, is
+    exact for float32 in either.
+
+    Args:
+        x: Any tensor; float64 is as exact as PyTorch.
+    """
+    if torch.compiler.is_compiling() or x.dtype != torch.float32:
+        return x.sqrt()
+    return x.double().sqrt_().float()
+
+
+# pi/2 = HIGH + MIDDLE + LOW: a few bits each in the first two (Cephes), so that their
+# products with a small integer are exact.
+_HIGH, _MIDDLE, _LOW = 1.5703125, 4.837512969970703125e-4, 7.54978995489188216e-8
+
+
+def sincos(x: Tensor) -> tuple[Tensor, Tensor]:
+    """Return (sine, cosine) to the last bit or two, by sums and products alone.
+
+    PyTorch's own differ between compiled code, vector code and the tail of an array.
+
+    Args:
+        x: Angles [rad] of joints: up to some hundreds.
+    """
+    # x = n pi/2 + r, |r| <= pi/4
+    n = (x * (2 / math.pi)).round()
+    r = ((x - n * _HIGH) - n * _MIDDLE) - n * _LOW
+    z, terms = r * r, 9 if x.dtype == torch.float64 else 5
+    # Taylor's series; the first term left out is below half of the last bit.
+    s, c = torch.zeros_like(r), torch.zeros_like(r)
+    for i in range(terms - 1, 0, -1):
+        s = (s + (-1) ** i / math.factorial(2 * i + 1)) * z
+        c = (c + (-1) ** (i + 1) / math.factorial(2 * i + 2)) * z
+    s, c = r + r * s, 1 + z * (c - 0.5)
+    half = (n * 0.5).floor()
+    swapped, sign = n - 2 * half > 0.5, 1 - 2 * (half - 2 * (half * 0.5).floor())
+    return torch.where(swapped, c, s) * sign, torch.where(swapped, -s, c) * sign
