@@ -181,7 +181,7 @@ class Painter:
 
     Raises:
         RenderingError: If no OpenGL context can be made.
-        ValueError: If the size is not positive and even.
+        ValueError: If the size is odd or below 16.
     """
 
     def __init__(
@@ -193,9 +193,9 @@ class Painter:
         size: tuple[int, int] = (960, 540),
         camera: CameraConfig | None = None,
     ) -> None:
-        if min(size) < 2 or size[0] % 2 or size[1] % 2:
+        if min(size) < 16 or size[0] % 2 or size[1] % 2:
             # H.264 stores colour for blocks of 2 x 2 pixels.
-            raise ValueError(f"size must be two positive even numbers, got {size}")
+            raise ValueError(f"size must be two even numbers from 16 on, got {size}")
         self._skin, self._objects = skin, tuple(objects)
         self._model = _build_model(robot, objects, size)
         self._data = mujoco.MjData(self._model)

@@ -159,6 +159,13 @@ def parse_config(args: list[str]) -> TrainConfig:
     if run.resume is None or str(run.resume) == "None":
         return tyro.cli(TrainConfig, args=args)
     stored = Run.open(run.resume).config
+    # What the file lacks was filled with today's defaults.
+    file = run.resume / "config.json"
+    if lacking := changed_fields(read_json(file), to_plain(stored)):
+        raise ValueError(
+            f"{file} lacks {', '.join(lacking)}: another version made it. Go on with "
+            "that version (its commit is in versions.json), or add what it lacks"
+        )
     config = tyro.cli(TrainConfig, args=args, default=stored)
     before, after = to_plain(stored), to_plain(config)
     for name in _CALL_FIELDS:

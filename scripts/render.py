@@ -78,8 +78,8 @@ class RenderConfig:
         check_path(self.out, FILM_SUFFIXES)
         check_path(self.sheet_path, (".png",))
         check_seed(self.bank_seed, "bank_seed")
-        if not self.slowdown > 0:
-            raise ValueError(f"slowdown must be positive, got {self.slowdown}")
+        if not 0 < self.slowdown <= 100:
+            raise ValueError(f"slowdown must be in (0, 100], got {self.slowdown}")
         if self.policy is not None and self.env != EnvConfig():
             raise ValueError(
                 "a policy brings its own robot, task, skin and sensors: leave their "

@@ -234,7 +234,8 @@ def test_an_episode_is_the_row_of_the_bank(skin: Skin):
         ({"fps": 61.0}, "fps must be in"),
         ({"row": -1}, "row must not be negative"),
         ({"max_seconds": 0.0}, "at least one control step"),
-        ({"size": (161, 90)}, "positive even numbers"),
+        ({"size": (161, 90)}, "two even numbers"),
+        ({"size": (160, 8)}, "two even numbers"),
     ],
 )
 def test_numbers_out_of_range_are_refused(skin: Skin, options: dict, text: str):
@@ -279,7 +280,8 @@ def test_the_script_writes_a_film_and_a_sheet(script: Callable, tmp_path: Path):
         (["--out", "a.avi"], "must end in .mp4 or .gif"),
         (["--out", "nowhere/a.mp4"], "no folder nowhere"),
         (["--sheet", "a.jpg"], "must end in .png"),
-        (["--slowdown", "0"], "slowdown must be positive"),
+        (["--slowdown", "0"], "slowdown must be in (0, 100]"),
+        (["--slowdown", "inf"], "slowdown must be in (0, 100]"),
         (["--bank-seed", "-1"], "bank_seed must be in"),
         (["nothing.safetensors"], "nothing.safetensors"),
         (["nothing", "--sensor.range", "1"], "a policy brings its own"),

@@ -15,7 +15,7 @@ import torch
 import egoskin
 from egoskin.checkpoint import load_tensors, save_tensors
 from egoskin.make import EnvConfig
-from egoskin.runs import Run, TrainConfig
+from egoskin.runs import Run, TrainConfig, parse_config
 from egoskin.sensors.config import SensorConfig
 from egoskin.training import open_trainer, train
 
@@ -68,6 +68,19 @@ def test_a_damaged_checkpoint_is_told_of(config: TrainConfig):
         pass
     with pytest.raises(ValueError, match=message):
         egoskin.load_policy(run.path)
+
+
+def test_a_run_of_another_version_is_not_gone_on_with(config: TrainConfig):
+    run = Run.create(config)
+    args = ["--resume", str(run.path)]
+    assert parse_config(args) == replace(run.config, run_dir=None, resume=run.path)
+    file = run.path / "config.json"
+    content = json.loads(file.read_text())
+    del content["env"]["task"]["throws"]["lead"]
+    file.write_text(json.dumps(content))
+    message = r"config\.json lacks env\.task\.throws\.lead: another version made it"
+    with pytest.raises(ValueError, match=message):
+        parse_config(args)
 
 
 def test_policies_are_kept_at_the_start_in_between_and_at_the_end(config: TrainConfig):
