@@ -194,7 +194,7 @@ class Painter:
         camera: CameraConfig | None = None,
     ) -> None:
         if min(size) < 16 or size[0] % 2 or size[1] % 2:
-            # H.264 stores colour for blocks of 2 x 2 pixels.
+            # H.264 stores colour for blocks of 2 x 2 pixels; the text needs some room.
             raise ValueError(f"size must be two even numbers from 16 on, got {size}")
         self._skin, self._objects = skin, tuple(objects)
         self._model = _build_model(robot, objects, size)

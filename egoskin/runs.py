@@ -160,14 +160,14 @@ def parse_config(args: list[str]) -> TrainConfig:
         return tyro.cli(TrainConfig, args=args)
     stored = Run.open(run.resume).config
     # What the file lacks was filled with today's defaults.
-    file = run.resume / "config.json"
-    if lacking := changed_fields(read_json(file), to_plain(stored)):
+    file, before = run.resume / "config.json", to_plain(stored)
+    if lacking := changed_fields(read_json(file), before):
         raise ValueError(
             f"{file} lacks {', '.join(lacking)}: another version made it. Go on with "
             "that version (its commit is in versions.json), or add what it lacks"
         )
     config = tyro.cli(TrainConfig, args=args, default=stored)
-    before, after = to_plain(stored), to_plain(config)
+    after = to_plain(config)
     for name in _CALL_FIELDS:
         del before[name], after[name]
     if config.run_dir is not None:
