@@ -340,14 +340,6 @@ def test_a_total_speed_by_hand(drawn, horizontal):
     torch.testing.assert_close(speed, torch.tensor([horizontal]))
 
 
-def test_the_speed_of_a_straight_throw_is_the_whole_in_either_case():
-    one, other = (
-        draw(make(ThrowConfig(flight="straight", speed_is=kind))).speed
-        for kind in ("horizontal", "total")
-    )
-    assert torch.equal(one, other)
-
-
 # --- invariances ----------------------------------------------------------------
 
 
@@ -447,6 +439,9 @@ def test_every_throw_hits_a_rigid_robot(throws, request, capsys):
         ({"num_balls": 0}, "num_balls must be at least 1, got 0"),
         ({"mass": 0.0}, "mass must be positive, got 0.0"),
         ({"lead": -0.1}, "lead must not be negative, got -0.1"),
+        ({"box_half_width": 0.0}, "box_half_width has no effect without aim=box"),
+        ({"box_height": (1.0, 1.0)}, "box_height has no effect without aim=box"),
+        ({"speed_is": "total"}, "speed_is has no effect without flight=ballistic"),
     ],
 )
 def test_throws_that_cannot_be_thrown_are_refused(changes, message):

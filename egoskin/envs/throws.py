@@ -31,6 +31,12 @@ _MAX_LEAD_RATIO = 0.9
 # Draws of a throw until one arrives at the total speed drawn. Half of those of the
 # default ranges do not: all of them, once in a thousand million throws.
 _MAX_TRIES = 32
+# Options that have an effect with one value of another alone.
+_ONLY_WITH = {
+    "box_half_width": ("aim", "box"),
+    "box_height": ("aim", "box"),
+    "speed_is": ("flight", "ballistic"),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +78,7 @@ class ThrowConfig:
     """A ball that has touched the ground is out of play, or rolls on and counts."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for ranges and counts that cannot be thrown."""
+        """Raise ValueError for what cannot be thrown, or has no effect."""
         ranges = ("interval", "height", "distance", "speed", "box_height")
         for name in (*ranges, "azimuth_deg"):
             low, high = getattr(self, name)
@@ -89,6 +95,10 @@ class ThrowConfig:
                 raise ValueError(
                     f"{name} must not be negative, got {getattr(self, name)}"
                 )
+        for name, (option, value) in _ONLY_WITH.items():
+            default = type(self).__dataclass_fields__[name].default
+            if getattr(self, option) != value and getattr(self, name) != default:
+                raise ValueError(f"{name} has no effect without {option}={value}")
 
     @property
     def gravity(self) -> float:
