@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Literal
 
@@ -119,7 +118,9 @@ def approaches_b(
     """
     gap = object_pose[..., :3] - base_pose[:, None, :3]
     speed = object_lin_vel_w - base_lin_vel_w[:, None]
-    time = _time_to_pass(gap, speed).clamp(0.0, _LONGEST_APPROACH)[..., None]
+    (x, y, _), (u, v, _) = gap.unbind(-1), speed.unbind(-1)
+    time = -(x * u + y * v) / (u * u + v * v).clamp(min=1e-3)
+    time = time.clamp(0.0, _LONGEST_APPROACH)[..., None]
     fall = torch.nn.functional.pad(0.5 * gravity * time * time, (2, 0))
     turn = base_pose[:, None, 3:].expand(-1, gap.shape[1], -1)
     passing = rotate_inverse(turn, gap + speed * time - fall)
@@ -127,17 +128,6 @@ def approaches_b(
     nearness = _SOON / (_SOON + time)
     flag = object_active[..., None].to(gap.dtype)
     return (torch.cat((nearness, passing), -1) * flag).flatten(1)
-
-
-def _time_to_pass(gap: Tensor, speed: Tensor) -> Tensor:
-    """Return when the horizontal distance is least [s], negative if that is over.
-
-    Args:
-        gap: Where something is, ``[..., 3]``.
-        speed: Its velocity, ``[..., 3]``.
-    """
-    (x, y, _), (u, v, _) = gap.unbind(-1), speed.unbind(-1)
-    return -(x * u + y * v) / (u * u + v * v).clamp(min=1e-3)
 
 
 class Numb(RowTransform):
@@ -165,10 +155,7 @@ class Oracle(RowTransform):
     """What every ball does: a diagnostic of the task, no sensor can give it.
 
     Reads ``base_pose``, ``base_lin_vel_w``, ``object_pose``, ``object_lin_vel_w`` and
-    ``object_active``; writes ``signal [*B, 7 O]``, the states of `object_states_b` in
-    the order in which the objects matter: those on their way to the base, the soonest
-    to pass it first; those that have passed, the latest first; those out of play. So
-    what is learnt from one ball holds for the next, as with a skin.
+    ``object_active``; writes ``signal [*B, 7 O]``, see `object_states_b`.
 
     Args:
         in_keys: Keys of the inputs, in the order above.
@@ -190,15 +177,7 @@ class Oracle(RowTransform):
 
     def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Return the signal, ``[B, 7 O]``."""
-        base_pose, base_lin_vel_w, object_pose, object_lin_vel_w, active = inputs
-        time = _time_to_pass(
-            object_pose[..., :3] - base_pose[:, None, :3],
-            object_lin_vel_w - base_lin_vel_w[:, None],
-        )
-        rank = (-1 / time).where(time > 0, -time)
-        order = rank.masked_fill(~active, math.inf).argsort(dim=-1, stable=True)
-        states = object_states_b(*inputs).unflatten(-1, (-1, 7))
-        return (states.take_along_dim(order[..., None], 1).flatten(1),)
+        return (object_states_b(*inputs),)
 
     def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
         """Return the spec of the signal."""

@@ -51,12 +51,12 @@ _CELL = {"env.sensor.coverage", "env.sensor.signal", "env.sensor.range"}
 # Options of stored runs that are no more, and their values without effect: steps over
 # which what of a ball touches grew, the price of the distance from the start (from
 # "drift_start" on), and the speed of the balls (from "slow_start", 0.4 of it, on); and
-# whether an oracle was told of the balls in the order of their numbers.
+# whether an oracle was told first of the ball that passes next.
 _RETIRED = {
     "core_frames": [0, 0],
     "drift_frames": [0, 0],
     "slow_start_frames": 0,
-    "told_by_number": False,
+    "told_next_first": False,
 }
 
 
