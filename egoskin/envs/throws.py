@@ -96,8 +96,8 @@ class ThrowConfig:
                     f"{name} must not be negative, got {getattr(self, name)}"
                 )
         for name, (option, value) in _ONLY_WITH.items():
-            default = type(self).__dataclass_fields__[name].default
-            if getattr(self, option) != value and getattr(self, name) != default:
+            changed = getattr(self, name) != getattr(ThrowConfig, name)
+            if changed and getattr(self, option) != value:
                 raise ValueError(f"{name} has no effect without {option}={value}")
 
     @property
@@ -224,7 +224,7 @@ class Thrower:
             Draws, a pure function of the arguments.
         """
         what = (seed, Stream.THROW, row, episode, throw)
-        if self.config.flight == "straight" or self.config.speed_is == "horizontal":
+        if self.config.speed_is == "horizontal":
             return self._scaled(uniform(*what, 7))
         # Whole blocks of random words: the first try is the draw above.
         u = uniform(*what, 8 * _MAX_TRIES).unflatten(-1, (_MAX_TRIES, 8))
