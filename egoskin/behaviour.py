@@ -24,8 +24,8 @@ from egoskin.make import EnvConfig
 from egoskin.robots import RobotConfig
 from egoskin.sensors import Skin
 
-# Ages at which the displacement from the start is read [s].
-_AGES = (1.0, 2.0, 3.0)
+# Ages at which it is read where the base is [s].
+_AGES = (1.0, 2.0, 3.0, 5.0)
 # Bounds of the groups by height aimed at [m], by speed at arrival [m/s] and by time
 # since the throw before [s]: about a third of the standard throws in each.
 _HEIGHTS, _SPEEDS, _GAPS = (0.9, 1.2), (5.3, 6.7), (1.33, 1.67)
@@ -55,16 +55,18 @@ class Group:
 
 @dataclass(frozen=True, kw_only=True)
 class Displacement:
-    """Planar way from the start of the episodes that last to an age."""
+    """Where the base is in the episodes that last to an age."""
 
     age: float
     """Age [s]."""
     episodes: int
     """Number of these episodes."""
     mean: float | None
-    """Mean [m]."""
+    """Mean planar way from the start [m]."""
     largest_tenth: float | None
-    """What a tenth of them exceeds [m]."""
+    """The way that a tenth of them exceeds [m]."""
+    height: float | None
+    """Mean height of the base above ground [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,7 +168,8 @@ class Watcher:
         self._arrived = torch.zeros(episodes, count, dtype=torch.bool)
         self._hit = self._arrived.clone()
         self._failed = torch.zeros(episodes, dtype=torch.bool)
-        self._way: dict[float, Tensor] = {}
+        # Way and height at each age, of the episodes that last, [2, n].
+        self._base: dict[float, Tensor] = {}
         self._feet = _Feet(robot)
         self._step = 0
         self._sums: dict[str, float] = {}
@@ -183,8 +186,8 @@ class Watcher:
         going = running & ~ended
         for age in _AGES:
             if self._step == round(age * self._hz):
-                way = after["displacement_w"][going]
-                self._way[age] = way.square().sum(-1).sqrt()
+                way = after["displacement_w"][going].square().sum(-1).sqrt()
+                self._base[age] = torch.stack((way, after["base_pose"][going, 2]))
         self._see_balls(after, running)
         # A blow, a fall or a failed simulation is not how the policy moves.
         self._see_motion(before[going], after[going])
@@ -225,10 +228,10 @@ class Watcher:
         return Motion(**mean)
 
     def displacement(self) -> list[Displacement]:
-        """Return how far the robot had gone."""
+        """Return where the base was at each age."""
         result = []
         for age in _AGES:
-            way = self._way.get(age, torch.zeros(0))
+            way, height = self._base.get(age, torch.zeros(2, 0))
             some = len(way) > 0
             result.append(
                 Displacement(
@@ -236,6 +239,7 @@ class Watcher:
                     episodes=len(way),
                     mean=float(way.mean()) if some else None,
                     largest_tenth=float(way.quantile(0.9)) if some else None,
+                    height=float(height.mean()) if some else None,
                 )
             )
         return result

@@ -103,12 +103,12 @@ def behaviour_table(result: Behaviour) -> str:
                 f"{share(group.first_hits)}    {share(group.later_hits)} "
                 f"{group.later_balls:4}"
             )
-    lines += ["", "  displacement from the start     mean   a tenth exceeds     of"]
+    lines += ["", "  way from the start     mean   a tenth exceeds  base height     of"]
     for way in result.displacement:
         if way.mean is not None:
             lines.append(
-                f"    after {way.age:g} s                {way.mean:6.2f} m "
-                f"{way.largest_tenth:14.2f} m {way.episodes:6}"
+                f"    after {way.age:g} s       {way.mean:6.2f} m "
+                f"{way.largest_tenth:14.2f} m {way.height:10.2f} m {way.episodes:6}"
             )
     lines += ["", f"  {'':<32}{'policy':>10} {'zero action':>13}"]
 

@@ -211,14 +211,16 @@ def test_a_foot_that_rolls_over_its_toes_does_not_slide():
 def test_displacement_is_that_of_the_episodes_that_last():
     watcher = Watcher(make(), 0, 2)
     way = state(2, displacement_w=torch.tensor([[3.0, 4.0], [6.0, 8.0]]))
+    way["base_pose"][:, 2] = torch.tensor([0.5, 1.0])
     for step in range(1, 121):
         # Row 1 ends at step 100.
         watcher(state(2), way, torch.tensor([True, step <= 100]))
-    one, two, three = watcher.displacement()
-    assert (one.age, one.episodes, one.mean) == (1.0, 2, 7.5)
+    one, two, three, five = watcher.displacement()
+    assert (one.age, one.episodes, one.mean, one.height) == (1.0, 2, 7.5, 0.75)
     assert one.largest_tenth == pytest.approx(9.5)
-    assert (two.episodes, two.mean) == (1, 5.0)
+    assert (two.episodes, two.mean, two.height) == (1, 5.0, 0.5)
     assert (three.episodes, three.mean, three.largest_tenth) == (0, None, None)
+    assert (five.age, five.episodes, five.height) == (5.0, 0, None)
 
 
 def test_watching_changes_no_figure():
