@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -69,6 +70,7 @@ _COLUMNS = (
     "frames",
     "throws",
     "success at 3 s",
+    "success at 5 s",
     "survival",
     "first balls avoided",
     "later balls avoided",
@@ -98,6 +100,7 @@ def _figures(run: StoredRun) -> list[str]:
         f"{e['episodes']:,}",
         f"{_percent(success['mean'])} ({_percent(success['low'], '')} to "
         f"{_percent(success['high'], '')})",
+        _percent(_lasting(run)),
         f"{survival['mean']:.2f} s",
         _percent(e["avoided"]["first_ball"]),
         _percent(e["avoided"]["later_balls"]),
@@ -122,6 +125,7 @@ def _over_seeds(runs: Sequence[StoredRun]) -> list[str]:
         "",
         "",
         f"**{_percent(mean(success))}** ({_percent(low, '')} to {_percent(high, '')})",
+        _percent(mean(_lasting(run) for run in runs)),
         f"{survival:.2f} s",
         _percent(mean(e["avoided"]["first_ball"] for e in all_of)),
         _percent(mean(e["avoided"]["later_balls"] for e in all_of)),
@@ -132,10 +136,20 @@ def _over_seeds(runs: Sequence[StoredRun]) -> list[str]:
 
 def _way(run: StoredRun) -> float | None:
     """Return the mean displacement at 3 s [m], None where it was not measured."""
-    for way in run.evaluation.get("behaviour", {}).get("displacement", ()):
-        if way["age"] == 3.0:
-            return way["mean"]
-    return None
+    at = _at_age(run, 3.0)
+    return None if at is None else at["mean"]
+
+
+def _lasting(run: StoredRun) -> float | None:
+    """Return the share of episodes that last 5 s, None where it was not measured."""
+    at = _at_age(run, 5.0)
+    return None if at is None else at["episodes"] / run.evaluation["episodes"]
+
+
+def _at_age(run: StoredRun, age: float) -> dict[str, Any] | None:
+    """Return the `egoskin.behaviour.Displacement` at an age [s]."""
+    ways = run.evaluation.get("behaviour", {}).get("displacement", ())
+    return next((way for way in ways if way["age"] == age), None)
 
 
 def _row(*columns: str) -> str:
@@ -159,12 +173,14 @@ is written by hand is in `results/notes.md`.
 
 Every figure is of the stored policy, mean action, on a bank of standard throws, with
 95 % intervals for each seed (over throws, not over trainings); over seeds the
-interquartile mean and, for the success, the interquartile range. Survival is at most
-10 s. Balls are *avoided* that land or fly on past the robot while the episode lasts, of
-those and the ones that touch it. *Falls* are the share of episodes ended by a fall
-within 3 s; the *way* is the mean displacement of the episodes that last 3 s. The curves
-are the estimate of success while training, exploration on, against the simulated time
-of all agents: interquartile mean and range over the seeds, as far as all seeds go.
+interquartile mean and, for the success at 3 s, the interquartile range. *Success* is
+the share of episodes without contact or fall up to an age ("-": not measured);
+survival is at most 10 s. Balls are *avoided* that land or fly on past the robot while
+the episode lasts, of those and the ones that touch it. *Falls* are the share of
+episodes ended by a fall within 3 s; the *way* is the mean displacement of the episodes
+that last 3 s. The curves are the estimate of success while training, exploration on,
+against the simulated time of all agents: interquartile mean and range over the seeds,
+as far as all seeds go.
 """
 
 

@@ -150,7 +150,8 @@ def thin(text: str) -> str:
     Args:
         text: Content of a ``metrics.csv``.
     """
-    rows = list(csv.DictReader(io.StringIO(text)))
+    source = csv.DictReader(io.StringIO(text))
+    rows = list(source)
     kept, last = [], -1
     for row in rows:
         block = int(row["frames"]) // _THIN_FRAMES
@@ -158,7 +159,7 @@ def thin(text: str) -> str:
             kept.append(row)
         last = block
     out = io.StringIO()
-    writer = csv.DictWriter(out, list(rows[0]), lineterminator="\n")
+    writer = csv.DictWriter(out, source.fieldnames or (), lineterminator="\n")
     writer.writeheader()
     for row in kept:
         writer.writerow(
@@ -239,14 +240,18 @@ def load_runs(folder: Path) -> list[StoredRun]:
     paths = sorted(path.parent for path in folder.glob("*/config.json"))
     if not paths:
         raise ValueError(f"{folder} holds no runs (scripts/results.py add RUN)")
-    return [_load(path) for path in paths]
+    return [load_run(path) for path in paths]
 
 
-def _load(path: Path) -> StoredRun:
-    """Return the run stored in a folder."""
+def load_run(path: Path) -> StoredRun:
+    """Return the run stored in a folder.
+
+    Raises:
+        ValueError: If it is not whole.
+    """
     what = path / "run.json"
     evaluations = sorted(path.glob("evaluation_*.json"))
-    for file in (what, path / "metrics.csv"):
+    for file in (path / "config.json", what, path / "metrics.csv"):
         if not file.is_file():
             raise ValueError(f"{path} is not whole: it has no {file.name}")
     if not evaluations:

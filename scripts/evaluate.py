@@ -66,6 +66,11 @@ def share(value: float | None) -> str:
     return "     -" if value is None else f"{100 * value:6.2f} %"
 
 
+def metres(value: float | None) -> str:
+    """Return a length as text, a dash for None."""
+    return "-  " if value is None else f"{value:.2f} m"
+
+
 def table(result: Evaluation, title: str, age: float) -> str:
     """Return the figures as text, with the age of success [s]."""
 
@@ -105,11 +110,10 @@ def behaviour_table(result: Behaviour) -> str:
             )
     lines += ["", "  way from the start     mean   a tenth exceeds  base height     of"]
     for way in result.displacement:
-        if way.mean is not None:
-            lines.append(
-                f"    after {way.age:g} s       {way.mean:6.2f} m "
-                f"{way.largest_tenth:14.2f} m {way.height:10.2f} m {way.episodes:6}"
-            )
+        lines.append(
+            f"    after {way.age:g} s       {metres(way.mean):>8} "
+            f"{metres(way.largest_tenth):>16} {metres(way.height):>12} {way.episodes:6}"
+        )
     lines += ["", f"  {'':<32}{'policy':>10} {'zero action':>13}"]
 
     def row(name: str, unit: str, show: Callable[[Motion], float]) -> str:

@@ -2,6 +2,7 @@
 
 python scripts/results.py add runs/NAME            # evaluates its last policy
 python scripts/results.py add runs/NAME --name field_proximity_2m_seed0
+python scripts/results.py repeat results/NAME      # its evaluation, once more
 python scripts/results.py write                    # docs/results.md and its pictures
 """
 
@@ -16,7 +17,7 @@ import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
@@ -41,9 +42,18 @@ from egoskin.cli import check_output, clear_errors, counted
 from egoskin.draws import check_seed
 from egoskin.evaluation import standard_task
 from egoskin.make import check_num_workers
-from egoskin.policies import load_policy
+from egoskin.plain import read_json
+from egoskin.policies import Policy, load_policy
 from egoskin.report import curve, report, sections
-from egoskin.results import StoredRun, load_runs, record, same_but_length, thin, to_json
+from egoskin.results import (
+    StoredRun,
+    load_run,
+    load_runs,
+    record,
+    same_but_length,
+    thin,
+    to_json,
+)
 from egoskin.runs import Run
 
 # Okabe and Ito's colours, told apart by colour-blind readers as well.
@@ -101,19 +111,7 @@ class Add:
             raise ValueError(
                 f"{folder} holds a run of another configuration: choose a --name"
             )
-        result, behaviour = behave(
-            policy,
-            standard_task(policy.env_config),
-            policy.skin,
-            bank_seed=self.bank_seed,
-            episodes=self.episodes,
-            num_workers=self.num_workers,
-        )
-        evaluation = {
-            **dataclasses.asdict(result),
-            "bank_seed": self.bank_seed,
-            "behaviour": dataclasses.asdict(behaviour),
-        }
+        evaluation = figures(policy, self.bank_seed, self.episodes, self.num_workers)
         (folder / "policies").mkdir(parents=True, exist_ok=True)
         contents = {
             f"policies/{policies[-1].name}": policies[-1].read_bytes(),
@@ -124,8 +122,37 @@ class Add:
         }
         for name, content in contents.items():
             write_file(folder / name, content)
-        mean = 100 * result.success.mean
+        mean = 100 * evaluation["success"]["mean"]
         print(f"{folder}: {frames:,} frames, success {mean:.1f} %; now: write")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Repeat:
+    """Evaluate stored policies again, each on its bank, and store what comes out."""
+
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Folders of stored runs."""
+    num_workers: int | None = None
+    """Physics threads; None: the largest divisor of the bank's size <= cores."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a folder that holds no stored run."""
+        if not self.runs:
+            raise ValueError("name the stored runs to evaluate again")
+        for folder in self.runs:
+            load_run(folder)
+
+    def execute(self) -> None:
+        """Evaluate the policies one after another, and say what the success was."""
+        for folder in self.runs:
+            file = sorted(folder.glob("evaluation_*.json"))[-1]
+            frames = file.stem.removeprefix("evaluation_")
+            policy = load_policy(folder / "policies" / f"{frames}.safetensors")
+            old = read_json(file)
+            new = figures(policy, old["bank_seed"], old["episodes"], self.num_workers)
+            write_file(file, _json(new))
+            now, before = (100 * x["success"]["mean"] for x in (new, old))
+            print(f"{folder}: success {now:.1f} %, was {before:.1f} %", flush=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,6 +181,25 @@ class Write:
         write_file(self.out, report(runs, pictures, hand).encode())
         number = counted(len(runs), "run")
         print(f"{self.out}: {number}, pictures {', '.join(pictures.values())}")
+
+
+def figures(
+    policy: Policy, bank_seed: int, episodes: int, num_workers: int | None
+) -> dict[str, Any]:
+    """Return how a policy fares on a bank of standard throws, as it is stored."""
+    result, behaviour = behave(
+        policy,
+        standard_task(policy.env_config),
+        policy.skin,
+        bank_seed=bank_seed,
+        episodes=episodes,
+        num_workers=num_workers,
+    )
+    return {
+        **dataclasses.asdict(result),
+        "bank_seed": bank_seed,
+        "behaviour": dataclasses.asdict(behaviour),
+    }
 
 
 def _json(content: object) -> bytes:
@@ -205,7 +251,7 @@ def _draw_cell(axes: Axes, name: str, runs: list[StoredRun], number: int) -> Non
 
 def main(args: list[str]) -> None:
     """Run the command."""
-    commands = {"add": Add, "write": Write}
+    commands = {"add": Add, "repeat": Repeat, "write": Write}
     tyro.extras.subcommand_cli_from_dict(commands, args=args).execute()
 
 

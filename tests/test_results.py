@@ -53,7 +53,11 @@ def evaluation(success: float, way: float | None = None) -> dict[str, Any]:
         "episodes": 4096,
     }
     if way is not None:
-        ages = [{"age": 2.0, "mean": 9.0}, {"age": 3.0, "mean": way}]
+        ages = [
+            {"age": 2.0, "mean": 9.0, "episodes": 4000},
+            {"age": 3.0, "mean": way, "episodes": 2000},
+            {"age": 5.0, "mean": None, "episodes": round(256 * way)},
+        ]
         result["behaviour"] = {"displacement": ages}
     return result
 
@@ -130,12 +134,12 @@ def test_a_table_has_a_line_for_each_seed_and_one_for_all(tmp_path: Path):
     lines = table(group).splitlines()
     assert len(lines) == 2 + 3 + 1
     assert lines[2] == (
-        "| field proximity, 2 m | 0 | 0.0 M | 4,096 | 20.0 % (18.0 to 22.0) | 2.50 s "
-        "| 80.0 % | - | 10.0 % | 1.00 m |"
+        "| field proximity, 2 m | 0 | 0.0 M | 4,096 | 20.0 % (18.0 to 22.0) | 6.2 % "
+        "| 2.50 s | 80.0 % | - | 10.0 % | 1.00 m |"
     )
     # Interquartile mean 0.35 by symmetry; quartiles half way: 0.275 and 0.425.
     assert "3 seeds" in lines[5]
-    assert "**35.0 %** (27.5 to 42.5)" in lines[5]
+    assert "**35.0 %** (27.5 to 42.5) | 12.5 % |" in lines[5]
     assert lines[5].endswith("| 2.00 m |")
 
 
@@ -169,6 +173,7 @@ def test_thinned_metrics_keep_a_line_for_each_block_and_the_last():
     assert kept[1].endswith(",0.333333")
     # What is thin stays as it is.
     assert thin("\n".join(kept)).splitlines() == kept
+    assert thin("frames,x\n") == "frames,x\n"
 
 
 def test_a_record_says_what_was_run_but_not_where(tmp_path: Path):

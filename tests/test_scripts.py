@@ -220,6 +220,16 @@ def test_a_run_is_stored_and_reported_again_when_it_is_longer(
     evaluation = json.loads((folder / f"evaluation_{frames}.json").read_text())
     assert (evaluation["episodes"], evaluation["bank_seed"]) == (16, 0)
 
+    # Its evaluation, once more, comes to the same whatever was written there.
+    file = folder / f"evaluation_{frames}.json"
+    spoilt = {**evaluation, "success": {"mean": 0.123}}
+    file.write_text(json.dumps(spoilt))
+    done = run("results.py", "repeat", folder)
+    assert done.returncode == 0, done.stderr
+    success = 100 * evaluation["success"]["mean"]
+    assert f"success {success:.1f} %, was 12.3 %" in done.stdout
+    assert json.loads(file.read_text()) == evaluation
+
     # The same run once more is an update, another configuration is refused.
     assert run(*add).returncode == 0
     config = json.loads((folder / "config.json").read_text())
@@ -244,6 +254,8 @@ def test_a_run_is_stored_and_reported_again_when_it_is_longer(
         (["add", "nothing", "--name", "a/b"], "must be the name of a folder"),
         (["add", "nothing", "--episodes", "0"], "must be at least 1"),
         (["add", "nothing", "--results", "elsewhere"], "no folder elsewhere"),
+        (["repeat"], "name the stored runs"),
+        (["repeat", "results"], "results is not whole: it has no config.json"),
         (["write", "--results", "results", "--out", "new.md"], "holds no runs"),
         (["write", "--out", "no/results.md"], "no folder no"),
     ],
