@@ -66,7 +66,7 @@ _COLOURS = (
     "#E69F00",
     "#56B4E9",
 )
-_DASHES = ("-", "--", ":")
+_DASHES = ("-", "--", ":", "-.")
 
 
 @dataclass(frozen=True, kw_only=True)
