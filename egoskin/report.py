@@ -105,7 +105,7 @@ def _figures(run: StoredRun) -> list[str]:
         _percent(e["avoided"]["first_ball"]),
         _percent(e["avoided"]["later_balls"]),
         _percent(e["ended_by_fall"]),
-        _metres(_way(run)),
+        metres(_way(run)),
     ]
 
 
@@ -130,7 +130,7 @@ def _over_seeds(runs: Sequence[StoredRun]) -> list[str]:
         _percent(mean(e["avoided"]["first_ball"] for e in all_of)),
         _percent(mean(e["avoided"]["later_balls"] for e in all_of)),
         _percent(mean(e["ended_by_fall"] for e in all_of)),
-        _metres(mean(_way(run) for run in runs)),
+        metres(mean(_way(run) for run in runs)),
     ]
 
 
@@ -147,7 +147,7 @@ def _lasting(run: StoredRun) -> float | None:
 
 
 def _at_age(run: StoredRun, age: float) -> dict[str, Any] | None:
-    """Return the `egoskin.behaviour.Displacement` at an age [s]."""
+    """Return the `egoskin.behaviour.Displacement` at an age [s], None without one."""
     ways = run.evaluation.get("behaviour", {}).get("displacement", ())
     return next((way for way in ways if way["age"] == age), None)
 
@@ -160,7 +160,8 @@ def _percent(value: float | None, unit: str = " %") -> str:
     return "-" if value is None else f"{100 * value:.1f}{unit}"
 
 
-def _metres(value: float | None) -> str:
+def metres(value: float | None) -> str:
+    """Return a length [m] as text, a dash for None."""
     return "-" if value is None else f"{value:.2f} m"
 
 

@@ -24,6 +24,7 @@ from egoskin.draws import check_seed
 from egoskin.evaluation import Estimate, Evaluation, evaluate, standard_task
 from egoskin.make import EnvConfig, check_num_workers
 from egoskin.policies import load_policy
+from egoskin.report import metres
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,11 +65,6 @@ class EvaluateConfig:
 def share(value: float | None) -> str:
     """Return a share as text, a dash for None."""
     return "     -" if value is None else f"{100 * value:6.2f} %"
-
-
-def metres(value: float | None) -> str:
-    """Return a length as text, a dash for None."""
-    return "-  " if value is None else f"{value:.2f} m"
 
 
 def table(result: Evaluation, title: str, age: float) -> str:

@@ -42,7 +42,6 @@ from egoskin.cli import check_output, clear_errors, counted
 from egoskin.draws import check_seed
 from egoskin.evaluation import standard_task
 from egoskin.make import check_num_workers
-from egoskin.plain import read_json
 from egoskin.policies import Policy, load_policy
 from egoskin.report import curve, report, sections
 from egoskin.results import (
@@ -136,23 +135,25 @@ class Repeat:
     """Physics threads; None: the largest divisor of the bank's size <= cores."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for a folder that holds no stored run."""
+        """Raise ValueError if there is nothing to evaluate."""
         if not self.runs:
             raise ValueError("name the stored runs to evaluate again")
-        for folder in self.runs:
-            load_run(folder)
 
     def execute(self) -> None:
         """Evaluate the policies one after another, and say what the success was."""
+        # All are read before the first is played: a bad one costs no time.
+        stored = []
         for folder in self.runs:
-            file = sorted(folder.glob("evaluation_*.json"))[-1]
-            frames = file.stem.removeprefix("evaluation_")
+            run = load_run(folder)
+            frames = f"{run.record.frames:012d}"
             policy = load_policy(folder / "policies" / f"{frames}.safetensors")
-            old = read_json(file)
+            file = folder / f"evaluation_{frames}.json"
+            stored.append((file, run.evaluation, policy))
+        for file, old, policy in stored:
             new = figures(policy, old["bank_seed"], old["episodes"], self.num_workers)
             write_file(file, _json(new))
             now, before = (100 * x["success"]["mean"] for x in (new, old))
-            print(f"{folder}: success {now:.1f} %, was {before:.1f} %", flush=True)
+            print(f"{file.parent}: success {now:.1f} %, was {before:.1f} %", flush=True)
 
 
 @dataclass(frozen=True, kw_only=True)
