@@ -47,6 +47,7 @@ from egoskin.events import EventFile
 from egoskin.make import EnvConfig, check_num_workers
 from egoskin.plain import changed_fields, check_numbers, from_plain, read_json, to_plain
 from egoskin.policies import CHECKPOINT_NAME
+from egoskin.workers import available_cores
 
 _PACKAGES = ("egoskin", "torch", "torchrl", "tensordict", "mujoco", "numpy")
 _PACKAGES += ("pytorch-kinematics", "gymnasium")
@@ -105,6 +106,11 @@ class TrainConfig:
     def frames_per_batch(self) -> int:
         """Environment steps of one rollout."""
         return self.num_envs * self.ppo.rollout_steps
+
+    @property
+    def num_learner_threads(self) -> int:
+        """Threads of the learner on this machine; results do not depend on it."""
+        return self.learner_threads or available_cores()
 
     def check_machine(self) -> None:
         """Raise ValueError for what this machine lacks: the device, a C++ compiler."""
