@@ -216,7 +216,8 @@ def main(args: list[str]) -> None:
     played = trained if config.standard == "run" else config.standard
     title = (
         f"{config.policy}: {policy.spec.frames:,} frames on standard {trained}; "
-        f"standard {played}, bank {config.bank_seed} of {counted(config.episodes, 'episode')}"
+        f"standard {played}, bank {config.bank_seed} of "
+        f"{counted(config.episodes, 'episode')}"
     )
     if config.masked:
         title += f", sensors masked: {', '.join(config.masked)}"
