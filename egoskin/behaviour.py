@@ -33,9 +33,12 @@ from egoskin.sensors import Skin
 
 # Ages at which it is read where the base is [s].
 _AGES = (1.0, 2.0, 3.0, 5.0)
+_NUMBERS = ("first", "second", "third", "later")
 # Bounds of the groups by height aimed at [m], by speed at arrival [m/s] and by time
 # since the throw before [s]: about a third of the standard throws in each.
 _HEIGHTS, _SPEEDS, _GAPS = (0.9, 1.2), (5.3, 6.7), (1.33, 1.67)
+# When a robot has settled from its start [s].
+_SETTLED = 0.5
 # A point of a foot this close to the floor stands on it [m] (contacts give way a
 # little, so zero is too strict).
 _ON_FLOOR = 0.005
@@ -95,12 +98,26 @@ class Motion:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Waiting:
+    """How a robot waits for the first throw: means over all steps from 0.5 s on."""
+
+    base_speed: float
+    """Planar speed of the base [m/s]."""
+    power: float
+    """Mechanical power of the joints [W]."""
+    fallen: float
+    """Share of the episodes that end before the first throw."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Behaviour:
     """What a policy does with a bank of throws, within 10 s."""
 
     throws: dict[str, list[Group]]
-    """Groups by direction, height aimed at, speed at arrival, time since the throw
-    before, link aimed at."""
+    """Groups by number of the ball, direction, height aimed at, speed at arrival, time
+    since the throw before, link aimed at."""
+    waiting: Waiting | None
+    """Before the first throw; None where that is at the start."""
     displacement: list[Displacement]
     """Way from the start."""
     motion: Motion
@@ -143,6 +160,7 @@ def behave(
     play_bank(None, config, skin, **bank, watch=still)
     behaviour = Behaviour(
         throws=seen.groups(),
+        waiting=seen.waiting(),
         displacement=seen.displacement(),
         motion=seen.motion(),
         motion_zero_action=still.motion(),
@@ -182,6 +200,8 @@ class Watcher:
         self._failed = torch.zeros(episodes, dtype=torch.bool)
         # Way and height at each age, of the episodes that last, [2, n].
         self._base: dict[float, Tensor] = {}
+        self._waited = self._fallen_waiting = 0
+        self._waiting_speed = self._waiting_power = 0.0
         self._feet = _Feet(robot)
         self._step = 0
         self._sums: dict[str, float] = {}
@@ -193,13 +213,16 @@ class Watcher:
         """See one step; the arguments are those of `egoskin.evaluation.Watch`."""
         self._step += 1
         ended = running & after["terminated"][:, 0]
-        if self._step <= self._limit:
-            self._failed |= ended
+        age = self._step - after["first_throw_step"][:, 0]
+        self._failed |= ended & (age <= self._limit)
         going = running & ~ended
-        for age in _AGES:
-            if self._step == round(age * self._hz):
+        self._fallen_waiting += int((ended & (age <= 0)).sum())
+        if self._step >= round(_SETTLED * self._hz):
+            self._see_waiting(after[going & (age <= 0)])
+        for moment in _AGES:
+            if self._step == round(moment * self._hz):
                 way = after["displacement_w"][going].square().sum(-1).sqrt()
-                self._base[age] = torch.stack((way, after["base_pose"][going, 2]))
+                self._base[moment] = torch.stack((way, after["base_pose"][going, 2]))
         self._see_balls(after, running)
         # A blow, a fall or a failed simulation is not how the policy moves.
         self._see_motion(before[going], after[going])
@@ -213,6 +236,22 @@ class Watcher:
             flown, throw = rows[throw >= 0], throw[throw >= 0]
             self._arrived[flown, throw] |= after["object_arrived"][flown, ball]
             self._hit[flown, throw] |= after["object_hit"][flown, ball]
+
+    def _see_waiting(self, after: TensorDictBase) -> None:
+        speed = after["base_lin_vel_w"][:, :2].square().sum(-1).sqrt()
+        self._waited += len(after)
+        self._waiting_speed += float(speed.double().sum())
+        self._waiting_power += float(after["power"].double().sum())
+
+    def waiting(self) -> Waiting | None:
+        """Return how the robot waited for the first throw."""
+        if not self._waited:
+            return None
+        return Waiting(
+            base_speed=self._waiting_speed / self._waited,
+            power=self._waiting_power / self._waited,
+            fallen=self._fallen_waiting / len(self._failed),
+        )
 
     def _see_motion(self, before: TensorDictBase, after: TensorDictBase) -> None:
         acceleration = (after["joint_vel"] - before["joint_vel"]) * self._hz
@@ -259,7 +298,11 @@ class Watcher:
     def groups(self) -> dict[str, list[Group]]:
         """Return how the throws of each kind fared."""
         height, speed = self._thrower.at_standing_robot(self._draw)
+        number = torch.arange(self._arrived.shape[1]).clamp(max=len(_NUMBERS) - 1)
         result = {
+            "number of the ball": self._split(
+                number.expand(self._arrived.shape), _NUMBERS
+            ),
             "direction": self._split(quarter_of(self._draw.azimuth), QUARTERS),
             "height aimed at": self._split(*_bands(height, _HEIGHTS, "m")),
             "speed at arrival": self._split(*_bands(speed, _SPEEDS, "m/s")),

@@ -10,6 +10,7 @@ python scripts/evaluate.py runs/NAME --mask
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import json
 import sys
 import time
@@ -24,10 +25,13 @@ from egoskin.behaviour import Behaviour, Motion, behave
 from egoskin.cli import check_counts, check_output, clear_errors, counted
 from egoskin.draws import check_seed
 from egoskin.evaluation import Estimate, Evaluation, evaluate, standard_task
+from egoskin.film import check_path
 from egoskin.make import MASK_ALL, EnvConfig, check_mask, check_num_workers
+from egoskin.operating_map import draw_map, operating_map
 from egoskin.policies import load_policy
 from egoskin.report import metres
 
+PICTURE_SUFFIXES = (".png", ".svg", ".pdf")
 # In a file a line of progress is written this often [s].
 _FILE_INTERVAL = 10.0
 
@@ -56,6 +60,9 @@ class EvaluateConfig:
     check_substeps: int | None = None
     """Play the bank once more with this many physics steps in each control step, and
     say what is lost (8: 480 Hz)."""
+    map: Path | None = None
+    """Picture to draw of success against speed, tempo, height and direction of the
+    throws, within and beyond what is trained on (a quarter of the episodes each)."""
     json: Path | None = None
     """File to write the figures to."""
 
@@ -65,6 +72,9 @@ class EvaluateConfig:
         check_counts(self, "episodes", "check_substeps")
         check_num_workers(self.episodes, self.num_workers, "episodes")
         check_output(self.json, "--json")
+        if self.map is not None:
+            check_path(self.map, PICTURE_SUFFIXES)
+            check_matplotlib()
 
     @property
     def masked(self) -> tuple[str, ...]:
@@ -72,6 +82,12 @@ class EvaluateConfig:
         if self.mask is None:
             return ()
         return self.mask or MASK_ALL
+
+
+def check_matplotlib() -> None:
+    """Raise ValueError if the map's picture cannot be drawn here."""
+    if importlib.util.find_spec("matplotlib") is None:
+        raise ValueError("--map needs matplotlib: `pip install 'egoskin[plot]'`")
 
 
 def share(value: float | None) -> str:
@@ -117,6 +133,15 @@ def behaviour_table(result: Behaviour) -> str:
                 f"{share(group.first_hits)}    {share(group.later_hits)} "
                 f"{group.later_balls:4}"
             )
+    if result.waiting is not None:
+        waiting = result.waiting
+        lines += [
+            "",
+            "  before the first throw, from 0.5 s on",
+            f"    base speed       {waiting.base_speed:7.3f} m/s",
+            f"    mechanical power {waiting.power:7.1f} W",
+            f"    fallen           {share(waiting.fallen)}",
+        ]
     lines += ["", "  way from the start     mean   a tenth exceeds  base height     of"]
     for way in result.displacement:
         lines.append(
@@ -167,11 +192,17 @@ class Progress:
 
     def __call__(self, step: int, running: int) -> None:
         """Show one step; the arguments are those of ``on_step``."""
+        self._show(f"{step / self._hz:5.2f} s played, {running} still running")
+
+    def points(self, done: int, total: int) -> None:
+        """Show how many points of a map are done."""
+        self._show(f"map: {done} of {total} points")
+
+    def _show(self, text: str) -> None:
         now = time.monotonic()
         if not self._live and now - self._shown < _FILE_INTERVAL:
             return
         self._shown = now
-        text = f"{step / self._hz:5.2f} s played, {running} episodes still running"
         start, end = ("\r", "\x1b[K") if self._live else ("", "\n")
         print(f"{start}{text}{end}", end="", file=sys.stderr, flush=True)
 
@@ -241,6 +272,20 @@ def main(args: list[str]) -> None:
         print(f"  success lost by the other physics rate: {lost:.2f} points")
         content["check_substeps"] = config.check_substeps
         content["checked"] = dataclasses.asdict(checked)
+    if config.map is not None:
+        lines = operating_map(
+            policy,
+            env_config,
+            policy.skin,
+            bank_seed=config.bank_seed,
+            episodes=max(config.episodes // 4, 1),
+            mask=config.masked,
+            on_point=progress.points,
+        )
+        progress.finish()
+        draw_map(config.map, lines, title.removesuffix(", physics at "))
+        content["map"] = [dataclasses.asdict(line) for line in lines]
+        print(f"\n{config.map}: success against speed, tempo, height and direction")
     if config.json is not None:
         config.json.write_text(json.dumps(content, indent=2) + "\n")
 
