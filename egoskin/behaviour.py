@@ -18,7 +18,14 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from egoskin.envs.throws import QUARTERS, Thrower, quarter_of
-from egoskin.evaluation import Estimate, Evaluation, evaluate, play_bank, wilson
+from egoskin.evaluation import (
+    Estimate,
+    Evaluation,
+    evaluate,
+    play_bank,
+    throw_seed,
+    wilson,
+)
 from egoskin.kinematics import LinkKinematics, rotate
 from egoskin.make import EnvConfig
 from egoskin.robots import RobotConfig
@@ -110,6 +117,7 @@ def behave(
     bank_seed: int,
     episodes: int,
     num_workers: int | None = None,
+    mask: Sequence[str] = (),
     on_step: Callable[[int, int], None] | None = None,
 ) -> tuple[Evaluation, Behaviour]:
     """Return how a policy fares on a bank of throws, and what it does there.
@@ -121,6 +129,7 @@ def behave(
         bank_seed: Seed of the bank.
         episodes: Size of the bank.
         num_workers: Physics threads; the result does not depend on it.
+        mask: Links whose sensors detect nothing, or `egoskin.make.MASK_ALL`.
         on_step: Called with (steps done, episodes still running).
     """
     bank: dict[str, Any] = {
@@ -129,7 +138,8 @@ def behave(
         "num_workers": num_workers,
     }
     seen, still = (Watcher(config, bank_seed, episodes) for _ in range(2))
-    result = evaluate(policy, config, skin, **bank, on_step=on_step, watch=seen)
+    watching: dict[str, Any] = {"mask": mask, "on_step": on_step, "watch": seen}
+    result = evaluate(policy, config, skin, **bank, **watching)
     play_bank(None, config, skin, **bank, watch=still)
     behaviour = Behaviour(
         throws=seen.groups(),
@@ -153,18 +163,20 @@ class Watcher:
         task, robot = config.task, config.robot_config
         self._hz, self._balls = task.physics.control_hz, task.throws.num_balls
         self._limit = round(task.success_s * self._hz)
-        self._by_link = task.throws.aim == "body"
+        self._by_link = task.throws.aim != "box"
         self._thrower = Thrower(task.throws, robot, task.physics.timestep)
         shortest = max(1, round(task.throws.interval[0] * self._hz))
         count = 1 + task.episode_steps // shortest
         row = torch.arange(episodes).repeat_interleave(count)
         index = torch.arange(count).repeat(episodes)
         # The throws of each episode in turn, [N * K].
-        self._draw = self._thrower.draw(bank_seed, row, row * 0, index)
+        seed = throw_seed(config, bank_seed)
+        self._draw = self._thrower.draw(seed, row, row * 0, index)
         gap = (self._draw.interval * self._hz).round().long().clamp(min=1)
         gap = gap.reshape(episodes, count)
+        delay = self._thrower.first_delay(seed, row, row * 0).reshape(episodes, count)
         # Step at the end of which each ball is thrown, [N, K]: the draws' alone.
-        self._thrown = gap.cumsum(1) - gap
+        self._thrown = gap.cumsum(1) - gap + (delay * self._hz).round().long()
         self._arrived = torch.zeros(episodes, count, dtype=torch.bool)
         self._hit = self._arrived.clone()
         self._failed = torch.zeros(episodes, dtype=torch.bool)

@@ -17,6 +17,8 @@ import torch
 from torch import Tensor
 
 _MASK = 0xFFFFFFFF
+# Bit of a seed that marks a held-out one, and of a key's second word, above any stream.
+_HELD_OUT, _HELD_OUT_KEY = 1 << 32, 1 << 16
 # Multipliers and Weyl constants of Philox4x32, from the paper above.
 _M0, _M1 = 0xD2511F53, 0xCD9E8D57
 _W0, _W1 = 0x9E3779B9, 0xBB67AE85
@@ -28,6 +30,7 @@ class Stream(IntEnum):
     START = 0
     THROW = 1
     SENSOR = 2
+    FIRST_DELAY = 3
 
 
 def philox(counter: Tensor, key: tuple[int, int]) -> Tensor:
@@ -63,6 +66,44 @@ def check_seed(seed: int, name: str = "seed") -> None:
         raise ValueError(f"{name} must be in [0, 2**32), got {seed}")
 
 
+def held_out(seed: int) -> int:
+    """Return the held-out twin of a seed: its draws are those of no training.
+
+    Args:
+        seed: A seed that a user may choose, in [0, 2**32).
+
+    Raises:
+        ValueError: If it is no 32-bit unsigned integer.
+    """
+    check_seed(seed)
+    return seed | _HELD_OUT
+
+
+def offset_seed(seed: int, offset: int) -> int:
+    """Return another seed, held out where this one is.
+
+    Args:
+        seed: A seed, or what `held_out` returned.
+        offset: How far away, modulo 2**32; 0 is the same seed.
+    """
+    return ((seed + offset) & _MASK) | (seed & _HELD_OUT)
+
+
+def stream_key(seed: int, stream: Stream) -> tuple[int, int]:
+    """Return the two words of the generator's key.
+
+    Args:
+        seed: A seed in [0, 2**32), or what `held_out` returned.
+        stream: Purpose of the draws.
+
+    Raises:
+        ValueError: If the seed is neither.
+    """
+    own = seed & ~_HELD_OUT
+    check_seed(own)
+    return own, int(stream) | (_HELD_OUT_KEY if seed & _HELD_OUT else 0)
+
+
 def random_words(
     seed: int,
     stream: Stream,
@@ -74,7 +115,7 @@ def random_words(
     """Return four random 32-bit words for each element, a function of the arguments.
 
     Args:
-        seed: Run seed, in [0, 2**32).
+        seed: Run seed, in [0, 2**32), or what `held_out` returned.
         stream: Purpose of the draw.
         row: Global agent row, ``[*B]`` int64.
         episode: Episode of that row, ``[*B]`` int64.
@@ -88,9 +129,8 @@ def random_words(
     Raises:
         ValueError: If the seed is not a 32-bit unsigned integer.
     """
-    check_seed(seed)
     words = torch.stack((row, episode, counter, block))
-    return philox(words & _MASK, (seed, int(stream)))
+    return philox(words & _MASK, stream_key(seed, stream))
 
 
 def uniform(
@@ -104,7 +144,7 @@ def uniform(
     """Return uniform numbers in [0, 1), a pure function of the arguments.
 
     Args:
-        seed: Run seed, in [0, 2**32).
+        seed: Run seed, in [0, 2**32), or what `held_out` returned.
         stream: Purpose of the draw.
         row: Global agent row, ``[*B]`` int64.
         episode: Episode of that row, ``[*B]`` int64.

@@ -95,6 +95,7 @@ class PolicySpec:
     def header(self) -> dict[str, Any]:
         """Return the specification as JSON values."""
         return {
+            "standard": self.env.standard,
             "env": to_plain(self.env),
             "skin": self.skin.to_dict(),
             "network": to_plain(self.network),

@@ -32,7 +32,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import torch
 import tyro
@@ -43,10 +43,13 @@ from egoskin.checkpoint import PARTIAL, load_tensors, save_tensors, sync, write_
 from egoskin.cli import check_counts
 from egoskin.compilation import can_compile
 from egoskin.draws import check_seed
+from egoskin.envs.dodgeball import DodgeballConfig
+from egoskin.envs.standards import Standard, training_task
 from egoskin.events import EventFile
 from egoskin.make import EnvConfig, check_num_workers
 from egoskin.plain import changed_fields, check_numbers, from_plain, read_json, to_plain
 from egoskin.policies import CHECKPOINT_NAME
+from egoskin.workers import available_cores
 
 _PACKAGES = ("egoskin", "torch", "torchrl", "tensordict", "mujoco", "numpy")
 _PACKAGES += ("pytorch-kinematics", "gymnasium")
@@ -60,6 +63,9 @@ class TrainConfig:
     """Robot, task, skin, sensors."""
     ppo: PPOConfig = field(default_factory=PPOConfig)
     """Networks and PPO."""
+    standard: Standard | None = None
+    """Version of the standard throw: sets throws and ends. None: 2, the defaults. A
+    throw or end given beside it makes the task custom."""
     seed: int = 0
     """Seed of everything random: throws, starts, networks, actions."""
     total_frames: int = 65_536_000
@@ -106,6 +112,11 @@ class TrainConfig:
         """Environment steps of one rollout."""
         return self.num_envs * self.ppo.rollout_steps
 
+    @property
+    def num_learner_threads(self) -> int:
+        """Threads of the learner on this machine; results do not depend on it."""
+        return self.learner_threads or available_cores()
+
     def check_machine(self) -> None:
         """Raise ValueError for what this machine lacks: the device, a C++ compiler."""
         self.learner_device()
@@ -137,7 +148,7 @@ class TrainConfig:
 
 
 # What a run's stored configuration leaves out: it says how a run was called.
-_CALL_FIELDS = ("run_dir", "resume")
+_CALL_FIELDS = ("run_dir", "resume", "standard")
 
 
 def parse_config(args: list[str]) -> TrainConfig:
@@ -155,9 +166,16 @@ def parse_config(args: list[str]) -> TrainConfig:
     """
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     first.add_argument("--resume", type=Path)
+    first.add_argument("--standard")
     run, _ = first.parse_known_args(args)
     if run.resume is None or str(run.resume) == "None":
-        return tyro.cli(TrainConfig, args=args)
+        if run.standard not in get_args(Standard):
+            return tyro.cli(TrainConfig, args=args)
+        task = training_task(run.standard, DodgeballConfig())
+        default = TrainConfig(env=EnvConfig(task=task))
+        return tyro.cli(TrainConfig, args=args, default=default)
+    if run.standard is not None:
+        raise ValueError("--standard cannot be changed on resume")
     stored = Run.open(run.resume).config
     # What the file lacks was filled with today's defaults.
     file, before = run.resume / "config.json", to_plain(stored)

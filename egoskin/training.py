@@ -44,6 +44,7 @@ METRIC_KEYS = (
     "diverged",
     "episode_step",
     "fallen",
+    "first_throw_step",
     "hit",
     "reward",
     "reward_terms",
@@ -75,7 +76,7 @@ class Trainer:
         self.spec = PolicySpec.of(config.env, skin, config.ppo.network, env, sources)
         torch.manual_seed(self.config.seed)
         self.agent: Agent = self.spec.build_agent(sources).to(self.device)
-        self.ppo = PPO(self.agent, self.config.ppo)
+        self.ppo = PPO(self.agent, config.ppo, config.num_learner_threads)
         self.survival = SurvivalCurve(self.config.env.task.episode_steps)
         self.frames = 0
         self.wall_s = 0.0
@@ -126,7 +127,8 @@ class Trainer:
         """What the environment said during a rollout, ``[T, N]``."""
         self.survival.decay()
         for info in infos:
-            self.survival.update(info["episode_step"][:, 0], info["terminated"][:, 0])
+            age = info["episode_step"] - info["first_throw_step"]
+            self.survival.update(age[:, 0], info["terminated"][:, 0])
         task = self.config.env.task
         hz = task.physics.control_hz
         ended = float(infos["terminated"].sum())
@@ -222,7 +224,8 @@ class Trainer:
 def open_trainer(run: Run, num_threads: int = 1) -> Iterator[Trainer]:
     """Yield the trainer of a run, at its start or its checkpoint; close all after.
 
-    PyTorch then uses as many threads as the run's ``learner_threads`` says.
+    PyTorch itself then uses one thread, so that nothing depends on the machine's cores;
+    the learner has threads of its own, see `egoskin.agents.ppo.PPO`.
 
     Args:
         run: A new run or one to go on with.
@@ -232,8 +235,7 @@ def open_trainer(run: Run, num_threads: int = 1) -> Iterator[Trainer]:
         ValueError: If the run is being trained already, or cannot be gone on with.
     """
     config = run.config
-    if config.learner_threads is not None:
-        torch.set_num_threads(config.learner_threads)
+    torch.set_num_threads(1)
     with run.locked():
         # What cannot be read is told of before the workers start.
         skin = Skin.load(run.skin_path)

@@ -63,6 +63,13 @@ class WorkerError(RuntimeError):
     """A worker died, raised or hung; the text holds its own traceback or signal."""
 
 
+def available_cores() -> int:
+    """Return the number of cores that this process may use."""
+    # macOS has no affinity.
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
+
+
 def default_num_workers(num_envs: int, cores: int | None = None) -> int:
     """Return the largest divisor of the number of agents not above the cores.
 
@@ -70,10 +77,7 @@ def default_num_workers(num_envs: int, cores: int | None = None) -> int:
         num_envs: Number of agents.
         cores: Number of cores; those this process may use by default.
     """
-    if cores is None:
-        # macOS has no affinity.
-        affinity = getattr(os, "sched_getaffinity", None)
-        cores = len(affinity(0)) if affinity else os.cpu_count() or 1
+    cores = available_cores() if cores is None else cores
     return max(n for n in range(1, cores + 1) if num_envs % n == 0)
 
 

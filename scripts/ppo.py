@@ -15,8 +15,6 @@ import signal
 import sys
 from types import FrameType
 
-import torch
-
 from egoskin.agents.ppo import NonFiniteError
 from egoskin.cli import clear_errors, counted
 from egoskin.compilation import is_compiled
@@ -49,11 +47,10 @@ def main(args: list[str]) -> None:
     config.check_machine()
     run = Run.create(config) if config.resume is None else Run(config.resume, config)
     workers = check_num_workers(config.num_envs, config.num_workers)
-    threads = config.learner_threads or torch.get_num_threads()
     print(
         f"run {run.path}: {counted(config.num_envs, 'agent')} on "
         f"{counted(workers, 'worker')}, learner on {config.device} with "
-        f"{counted(threads, 'thread')}"
+        f"{counted(config.num_learner_threads, 'thread')}"
     )
     compiles = run.config.compile_kernels and run.config.env.sensor.uses_skin
     if compiles and not is_compiled(SOURCE):

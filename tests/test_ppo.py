@@ -348,23 +348,30 @@ def test_a_loss_that_is_not_finite_stops_before_the_weights_change():
         assert torch.equal(value, before[key]), key
 
 
-@pytest.mark.parametrize("threads", [2, 3])
-def test_shares_of_a_minibatch_add_up_to_the_whole(threads: int):
+def test_shares_of_a_minibatch_add_up_to_the_whole():
     results = []
-    for n in (1, threads):
-        torch.set_num_threads(n)
-        try:
-            agent = bandit_agent()
-            ppo = PPO(agent, PPOConfig(ppo_epochs=1))
-            metrics = ppo.update(bandit_rollout(agent))
-        finally:
-            torch.set_num_threads(2)
+    for shares in (1, 4):
+        agent = bandit_agent()
+        ppo = PPO(agent, PPOConfig(ppo_epochs=1))
+        ppo.shares = shares
+        metrics = ppo.update(bandit_rollout(agent))
         results.append((metrics, agent.head.body.tail[3].weight.detach()))
     (whole, expected), (shared, weight) = results
-    assert ppo.shares == threads
     torch.testing.assert_close(weight, expected)
     assert shared["loss_critic"] == pytest.approx(whole["loss_critic"], rel=1e-5)
     assert shared["grad_norm_actor"] == pytest.approx(whole["grad_norm_actor"], 1e-4)
+
+
+@pytest.mark.parametrize("threads", [2, 3])
+def test_the_number_of_threads_changes_no_bit(threads: int):
+    results = []
+    for n in (1, threads):
+        agent = bandit_agent()
+        metrics = PPO(agent, PPOConfig(ppo_epochs=1), n).update(bandit_rollout(agent))
+        results.append((metrics, agent.head.body.tail[3].weight.detach()))
+    (one, expected), (several, weight) = results
+    assert torch.equal(weight, expected)
+    assert several == one
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import json
 import shutil
 import subprocess
 import sys
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -38,7 +39,10 @@ def test_a_run_learns_with_its_own_number_of_threads(config: TrainConfig):
     run = Run.create(replace(config, learner_threads=3))
     try:
         with open_trainer(run) as trainer:
-            assert torch.get_num_threads() == trainer.ppo.shares == 3
+            trainer.iterate()
+            learners = [t for t in threading.enumerate() if "learner" in t.name]
+            assert len(learners) == 3
+            assert torch.get_num_threads() == 1
     finally:
         torch.set_num_threads(before)
 

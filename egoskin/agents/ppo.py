@@ -24,8 +24,9 @@ from egoskin.sparse import SparseRows
 _LR_BOUNDS, _LR_FACTOR = (1e-5, 1e-2), 1.5
 # The divergence of an update is estimated on this many frames.
 _KL_FRAMES = 4096
-# More shares of a minibatch than this are smaller than what it costs to call PyTorch.
-_MAX_SHARES = 4
+# Shares of a minibatch, whose gradients threads compute. Fixed: the last bits of their
+# sum depend on it. More would be smaller than what it costs to call PyTorch.
+_SHARES = 4
 
 
 class NonFiniteError(RuntimeError):
@@ -169,16 +170,18 @@ def add_advantages(
 class PPO:
     """The update: TorchRL's clipped loss, Adam, adaptive learning rate.
 
-    On a CPU each of a few threads takes its share of a minibatch: on networks this
-    small, PyTorch's own threads would wait for each other more than they work. The sum
-    of the gradients depends on the number of shares to rounding, and on nothing else.
+    On a CPU threads of its own take shares of a minibatch: on networks this small,
+    PyTorch's threads would wait for each other more than they work. The number of
+    shares is fixed, so the result does not depend on the number of threads, as long as
+    the caller lets PyTorch itself use one (sums of long tensors depend on it).
 
     Args:
         agent: What is trained.
         config: How.
+        num_threads: Threads that take the shares, if the agent is on a CPU.
     """
 
-    def __init__(self, agent: Agent, config: PPOConfig) -> None:
+    def __init__(self, agent: Agent, config: PPOConfig, num_threads: int = 1) -> None:
         self.agent, self.config = agent, config
         self.loss = ClipPPOLoss(
             agent.actor,
@@ -200,11 +203,10 @@ class PPO:
         self.optimizer = torch.optim.Adam(
             [self._actor, self._critic], lr=config.learning_rate, eps=1e-5, fused=True
         )
-        threads = torch.get_num_threads()
         on_cpu = agent.head.log_std.device.type == "cpu"
-        self.shares = min(threads, _MAX_SHARES) if on_cpu else 1
+        self.shares = _SHARES if on_cpu else 1
         self._pool = ThreadPoolExecutor(
-            self.shares, "learner", torch.set_num_threads, (threads // self.shares,)
+            min(num_threads, self.shares), "learner", torch.set_num_threads, (1,)
         )
 
     @property

@@ -39,9 +39,9 @@ class DodgeballConfig:
     clip_targets: bool = False
     """Clip q* to the joint ranges (an ankle could then ask for little torque)."""
     episode_length_s: float = 10.0
-    """Episodes are truncated at this age [s]."""
+    """Episodes are truncated this long after the first throw [s]."""
     success_s: float = 3.0
-    """An episode that is not terminated up to this age is a success [s]."""
+    """An episode not terminated until this long after the first throw succeeds [s]."""
     self_contact_ends: bool = False
     """Whether a robot that touches itself terminates the episode, as a fall does."""
     start_joint_noise: float = 0.05
@@ -71,8 +71,13 @@ class DodgeballConfig:
 
     @property
     def episode_steps(self) -> int:
-        """Control steps in an episode that is not ended early."""
+        """Control steps from the first throw to the end of a whole episode."""
         return round(self.episode_length_s * self.physics.control_hz)
+
+    @property
+    def delay_steps(self) -> int:
+        """Most control steps before the first throw."""
+        return round(self.throws.first_delay[1] * self.physics.control_hz)
 
 
 class DodgeballEnv(EnvBase):
@@ -110,16 +115,17 @@ class DodgeballEnv(EnvBase):
     ``balls_arrived``      ``[B, 2]``      first ball, later balls: arrived so far
     ``balls_avoided``      ``[B, 2]``      ... of which without touching
     ``episode_step``       ``[B, 1]``      age of the episode in control steps
+    ``first_throw_step``   ``[B, 1]``      age at which its first ball is thrown
     ====================== =============== ==========================================
 
     **Reward**: the sum of ``reward_terms``; see `egoskin.envs.rewards`.
 
     **Start**: default pose with a little joint noise on the ground at the origin,
-    uniform heading, at rest; the first ball is in the air at once.
+    uniform heading, at rest; the first ball is thrown after a random delay.
 
     **End**: ``terminated`` = hit or fallen or diverged, or self-contact if that ends
-    an episode; ``truncated`` at the age limit. A diverged row is reset like any other
-    and harms no other row.
+    an episode; ``truncated`` some time after the first throw. A diverged row is reset
+    like any other and harms no other row.
 
     All draws are functions of (seed, global row, episode, ...): rows
     ``row_offset`` to ``row_offset + num_envs`` give the same episodes whichever
@@ -176,6 +182,7 @@ class DodgeballEnv(EnvBase):
             "step": zeros.clone(),
             "throw": zeros.clone(),
             "next_throw_step": zeros.clone(),
+            "first_throw_step": zeros.clone(),
             "active": torch.zeros(num_envs, balls, dtype=torch.bool),
             "is_first": torch.zeros(num_envs, balls, dtype=torch.bool),
             "passed": torch.zeros(num_envs, balls, dtype=torch.bool),
@@ -193,6 +200,9 @@ class DodgeballEnv(EnvBase):
 
         def flag(*shape: int) -> Binary:
             return Binary(shape=torch.Size((n, *shape)), dtype=torch.bool)
+
+        def age(most: int) -> Bounded:
+            return Bounded(0, most, shape=torch.Size((n, 1)), dtype=torch.int64)
 
         self.observation_spec = Composite(
             base_pose=unbounded(7),
@@ -217,12 +227,8 @@ class DodgeballEnv(EnvBase):
             object_arrived=flag(balls),
             balls_arrived=unbounded(2),
             balls_avoided=unbounded(2),
-            episode_step=Bounded(
-                0,
-                self.config.episode_steps,
-                shape=torch.Size((n, 1)),
-                dtype=torch.int64,
-            ),
+            episode_step=age(self.config.delay_steps + self.config.episode_steps),
+            first_throw_step=age(self.config.delay_steps),
             shape=torch.Size([n]),
         )
         self.action_spec = unbounded(joints)
@@ -268,7 +274,9 @@ class DodgeballEnv(EnvBase):
         rows = mask.reshape(-1).nonzero()[:, 0]
         if len(rows):
             self._start_episodes(rows)
-            self._throw(rows)
+            at_once = rows[self._counters["first_throw_step"][rows] == 0]
+            if len(at_once):
+                self._throw(at_once)
         never = torch.zeros(self.batch_size[0], 1, dtype=torch.bool)
         out = self._state_td(self.physics.read())
         out["reward_terms"] = torch.zeros(self.batch_size[0], len(TERMS))
@@ -309,6 +317,10 @@ class DodgeballEnv(EnvBase):
         joint_pos = self._default + (0.0 if self._hold else noise)
         n = len(rows)
         self.physics.reset(rows.numpy(), pose[:n], joint_pos.expand_as(noise)[:n])
+        delay = self.thrower.first_delay(self._seed, self._rows[padded], episode)[:n]
+        steps = (delay * self.config.physics.control_hz).round().long()
+        for key in ("first_throw_step", "next_throw_step"):
+            counters[key][rows] = steps
 
     def _throw(self, rows: Tensor) -> None:
         """Throw the next ball of some rows at the robot as it is now."""
@@ -354,7 +366,8 @@ class DodgeballEnv(EnvBase):
         terminated = hit | fallen | result.diverged
         if config.self_contact_ends:
             terminated |= result.self_contact
-        truncated = (counters["step"] >= config.episode_steps) & ~terminated
+        since = counters["step"] - counters["first_throw_step"]
+        truncated = (since >= config.episode_steps) & ~terminated
         self._count_balls(state, hit_by, sound)
         # Of the balls in flight until here: a throw makes the flag a new ball's.
         arrived = counters["passed"].clone()
@@ -439,6 +452,7 @@ class DodgeballEnv(EnvBase):
                 "balls_arrived": counters["arrived"].clone(),
                 "balls_avoided": counters["avoided"].clone(),
                 "episode_step": counters["step"][:, None].clone(),
+                "first_throw_step": counters["first_throw_step"][:, None].clone(),
             },
             batch_size=self.batch_size,
         )

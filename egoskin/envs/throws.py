@@ -49,8 +49,11 @@ class ThrowConfig:
     """Mass of each ball [kg] (a touch ends the episode, so it hardly matters)."""
     num_balls: int = 2
     """Balls thrown in turn, so that a slow one is not snatched away in flight."""
+    first_delay: tuple[float, float] = (0.0, 2.0)
+    """Time from the start of an episode to the first throw [s]: at a random moment no
+    fixed programme pays, with (0, 0) a blind robot learns to duck at once."""
     interval: tuple[float, float] = (1.0, 2.0)
-    """Time from one throw to the next [s]; the first is at the start."""
+    """Time from one throw to the next [s]."""
     height: tuple[float, float] = (2.0, 3.0)
     """Height of release above ground [m]."""
     distance: tuple[float, float] = (4.0, 6.0)
@@ -64,8 +67,9 @@ class ThrowConfig:
     drawn again, 32 times at most; then the first is thrown as slowly as arrives."""
     azimuth_deg: tuple[float, float] = (-180.0, 180.0)
     """Direction the ball comes from, relative to the robot's heading [deg]."""
-    aim: Literal["body", "box"] = "body"
-    """A random point of the body's surface (no shins, no feet), or of a box."""
+    aim: Literal["skin", "body", "box"] = "skin"
+    """A random point of the outer surface of the links that carry skin (the robot's
+    ``skin_links``, whatever the skin), of the body (no shins, no feet), or of a box."""
     box_half_width: float = 0.45
     """For aim=box: largest sideways offset from the base [m]."""
     box_height: tuple[float, float] = (0.3, 1.8)
@@ -79,13 +83,17 @@ class ThrowConfig:
 
     def __post_init__(self) -> None:
         """Raise ValueError for what cannot be thrown, or has no effect."""
-        ranges = ("interval", "height", "distance", "speed", "box_height")
-        for name in (*ranges, "azimuth_deg"):
+        positive = ("interval", "height", "distance", "speed", "box_height")
+        for name in (*positive, "first_delay", "azimuth_deg"):
             low, high = getattr(self, name)
             if not low <= high:
                 raise ValueError(f"{name} must be (low, high), got ({low}, {high})")
-            if name != "azimuth_deg" and low <= 0:
+            if name in positive and low <= 0:
                 raise ValueError(f"{name} must be positive, got ({low}, {high})")
+        if not self.first_delay[0] >= 0:
+            raise ValueError(
+                f"first_delay must not be negative, got {self.first_delay}"
+            )
         if self.num_balls < 1:
             raise ValueError(f"num_balls must be at least 1, got {self.num_balls}")
         if not self.mass > 0:
@@ -169,12 +177,12 @@ class Thrower:
     def _aim_points(self) -> tuple[LinkKinematics, Tensor, Tensor]:
         """Kinematics of the links aimed at; link index and position of each point."""
         robot = self._robot
-        links = [
-            name
-            for name in robot.links
-            if name not in robot.untargeted_links
-            and any(shape.link == name for shape in robot.primitives)
-        ]
+        if self.config.aim == "skin":
+            aimed_at = set(robot.skin_links)
+        else:
+            aimed_at = set(robot.links) - set(robot.untargeted_links)
+        solid = {shape.link for shape in robot.primitives}
+        links = [name for name in robot.links if name in aimed_at & solid]
         points = sample_surface(robot, links, _NUM_AIM_POINTS, _AIM_SEED)
         index = [links.index(robot.links[i]) for i in points.link]
         return (
@@ -184,7 +192,7 @@ class Thrower:
         )
 
     def aim_link(self, draw: Draw) -> list[str]:
-        """Return the name of the link each throw is aimed at (``aim="body"``)."""
+        """Return the name of the link each throw is aimed at (unless at a box)."""
         kinematics, link, _ = self._aim_points
         return [kinematics.links[i] for i in link[self._point_index(draw)].tolist()]
 
@@ -210,6 +218,21 @@ class Thrower:
             way = (target - release.position)[:, :2].norm(dim=-1)
             velocity[:, 2] -= GRAVITY * way / draw.speed
         return target[:, 2], velocity.norm(dim=-1)
+
+    def first_delay(self, seed: int, row: Tensor, episode: Tensor) -> Tensor:
+        """Return the time from the start of some episodes to their first throw [s].
+
+        Args:
+            seed: Seed of the run or of the throw set.
+            row: Global agent row, ``[n]`` int64.
+            episode: Episode of that row, ``[n]`` int64.
+
+        Returns:
+            Delays, a pure function of the arguments, ``[n]``.
+        """
+        low, high = self.config.first_delay
+        u = uniform(seed, Stream.FIRST_DELAY, row, episode, torch.zeros_like(row), 1)
+        return low + (high - low) * u[:, 0]
 
     def draw(self, seed: int, row: Tensor, episode: Tensor, throw: Tensor) -> Draw:
         """Return the random part of the n-th throws of some episodes.

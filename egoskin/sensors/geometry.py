@@ -172,6 +172,7 @@ class ProximitySensor(RowTransform):
         # Columns of the sensor frames in the link frames, [3 (axis), 3, S, 1].
         constant("_axes", skin.rotation().transpose(2, 1, 0)[..., None], torch.float64)
         constant("_range", skin.range[:, None], torch.float64)
+        self._skin_range = self._range.clone()
         # No object whose centre is farther from the base than this is in range in any
         # pose of the robot [m], [O].
         reach = np.array(self._kinematics.reach())[self._link.numpy()]
@@ -208,6 +209,18 @@ class ProximitySensor(RowTransform):
             "farthest": np.array(self._farthest),
         }
         self._kernels = Kernels(kind, self._kinematics, balls, {**own, **constants})
+
+    def mask(self, sensors: Sequence[int]) -> None:
+        """Let some sensors, and no others, detect nothing from now on.
+
+        Args:
+            sensors: Their indices.
+        """
+        self._range.copy_(self._skin_range)
+        # No distance is within it.
+        self._range[list(sensors)] = -1.0
+        if self._kernels is not None:
+            self._kernels.set_constants(range=self._range.numpy())
 
     @property
     def num_joints(self) -> int:

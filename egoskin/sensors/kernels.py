@@ -102,6 +102,15 @@ class Kernels:
         vars(self).update(state)
         self._library = load_library(SOURCE)
 
+    def set_constants(self, **constants: Any) -> None:
+        """Give some of the constants other values.
+
+        Args:
+            constants: As of the class.
+        """
+        self._constants.update(constants)
+        self._tables.clear()
+
     @staticmethod
     def can(*inputs: Tensor) -> bool:
         """Whether the kernels take these inputs: on the CPU, and without gradients."""
