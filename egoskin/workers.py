@@ -199,7 +199,7 @@ def _temporary_folder() -> str:
     """
     folder = util.get_temp_dir()
     script = 'trap "" INT TERM HUP; read -r line || rm -rf -- "$0"'
-    command = ["sh", "-c", script, folder]
+    command = ["/bin/sh", "-c", script, folder]
     # In a session of its own: a SIGKILL may go to the whole group.
     shell = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)
     atexit.register(shell.communicate, b"\n")
