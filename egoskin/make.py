@@ -113,7 +113,6 @@ def make_worker_env(
     bare: bool = False,
     sparse: bool = False,
     mask: Sequence[str] = (),
-    compile_kernels: bool = False,
 ) -> TransformedEnv:
     """Return the batched environment of one process, with its transforms.
 
@@ -131,7 +130,6 @@ def make_worker_env(
         sparse: Whether to give the state that the sensors read, for the agent's own
             sources, instead of the signal.
         mask: Links whose sensors detect nothing, or `MASK_ALL`.
-        compile_kernels: Whether to compile the sensors; results are the same.
     """
     robot = config.robot_config
     env = DodgeballEnv(
@@ -173,7 +171,6 @@ def make_worker_env(
                 row_offset=row_offset,
                 out_key=f"signal{suffix}",
                 masked=masked_sensors(skin, mask),
-                compile_kernels=compile_kernels,
             )
         if config.sensor.coverage == "oracle":
             transforms.append(Oracle(out_keys=[f"signal{suffix}"]))
@@ -228,7 +225,6 @@ def make_env(
     bare: bool = False,
     sparse: bool = False,
     mask: Sequence[str] = (),
-    compile_kernels: bool = False,
 ) -> WorkerPool:
     """Return a ParallelEnv of ``num_workers`` processes, ``[W, num_envs / W]`` rows.
 
@@ -244,7 +240,6 @@ def make_env(
         bare: Whether to leave out observations and sensors.
         sparse: Whether to give the state instead of the signal, see `make_worker_env`.
         mask: Links whose sensors detect nothing, or `MASK_ALL`.
-        compile_kernels: Whether to compile the sensors; results are the same.
 
     Raises:
         ValueError: If the workers do not divide the agents.
@@ -265,7 +260,6 @@ def make_env(
                 bare=bare,
                 sparse=sparse,
                 mask=mask,
-                compile_kernels=compile_kernels,
             )
             for i in range(workers)
         ]

@@ -41,7 +41,6 @@ _NO_RECIPE = {
     "run_dir",
     "snapshot_frames",
     "checkpoint_interval",
-    "compile_kernels",
     "resume",
 }
 # What tells most comes first in tables and pictures.
@@ -266,6 +265,7 @@ def load_run(path: Path) -> StoredRun:
     content = read_json(path / "config.json")
     content.pop("drift_start", None)
     content.pop("slow_start", None)
+    content.pop("compile_kernels", None)
     used = {name: content.pop(name, off) for name, off in _RETIRED.items()}
     retired = {name: used[name] for name in used if used[name] != _RETIRED[name]}
     return StoredRun(

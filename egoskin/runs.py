@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import argparse
 import csv
-import dataclasses
 import datetime
 import fcntl
 import importlib.metadata
@@ -41,7 +40,6 @@ from torch import Tensor
 from egoskin.agents.ppo import PPOConfig
 from egoskin.checkpoint import PARTIAL, load_tensors, save_tensors, sync, write_file
 from egoskin.cli import check_counts
-from egoskin.compilation import can_compile
 from egoskin.draws import check_seed
 from egoskin.envs.dodgeball import DodgeballConfig
 from egoskin.envs.standards import Standard, training_task
@@ -84,9 +82,6 @@ class TrainConfig:
     """Environment steps between the policies kept for learning curves."""
     checkpoint_interval: float = 60.0
     """A checkpoint is at most this old [s]."""
-    compile_kernels: bool | None = None
-    """Compute the sensors in C++, compiled in seconds at the first start on a machine,
-    with the same results; None: where there is a C++ compiler."""
     resume: Path | None = None
     """Run folder to go on with; only --total-frames may be changed, to a later end."""
 
@@ -118,13 +113,8 @@ class TrainConfig:
         return self.learner_threads or available_cores()
 
     def check_machine(self) -> None:
-        """Raise ValueError for what this machine lacks: the device, a C++ compiler."""
+        """Raise ValueError for what this machine lacks: the device."""
         self.learner_device()
-        if self.compile_kernels and not can_compile():
-            raise ValueError(
-                "the run compiles its kernels (compile_kernels), but there is no "
-                "C++ compiler here: install g++"
-            )
 
     def learner_device(self) -> torch.device:
         """Return the device of the learner.
@@ -179,7 +169,7 @@ def parse_config(args: list[str]) -> TrainConfig:
     stored = Run.open(run.resume).config
     # What the file lacks was filled with today's defaults.
     file, before = run.resume / "config.json", to_plain(stored)
-    if lacking := changed_fields(read_json(file), before):
+    if lacking := changed_fields(_stored(file), before):
         raise ValueError(
             f"{file} lacks {', '.join(lacking)}: another version made it. Go on with "
             "that version (its commit is in versions.json), or add what it lacks"
@@ -203,6 +193,15 @@ def parse_config(args: list[str]) -> TrainConfig:
             f"{stored.total_frames}"
         )
     return config
+
+
+def _stored(file: Path) -> Any:
+    """Return the plain values of a stored configuration, without a field of old."""
+    content = read_json(file)
+    if isinstance(content, dict):
+        # Sensors were compiled as it said; now they are where they can be.
+        content.pop("compile_kernels", None)
+    return content
 
 
 class Run:
@@ -239,8 +238,6 @@ class Run:
                 f"{path} exists already; choose another --run-dir"
                 + f", or go on with it by --resume {path}" * go_on
             )
-        if config.compile_kernels is None:
-            config = dataclasses.replace(config, compile_kernels=can_compile())
         (path / "policies").mkdir(parents=True)
         run = cls(path, config)
         skin.save(run.skin_path)
@@ -258,7 +255,7 @@ class Run:
         file = path / "config.json"
         if not file.is_file():
             raise ValueError(f"{path} is no run folder: it has no config.json")
-        return cls(path, from_plain(TrainConfig, read_json(file), str(file)))
+        return cls(path, from_plain(TrainConfig, _stored(file), str(file)))
 
     def write_config(self) -> None:
         """Write the configuration (again, with a later end)."""

@@ -194,7 +194,6 @@ class SensorConfig:
         row_offset: int = 0,
         out_key: str = "signal",
         masked: Collection[int] = (),
-        compile_kernels: bool = False,
     ) -> list[Transform]:
         """Return the transforms that write the signal (none without a skin).
 
@@ -210,7 +209,6 @@ class SensorConfig:
             row_offset: Global index of the first row.
             out_key: Key of the signal.
             masked: Indices of sensors that detect nothing.
-            compile_kernels: Whether to compile the sensors; results are the same.
         """
         if not self.uses_skin:
             return []
@@ -222,7 +220,7 @@ class SensorConfig:
             part, key = skin.select(index), f"distance{suffix}"
             detected.append(f"object_detected{suffix}")
             out_keys = (key, detected[-1])
-            sensor = self._sensor(robot, part, objects, out_keys, compile_kernels)
+            sensor = self._sensor(robot, part, objects, out_keys)
             sensor.mask([i for i, own in enumerate(index) if own in masked])
             transforms.append(sensor)
             if self.signal == "localization":
@@ -262,7 +260,6 @@ class SensorConfig:
         robot: RobotConfig,
         skin: Skin,
         objects: Sequence[Shape],
-        compile_kernels: bool = False,
     ) -> SparseRays | None:
         """Return what gives the signal as sparse rows, or None if it is not sparse.
 
@@ -272,7 +269,6 @@ class SensorConfig:
             robot: The robot.
             skin: The sensors.
             objects: Shapes of what is sensed.
-            compile_kernels: Whether to compile the sensors; results are the same.
         """
         skin = self.filled(skin)
         dense = self.signal == "localization" or self.corruption != "none"
@@ -283,7 +279,7 @@ class SensorConfig:
             return None
 
         keys = ("distance", "object_detected")
-        sensor = self._sensor(robot, skin, objects, keys, compile_kernels)
+        sensor = self._sensor(robot, skin, objects, keys)
         assert isinstance(sensor, RaySensor)
         reading = self._signal(skin.select([0]), "distance", "signal")
         return SparseRays(sensor, reading)
@@ -318,14 +314,13 @@ class SensorConfig:
         skin: Skin,
         objects: Sequence[Shape],
         out_keys: Sequence[str],
-        compile_kernels: bool,
     ) -> FieldSensor | RaySensor:
         """Return the coverage of some sensors of one kind."""
         common: dict[str, Any] = {
             "body": robot.primitives if self.occlusion else (),
             "per_object": self.per_object and self.signal != "localization",
             "out_keys": out_keys,
-            "compile": compile_kernels,
+            "compile": True,
         }
         args = (skin, robot.chain, objects, self.range)
         if isinstance(skin.coverage[0], Ray):

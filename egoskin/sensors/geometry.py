@@ -11,7 +11,6 @@ a reading of NaN, never one of nothing.
 
 from __future__ import annotations
 
-import warnings
 from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
@@ -24,7 +23,6 @@ from torch import Tensor
 from torchrl.data import Binary as BinarySpec
 from torchrl.data import Composite, TensorSpec, Unbounded
 
-from egoskin.compilation import can_compile
 from egoskin.kinematics import LinkKinematics, quat_to_entries
 from egoskin.robots import Primitive
 from egoskin.sensors.coverage import Coverage
@@ -191,14 +189,6 @@ class ProximitySensor(RowTransform):
         balls = [shape for shape in self.objects if isinstance(shape, Sphere)]
         if self._occluder is not None or len(balls) < len(self.objects):
             return
-        if not can_compile():
-            # Python shows one warning from one place once.
-            warnings.warn(
-                "no C++ compiler was found (install g++): sensor kernels run "
-                "uncompiled, with the same results",
-                stacklevel=3,
-            )
-            return
         own = {
             "sensors": self.num_sensors,
             "apart": self.per_object,
@@ -283,7 +273,7 @@ class ProximitySensor(RowTransform):
         position = _writable(position, shape, joint_pos)
         rotation = _writable(rotation, (*shape, 3), joint_pos)
         out = position, rotation
-        if self._kernels is not None and Kernels.can(joint_pos, *out):
+        if self._kernels is not None and self._kernels.can(joint_pos, *out):
             self._kernels.poses(joint_pos, *out)
             return out
         rotation, position = self._kinematics.link_frames(joint_pos)
@@ -383,7 +373,7 @@ class ProximitySensor(RowTransform):
         each = (objects,) if self.per_object else ()
         out = _writable(out, (*each, batch, *self.readings), inputs[0])
         detected = torch.zeros(inputs[3].shape, dtype=torch.bool, device=out.device)
-        if self._kernels is not None and Kernels.can(*inputs[:3]):
+        if self._kernels is not None and self._kernels.can(*inputs[:3]):
             self._kernels.measure(inputs, out, detected)
         else:
             rows = self._rows_in_reach(*inputs)
