@@ -74,7 +74,8 @@ def run_hash(run: Run) -> str:
     """Return a hash of a run's checkpoint and of its metrics but for times."""
     digest = hashlib.sha256()
     tensors, header = load_tensors(run.checkpoint_path)
-    del header["wall_s"]
+    # When and how long is no result; the metrics follow, without times.
+    del header["wall_s"], header["starts"], tensors["log/metrics"]
     digest.update(json.dumps(header, sort_keys=True).encode())
     for name in sorted(tensors):
         value = tensors[name].contiguous()
