@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 import pytorch_kinematics as pk
 
-from egoskin.chains import JOINT_TYPES, body_name, build_chain, joint_name
+from egoskin.chains import JOINT_TYPES, body_id, body_name, build_chain, joint_name
 
 ASSETS = Path(__file__).parent / "assets"
 
@@ -118,7 +118,7 @@ class RobotConfig:
     @cached_property
     def _bodies(self) -> list[int]:
         """The base, be it the world, and all that hangs on it, in MuJoCo's order."""
-        bodies = [self.model.body(self.base).id]
+        bodies = [body_id(self.model, self.base)]
         for body in range(bodies[0] + 1, self.model.nbody):
             if self.model.body_parentid[body] in bodies:
                 bodies.append(body)
