@@ -86,7 +86,7 @@ class LinkKinematics:
         self.links = tuple(links)
         joint_names = chain.get_joint_parameter_names()
         self.num_joints = len(joint_names)
-        joint_index = {name: i for i, name in enumerate(joint_names)}
+        joint_index = {str(name): i for i, name in enumerate(joint_names)}
         _check_different("joints", joint_names)
         frames = _frames(chain)
         _check_different("links", [frame.name for frame, _ in frames])
@@ -245,7 +245,7 @@ def _step(parent: int, frame: pk.Frame, joint_index: Mapping[str, int]) -> tuple
         along, skew = np.outer(axis, axis), np.cross(np.eye(3), axis)
     elif joint.joint_type == "prismatic":
         slide = turn @ axis
-    number = -1 if joint.joint_type == "fixed" else joint_index[joint.name]
+    number = -1 if joint.joint_type == "fixed" else joint_index[str(joint.name)]
     if number >= 0 and not np.isfinite(axis).all():
         raise ValueError(
             f"the axis of joint {joint.name!r} must have a direction; the robot's file "

@@ -549,7 +549,9 @@ def test_missing_normals_need_a_shape_with_a_surface_nearby(small_robot, load):
     robot = small_robot(SHAPES)
     content = f"{PLAIN}\n0,0,-0.4,0,0.1,/base"
     options = {"robot_name": "small", "links": robot.links}
-    with pytest.raises(ValueError, match=r"export:2: .* base has no shape to take"):
+    with pytest.raises(
+        ValueError, match=r"export:2: .* base has no primitive shape to "
+    ):
         load(content, **options, primitives=())
     # The centre of the sphere.
     with pytest.raises(ValueError, match="equally near all around"):

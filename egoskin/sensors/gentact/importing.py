@@ -104,12 +104,14 @@ def load_gentact(
         provenance["unused_link_map"] = list(names.unused)
     if problems.found:
         provenance["left_out"] = [error.what for error in problems.found]
-    arrays = ("position", "normal", "roll_deg", "radius")
     return Skin(
         robot=robot_name,
         links=tuple(link for skin in skins for link in skin.links),
+        position=np.concatenate([s.position for s in skins]),
+        normal=np.concatenate([s.normal for s in skins]),
+        roll_deg=np.concatenate([s.roll_deg for s in skins]),
+        radius=np.concatenate([s.radius for s in skins]),
         provenance=provenance,
-        **{name: np.concatenate([getattr(s, name) for s in skins]) for name in arrays},
     )
 
 
@@ -271,7 +273,7 @@ def _normal(sensor: Sensor, outward: np.ndarray) -> tuple[np.ndarray, bool]:
         length = float(np.linalg.norm(outward))
         if not length >= _SHORTEST:
             why = (
-                f"{sensor.link} has no shape to take it from"
+                f"{sensor.link} has no primitive shape to take it from"
                 if math.isnan(length)
                 else f"the surface of {sensor.link} is equally near all around"
             )
