@@ -39,6 +39,8 @@ from egoskin.sensors.gentact import load_gentact, save_gentact
 from egoskin.sensors.mesh_surface import Meshes, meshes_in_folder, meshes_of_mjcf
 from egoskin.sensors.placement import place_sensors
 
+# So many sensors take long enough to say so.
+_MANY = 10_000
 # Sensors farther from the robot than this are told of [m].
 _FAR_OFF = 0.15
 # The picture: size of each of its two views [px], and how normals are drawn [m].
@@ -105,6 +107,8 @@ class Place:
                     f"--density: the weight of {link} must be a number, got {weight!r}"
                 ) from None
         robot = ROBOTS[self.robot]
+        if self.num_sensors is None or self.num_sensors >= _MANY:
+            print("placing many sensors: this may take some minutes", flush=True)
         skin = place_sensors(
             robot,
             self.num_sensors,
