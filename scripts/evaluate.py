@@ -181,8 +181,9 @@ def main(args: list[str]) -> None:
     if sys.stderr.isatty():
         print("\r\x1b[K", end="", file=sys.stderr)
     title = (
-        f"{config.policy}: {policy.spec.frames:,} frames; bank {config.bank_seed} of "
-        f"{counted(config.episodes, 'episode')}, {config.throw} throw, physics at "
+        f"{config.policy}: {policy.policy_spec.frames:,} frames; bank "
+        f"{config.bank_seed} of {counted(config.episodes, 'episode')}, "
+        f"{config.throw} throw, physics at "
     )
     age = env_config.task.success_s
     print(table(result, title + physics_rate(env_config), age))
