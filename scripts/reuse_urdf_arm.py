@@ -19,6 +19,7 @@ import tyro
 from tensordict import TensorDict
 from torchrl.envs import Compose
 
+from egoskin.cli import clear_errors
 from egoskin.sensors import FieldSensor, Ray, RaySensor, Skin
 from egoskin.shapes import Sphere
 
@@ -89,8 +90,8 @@ def sensors(skin: Skin) -> Compose:
     beams = ("beams", "beams_detected")
     return Compose(
         [
-            FieldSensor(skin, chain, [BALL], RANGE),
-            RaySensor(skin, chain, [BALL], RANGE, Ray(), out_keys=beams),
+            FieldSensor(skin, chain, BALL, RANGE),
+            RaySensor(skin, chain, BALL, RANGE, Ray(), out_keys=beams),
         ]
     )
 
@@ -110,4 +111,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    with clear_errors():
+        tyro.cli(main)
