@@ -253,7 +253,7 @@ def main(args: list[str]) -> None:
     trained = policy.env_config.standard
     played = trained if config.standard == "run" else config.standard
     title = (
-        f"{config.policy}: {policy.spec.frames:,} frames on standard {trained}; "
+        f"{config.policy}: {policy.policy_spec.frames:,} frames on standard {trained}; "
         f"standard {played}, bank {config.bank_seed} of "
         f"{counted(config.episodes, 'episode')}"
     )
@@ -267,7 +267,7 @@ def main(args: list[str]) -> None:
         "standard": played,
         "trained_on": trained,
         "bank_seed": config.bank_seed,
-        "frames": policy.spec.frames,
+        "frames": policy.policy_spec.frames,
         "mask": config.masked,
     }
     if behaviour is not None:
