@@ -18,7 +18,14 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from egoskin.envs.throws import QUARTERS, Thrower, quarter_of
-from egoskin.evaluation import Estimate, Evaluation, evaluate, play_bank, wilson
+from egoskin.evaluation import (
+    Estimate,
+    Evaluation,
+    evaluate,
+    play_bank,
+    throw_seed,
+    wilson,
+)
 from egoskin.kinematics import LinkKinematics, rotate
 from egoskin.make import EnvConfig
 from egoskin.robots import RobotConfig
@@ -26,9 +33,12 @@ from egoskin.sensors import Skin
 
 # Ages at which it is read where the base is [s].
 _AGES = (1.0, 2.0, 3.0, 5.0)
+_NUMBERS = ("first", "second", "third", "later")
 # Bounds of the groups by height aimed at [m], by speed at arrival [m/s] and by time
 # since the throw before [s]: about a third of the standard throws in each.
 _HEIGHTS, _SPEEDS, _GAPS = (0.9, 1.2), (5.3, 6.7), (1.33, 1.67)
+# When a robot has settled from its start [s].
+_SETTLED = 0.5
 # A point of a foot this close to the floor stands on it [m] (contacts give way a
 # little, so zero is too strict).
 _ON_FLOOR = 0.005
@@ -88,12 +98,26 @@ class Motion:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Waiting:
+    """How a robot waits for the first throw: means over all steps from 0.5 s on."""
+
+    base_speed: float
+    """Planar speed of the base [m/s]."""
+    power: float
+    """Mechanical power of the joints [W]."""
+    fallen: float
+    """Share of the episodes that end before the first throw."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Behaviour:
     """What a policy does with a bank of throws, within 10 s."""
 
     throws: dict[str, list[Group]]
-    """Groups by direction, height aimed at, speed at arrival, time since the throw
-    before, link aimed at."""
+    """Groups by number of the ball, direction, height aimed at, speed at arrival, time
+    since the throw before, link aimed at."""
+    waiting: Waiting | None
+    """Before the first throw; None where that is at the start."""
     displacement: list[Displacement]
     """Way from the start."""
     motion: Motion
@@ -110,6 +134,7 @@ def behave(
     bank_seed: int,
     episodes: int,
     num_workers: int | None = None,
+    mask: Sequence[str] = (),
     on_step: Callable[[int, int], None] | None = None,
 ) -> tuple[Evaluation, Behaviour]:
     """Return how a policy fares on a bank of throws, and what it does there.
@@ -121,6 +146,7 @@ def behave(
         bank_seed: Seed of the bank.
         episodes: Size of the bank.
         num_workers: Physics threads; the result does not depend on it.
+        mask: Links whose sensors detect nothing, or `egoskin.make.MASK_ALL`.
         on_step: Called with (steps done, episodes still running).
     """
     bank: dict[str, Any] = {
@@ -129,10 +155,12 @@ def behave(
         "num_workers": num_workers,
     }
     seen, still = (Watcher(config, bank_seed, episodes) for _ in range(2))
-    result = evaluate(policy, config, skin, **bank, on_step=on_step, watch=seen)
+    watching: dict[str, Any] = {"mask": mask, "on_step": on_step, "watch": seen}
+    result = evaluate(policy, config, skin, **bank, **watching)
     play_bank(None, config, skin, **bank, watch=still)
     behaviour = Behaviour(
         throws=seen.groups(),
+        waiting=seen.waiting(),
         displacement=seen.displacement(),
         motion=seen.motion(),
         motion_zero_action=still.motion(),
@@ -153,23 +181,27 @@ class Watcher:
         task, robot = config.task, config.robot_config
         self._hz, self._balls = task.physics.control_hz, task.throws.num_balls
         self._limit = round(task.success_s * self._hz)
-        self._by_link = task.throws.aim == "body"
+        self._by_link = task.throws.aim != "box"
         self._thrower = Thrower(task.throws, robot, task.physics.timestep)
         shortest = max(1, round(task.throws.interval[0] * self._hz))
         count = 1 + task.episode_steps // shortest
         row = torch.arange(episodes).repeat_interleave(count)
         index = torch.arange(count).repeat(episodes)
         # The throws of each episode in turn, [N * K].
-        self._draw = self._thrower.draw(bank_seed, row, row * 0, index)
+        seed = throw_seed(config, bank_seed)
+        self._draw = self._thrower.draw(seed, row, row * 0, index)
         gap = (self._draw.interval * self._hz).round().long().clamp(min=1)
         gap = gap.reshape(episodes, count)
+        delay = self._thrower.first_delay(seed, row, row * 0).reshape(episodes, count)
         # Step at the end of which each ball is thrown, [N, K]: the draws' alone.
-        self._thrown = gap.cumsum(1) - gap
+        self._thrown = gap.cumsum(1) - gap + (delay * self._hz).round().long()
         self._arrived = torch.zeros(episodes, count, dtype=torch.bool)
         self._hit = self._arrived.clone()
         self._failed = torch.zeros(episodes, dtype=torch.bool)
         # Way and height at each age, of the episodes that last, [2, n].
         self._base: dict[float, Tensor] = {}
+        self._waited = self._fallen_waiting = 0
+        self._waiting_speed = self._waiting_power = 0.0
         self._feet = _Feet(robot)
         self._step = 0
         self._sums: dict[str, float] = {}
@@ -181,13 +213,16 @@ class Watcher:
         """See one step; the arguments are those of `egoskin.evaluation.Watch`."""
         self._step += 1
         ended = running & after["terminated"][:, 0]
-        if self._step <= self._limit:
-            self._failed |= ended
+        age = self._step - after["first_throw_step"][:, 0]
+        self._failed |= ended & (age <= self._limit)
         going = running & ~ended
-        for age in _AGES:
-            if self._step == round(age * self._hz):
+        self._fallen_waiting += int((ended & (age <= 0)).sum())
+        if self._step >= round(_SETTLED * self._hz):
+            self._see_waiting(after[going & (age <= 0)])
+        for moment in _AGES:
+            if self._step == round(moment * self._hz):
                 way = after["displacement_w"][going].square().sum(-1).sqrt()
-                self._base[age] = torch.stack((way, after["base_pose"][going, 2]))
+                self._base[moment] = torch.stack((way, after["base_pose"][going, 2]))
         self._see_balls(after, running)
         # A blow, a fall or a failed simulation is not how the policy moves.
         self._see_motion(before[going], after[going])
@@ -201,6 +236,22 @@ class Watcher:
             flown, throw = rows[throw >= 0], throw[throw >= 0]
             self._arrived[flown, throw] |= after["object_arrived"][flown, ball]
             self._hit[flown, throw] |= after["object_hit"][flown, ball]
+
+    def _see_waiting(self, after: TensorDictBase) -> None:
+        speed = after["base_lin_vel_w"][:, :2].square().sum(-1).sqrt()
+        self._waited += len(after)
+        self._waiting_speed += float(speed.double().sum())
+        self._waiting_power += float(after["power"].double().sum())
+
+    def waiting(self) -> Waiting | None:
+        """Return how the robot waited for the first throw."""
+        if not self._waited:
+            return None
+        return Waiting(
+            base_speed=self._waiting_speed / self._waited,
+            power=self._waiting_power / self._waited,
+            fallen=self._fallen_waiting / len(self._failed),
+        )
 
     def _see_motion(self, before: TensorDictBase, after: TensorDictBase) -> None:
         acceleration = (after["joint_vel"] - before["joint_vel"]) * self._hz
@@ -247,7 +298,11 @@ class Watcher:
     def groups(self) -> dict[str, list[Group]]:
         """Return how the throws of each kind fared."""
         height, speed = self._thrower.at_standing_robot(self._draw)
+        number = torch.arange(self._arrived.shape[1]).clamp(max=len(_NUMBERS) - 1)
         result = {
+            "number of the ball": self._split(
+                number.expand(self._arrived.shape), _NUMBERS
+            ),
             "direction": self._split(quarter_of(self._draw.azimuth), QUARTERS),
             "height aimed at": self._split(*_bands(height, _HEIGHTS, "m")),
             "speed at arrival": self._split(*_bands(speed, _SPEEDS, "m/s")),

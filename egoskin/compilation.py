@@ -1,18 +1,31 @@
-"""C++ where there is a compiler."""
+"""C++ where it can be compiled; what it computes, PyTorch does as well.
+
+Libraries are kept in a folder that belongs to the user alone, under the name of what
+they were compiled from and of their own content: one that was cut or changed is none.
+"""
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import functools
 import hashlib
+import logging
 import os
+import platform
 import shutil
+import stat
 import subprocess
 import tempfile
+from contextlib import suppress
+from multiprocessing import parent_process
 from pathlib import Path
 
 import torch
+
+SETTING = "EGOSKIN_COMPILE"
+"""Environment variable: 0 compiles nothing, for tests and measurements."""
+
+_log = logging.getLogger(__name__)
 
 # No -ffast-math: results are the same whoever computes them.
 _FLAGS = (
@@ -37,62 +50,117 @@ def can_compile() -> bool:
     return _compiler() is not None
 
 
+def load_library(source: Path) -> ctypes.CDLL | None:
+    """Return a C++ source as a library, compiled once on a machine, or None.
+
+    It is None where that fails, which is logged as one warning. A process of
+    `multiprocessing` takes what its parent has compiled, and neither compiles nor logs.
+
+    Args:
+        source: The file; it includes nothing of its own.
+    """
+    return None if os.environ.get(SETTING) == "0" else _loaded(source)
+
+
+@functools.cache
+def _loaded(source: Path) -> ctypes.CDLL | None:
+    """Return the library, or None, having said why."""
+    is_parent = parent_process() is None
+    try:
+        command, name = _recipe(source)
+        folder = _cache()
+        found = _find(folder, name)
+        if found is None and is_parent:
+            _log.warning("compiling %s: some seconds, once on a machine", source.name)
+            found = _keep(folder, name, _compile(command, source))
+    # Path.home() raises RuntimeError.
+    except (OSError, RuntimeError) as error:
+        found = None
+        if is_parent:
+            _log.warning(
+                "%s stays uncompiled: sensors are slower, with the same results (%s)",
+                *(source.name, error),
+            )
+    return found
+
+
 def _recipe(source: Path) -> tuple[list[str], str]:
-    """Return the command that compiles a source, and the name of the result."""
+    """Return the command that compiles a source, and a name for the two."""
     compiler = _compiler()
     if compiler is None:
         raise RuntimeError("no C++ compiler was found: install g++")
     vectors = _VECTORS.get(torch.backends.cpu.get_cpu_capability(), "")
     command = [compiler, *_FLAGS.split(), *vectors.split()]
-    code = source.read_bytes()
-    key = hashlib.sha256(" ".join(command).encode() + code).hexdigest()[:16]
-    return command, f"{source.stem}-{key}.so"
+    recipe = " ".join([platform.machine(), *command]).encode()
+    return command, f"{source.stem}-{_digest(recipe + source.read_bytes())}"
 
 
-def _cached(name: str) -> Path:
-    """Return where a library of this user is kept."""
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:32]
+
+
+def _cache() -> Path:
+    """Return the folder that libraries are kept in, which nobody else can write to."""
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(base) / "egoskin" / name
+    folder = Path(base) / "egoskin"
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    about = folder.lstat()
+    if not stat.S_ISDIR(about.st_mode) or about.st_uid != os.geteuid():
+        raise RuntimeError(
+            f"{folder} is no folder of this user: remove it, or set XDG_CACHE_HOME"
+        )
+    if about.st_mode & 0o077:
+        folder.chmod(0o700)
+    return folder
 
 
-def is_compiled(source: Path) -> bool:
-    """Whether `load_library` finds it compiled.
+def _find(folder: Path, name: str) -> ctypes.CDLL | None:
+    """Return the library that is kept by a name, if there is one and it is whole."""
+    for path in sorted(folder.glob(f"{name}-*.so")):
+        about = path.lstat()
+        own = stat.S_ISREG(about.st_mode) and about.st_uid == os.geteuid()
+        if own and path.name == _file_name(name, path.read_bytes()):
+            # One that was compiled for another system cannot be loaded.
+            with suppress(OSError):
+                return ctypes.CDLL(str(path))
+    return None
 
-    Raises:
-        RuntimeError: If there is no compiler.
-    """
-    return _cached(_recipe(source)[1]).exists()
+
+def _file_name(name: str, content: bytes) -> str:
+    return f"{name}-{_digest(content)}.so"
 
 
-@functools.cache
-def load_library(source: Path) -> ctypes.CDLL:
-    """Return a C++ source as a library, compiled for this machine once.
-
-    Args:
-        source: The file; it includes nothing of its own.
-
-    Raises:
-        RuntimeError: If there is no compiler, or it fails.
-    """
-    command, name = _recipe(source)
-    library = _cached(name)
-    if library.exists():
-        return ctypes.CDLL(str(library))
-    try:
-        library.parent.mkdir(parents=True, exist_ok=True)
-        folder = tempfile.TemporaryDirectory(dir=library.parent)
-    except OSError:
-        # Nothing can be kept here: compiled in each process.
-        folder = tempfile.TemporaryDirectory()
-    with folder as path:
-        made = Path(path) / name
+def _compile(command: list[str], source: Path) -> bytes:
+    """Return the content of the library."""
+    with tempfile.TemporaryDirectory() as folder:
+        made = Path(folder) / "made.so"
+        command = [*command, str(source), "-o", str(made)]
         ended = subprocess.run(
-            [*command, str(source), "-o", str(made)], capture_output=True, text=True
+            command, capture_output=True, text=True, errors="replace"
         )
         if ended.returncode:
-            raise RuntimeError(f"{' '.join(command)} {source}: {ended.stderr.strip()}")
-        loaded = ctypes.CDLL(str(made))
-        # Whole or not at all: other processes may be compiling the same.
-        with contextlib.suppress(OSError):
-            os.replace(made, library)
-    return loaded
+            lines = ended.stderr.splitlines() or [f"exit status {ended.returncode}"]
+            told = next((line for line in lines if "error" in line), lines[-1])
+            raise RuntimeError(f"{command[0]}: {told.strip()}")
+        return made.read_bytes()
+
+
+def _keep(folder: Path, name: str, content: bytes) -> ctypes.CDLL:
+    """Keep a library, whole or not at all, and return it."""
+    path = folder / _file_name(name, content)
+    descriptor, partial = tempfile.mkstemp(dir=folder)
+    try:
+        with open(descriptor, "wb") as file:
+            file.write(content)
+        os.replace(partial, path)
+    except BaseException as error:
+        os.unlink(partial)
+        if isinstance(error, OSError):
+            # The system's own text of a full disk names no file.
+            raise OSError(error.errno, error.strerror, str(path)) from error
+        raise
+    try:
+        return ctypes.CDLL(str(path))
+    except OSError:
+        path.unlink()
+        raise

@@ -79,6 +79,31 @@ def held_out(seed: int) -> int:
     return seed | _HELD_OUT
 
 
+def offset_seed(seed: int, offset: int) -> int:
+    """Return another seed, held out where this one is.
+
+    Args:
+        seed: A seed, or what `held_out` returned.
+        offset: How far away, modulo 2**32; 0 is the same seed.
+    """
+    return ((seed + offset) & _MASK) | (seed & _HELD_OUT)
+
+
+def stream_key(seed: int, stream: Stream) -> tuple[int, int]:
+    """Return the two words of the generator's key.
+
+    Args:
+        seed: A seed in [0, 2**32), or what `held_out` returned.
+        stream: Purpose of the draws.
+
+    Raises:
+        ValueError: If the seed is neither.
+    """
+    own = seed & ~_HELD_OUT
+    check_seed(own)
+    return own, int(stream) | (_HELD_OUT_KEY if seed & _HELD_OUT else 0)
+
+
 def random_words(
     seed: int,
     stream: Stream,
@@ -104,11 +129,8 @@ def random_words(
     Raises:
         ValueError: If the seed is not a 32-bit unsigned integer.
     """
-    own = seed & ~_HELD_OUT
-    check_seed(own)
     words = torch.stack((row, episode, counter, block))
-    key = int(stream) | (_HELD_OUT_KEY if seed & _HELD_OUT else 0)
-    return philox(words & _MASK, (own, key))
+    return philox(words & _MASK, stream_key(seed, stream))
 
 
 def uniform(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Literal
@@ -19,7 +20,8 @@ from torchrl.envs import (
 
 from egoskin.checkpoint import part, prefixed
 from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
-from egoskin.observations import Numb, Oracle, Privileged, Proprioception
+from egoskin.envs.standards import standard_of
+from egoskin.observations import HideObjects, Oracle, Privileged, Proprioception
 from egoskin.robots import ROBOTS, RobotConfig, RobotName
 from egoskin.sensors import History, Skin
 from egoskin.sensors.config import SensorConfig, SkinConfig
@@ -45,6 +47,8 @@ _RAW_KEYS = (
     "object_hit",
     "object_arrived",
 )
+MASK_ALL = ("all",)
+"""Mask of all sensors, and of what an oracle is told."""
 # What the networks read of the transforms' results; the others stay as well.
 _NETWORK_KEYS = ("observation", "privileged_observation", "signal")
 
@@ -80,6 +84,11 @@ class EnvConfig:
         return ROBOTS[self.robot]
 
     @property
+    def standard(self) -> str:
+        """Version of the standard throw that it trains on, "custom" if none."""
+        return standard_of(self.task)
+
+    @property
     def actor_keys(self) -> list[str]:
         """Keys the actor reads."""
         blind = self.sensor.coverage == "none"
@@ -103,7 +112,7 @@ def make_worker_env(
     keep_raw: bool = False,
     bare: bool = False,
     sparse: bool = False,
-    compile_kernels: bool = False,
+    mask: Sequence[str] = (),
 ) -> TransformedEnv:
     """Return the batched environment of one process, with its transforms.
 
@@ -120,7 +129,7 @@ def make_worker_env(
             cost).
         sparse: Whether to give the state that the sensors read, for the agent's own
             sources, instead of the signal.
-        compile_kernels: Whether to compile the sensors; results are the same.
+        mask: Links whose sensors detect nothing, or `MASK_ALL`.
     """
     robot = config.robot_config
     env = DodgeballEnv(
@@ -150,8 +159,8 @@ def make_worker_env(
                 throws.gravity,
             ),
         ]
-        if config.sensor.numb:
-            transforms.append(Numb())
+        if mask == MASK_ALL:
+            transforms.append(HideObjects())
         if not sparse:
             transforms += config.sensor.transforms(
                 robot,
@@ -161,7 +170,7 @@ def make_worker_env(
                 seed=seed,
                 row_offset=row_offset,
                 out_key=f"signal{suffix}",
-                compile_kernels=compile_kernels,
+                masked=masked_sensors(skin, mask),
             )
         if config.sensor.coverage == "oracle":
             transforms.append(Oracle(out_keys=[f"signal{suffix}"]))
@@ -175,6 +184,27 @@ def make_worker_env(
         unread = [key for key in _RAW_KEYS if not (sparse and key in STATE_KEYS)]
         transforms.append(ExcludeTransform(*unread, *between))
     return TransformedEnv(env, Compose(transforms))
+
+
+def masked_sensors(skin: Skin, mask: Sequence[str]) -> list[int]:
+    """Return the indices of the sensors on masked links, all with `MASK_ALL`."""
+    return [i for i, name in enumerate(skin.links) if mask == MASK_ALL or name in mask]
+
+
+def check_mask(config: EnvConfig, skin: Skin, mask: Sequence[str]) -> None:
+    """Raise ValueError for a mask that masks nothing; the text lists what does."""
+    if not mask:
+        return
+    if config.sensor.coverage == "none":
+        raise ValueError("a blind robot has no sensors to mask")
+    if mask == MASK_ALL:
+        return
+    links = sorted(set(skin.links)) if config.sensor.uses_skin else []
+    for name in mask:
+        if name not in links:
+            raise ValueError(
+                f"mask: no sensor on {name!r}; links with sensors: {', '.join(links)}"
+            )
 
 
 def _state_keys(transform: Transform) -> list[NestedKey]:
@@ -194,7 +224,7 @@ def make_env(
     hold: bool = False,
     bare: bool = False,
     sparse: bool = False,
-    compile_kernels: bool = False,
+    mask: Sequence[str] = (),
 ) -> WorkerPool:
     """Return a ParallelEnv of ``num_workers`` processes, ``[W, num_envs / W]`` rows.
 
@@ -209,7 +239,7 @@ def make_env(
         hold: Whether the robots are held rigid in their default pose.
         bare: Whether to leave out observations and sensors.
         sparse: Whether to give the state instead of the signal, see `make_worker_env`.
-        compile_kernels: Whether to compile the sensors; results are the same.
+        mask: Links whose sensors detect nothing, or `MASK_ALL`.
 
     Raises:
         ValueError: If the workers do not divide the agents.
@@ -229,7 +259,7 @@ def make_env(
                 hold=hold,
                 bare=bare,
                 sparse=sparse,
-                compile_kernels=compile_kernels,
+                mask=mask,
             )
             for i in range(workers)
         ]

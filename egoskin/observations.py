@@ -130,8 +130,8 @@ def approaches_b(
     return (torch.cat((nearness, passing), -1) * flag).flatten(1)
 
 
-class Numb(RowTransform):
-    """Hides all objects from the transforms after it.
+class HideObjects(RowTransform):
+    """Hides all objects from the transforms after it: masks every sensor.
 
     Reads ``object_active [*B, O]`` and writes it again, false.
 

@@ -16,6 +16,7 @@ from torch import Tensor
 from torchrl.envs import Compose, TransformedEnv
 
 from egoskin.envs.dodgeball import DodgeballEnv
+from egoskin.evaluation import throw_seed
 from egoskin.make import EnvConfig, default_num_workers, make_worker_env
 from egoskin.policies import Policy
 from egoskin.sensors import Skin
@@ -143,7 +144,7 @@ def find_ceiling(
             "a ceiling is searched with ideal sensors, but the policy's have "
             f"corruption={config.sensor.corruption}"
         )
-    hz = config.task.physics.control_hz
+    hz, seed = config.task.physics.control_hz, throw_seed(config, bank_seed)
     if (steps := round(search.stand_s * hz)) < 1:
         raise ValueError(
             f"stand_s must be at least one control step, got {search.stand_s}"
@@ -158,7 +159,7 @@ def find_ceiling(
             config,
             policy.skin,
             num_envs=rows,
-            seed=bank_seed,
+            seed=seed,
             num_threads=default_num_workers(rows),
             keep_raw=True,
         )
@@ -205,7 +206,7 @@ def find_ceiling(
     thrower = _task(env).thrower
     zero = torch.zeros_like(start.throw)
     height, _ = thrower.at_standing_robot(
-        thrower.draw(bank_seed, start.throw, zero, zero + ball - 1)
+        thrower.draw(seed, start.throw, zero, zero + ball - 1)
     )
     return Ceiling(height=height, policy=own, best=best)
 
@@ -236,7 +237,7 @@ def _until_in_reach(
     simulation = _task(env).simulation_state()
     waiting = torch.ones(throws, dtype=torch.bool)
     started = ~waiting
-    for _ in range(config.task.episode_steps):
+    for _ in range(config.task.delay_steps + config.task.episode_steps):
         now = _task(env).simulation_state()
         last = now["throw"] == ball
         if (now["next_throw_step"][last] < _NEVER).any():

@@ -95,6 +95,7 @@ class PolicySpec:
     def header(self) -> dict[str, Any]:
         """Return the specification as JSON values."""
         return {
+            "standard": self.env.standard,
             "env": to_plain(self.env),
             "skin": self.skin.to_dict(),
             "network": to_plain(self.network),
@@ -133,21 +134,18 @@ class PolicySpec:
         )
 
 
-def sparse_sources(
-    config: EnvConfig, skin: Skin, compile_kernels: bool = False
-) -> dict[str, SparseSource]:
+def sparse_sources(config: EnvConfig, skin: Skin) -> dict[str, SparseSource]:
     """Return what computes the keys that are better learnt from as sparse rows.
 
     Args:
         config: What the environment is made of.
         skin: The sensors.
-        compile_kernels: Whether to compile the sensors; results are the same.
     """
     if config.history > 1:
         return {}
     balls = config.task.throws.balls
     robot = config.robot_config
-    rays = config.sensor.sparse_rays(robot, skin, balls, compile_kernels)
+    rays = config.sensor.sparse_rays(robot, skin, balls)
     return {} if rays is None else {"signal": rays}
 
 

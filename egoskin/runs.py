@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import argparse
 import csv
-import dataclasses
 import datetime
 import fcntl
 import io
@@ -33,7 +32,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import numpy as np
 import torch
@@ -49,8 +48,9 @@ from egoskin.checkpoint import (
     write_file,
 )
 from egoskin.cli import check_counts
-from egoskin.compilation import can_compile
 from egoskin.draws import check_seed
+from egoskin.envs.dodgeball import DodgeballConfig
+from egoskin.envs.standards import Standard, training_task
 from egoskin.events import EventFile
 from egoskin.files import read_regular
 from egoskin.formats import (
@@ -79,6 +79,9 @@ class TrainConfig:
     """Robot, task, skin, sensors."""
     ppo: PPOConfig = field(default_factory=PPOConfig)
     """Networks and PPO."""
+    standard: Standard | None = None
+    """Version of the standard throw: sets throws and ends. None: 2, the defaults. A
+    throw or end given beside it makes the task custom."""
     seed: int = 0
     """Seed of everything random: throws, starts, networks, actions."""
     total_frames: int = 65_536_000
@@ -97,13 +100,9 @@ class TrainConfig:
     """Environment steps between the policies kept for learning curves."""
     checkpoint_interval: float = 60.0
     """A checkpoint is at most this old [s]."""
-    compile_kernels: bool | None = None
-    """Compute the sensors in C++, compiled in seconds at the first start on a machine,
-    with the same results; None: where there is a C++ compiler."""
     resume: Path | None = None
     """Run folder to go on with; changed may be --total-frames, to a later end, and what
-    changes no result: workers, threads, compiling, when checkpoints and policies are
-    kept."""
+    changes no result: workers, threads, when checkpoints and policies are kept."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for values with which no run can start."""
@@ -133,13 +132,8 @@ class TrainConfig:
         return self.learner_threads or available_cores()
 
     def check_machine(self) -> None:
-        """Raise ValueError for what this machine lacks: the device, a C++ compiler."""
+        """Raise ValueError for what this machine lacks: the device."""
         self.learner_device()
-        if self.compile_kernels and not can_compile():
-            raise ValueError(
-                "the run compiles its kernels (compile_kernels), but there is no "
-                "C++ compiler here: install g++"
-            )
 
     def learner_device(self) -> torch.device:
         """Return the device of the learner.
@@ -162,22 +156,20 @@ class TrainConfig:
         return device
 
 
+# What a run's stored configuration leaves out: it says how a run was called.
+_CALL_FIELDS = ("run_dir", "resume", "standard")
 MACHINE_FIELDS = frozenset(
     (
+        *_CALL_FIELDS,
         "num_workers",
         "learner_threads",
-        "compile_kernels",
         "snapshot_frames",
         "checkpoint_interval",
-        "run_dir",
-        "resume",
     )
 )
-"""Fields that say where a run is computed and what is kept of it: they change no
-result, to the last bit, and may change at a resume. The device is none of them: sums
-on another one round otherwise."""
-# What a run's stored configuration leaves out: it says how a run was called.
-_CALL_FIELDS = ("run_dir", "resume")
+"""Fields that say how a run was called, where it is computed and what is kept of it:
+they change no result, to the last bit, and may change at a resume. The device is none
+of them: sums on another one round otherwise."""
 SKIN_HASH = "skin_sha256"
 """What config.json holds beside the configuration: the hash of the skin."""
 # Where a checkpoint keeps the metrics.
@@ -199,9 +191,16 @@ def parse_config(args: list[str]) -> TrainConfig:
     """
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     first.add_argument("--resume", type=Path)
+    first.add_argument("--standard")
     run, _ = first.parse_known_args(args)
     if run.resume is None or str(run.resume) == "None":
-        return tyro.cli(TrainConfig, args=args)
+        if run.standard not in get_args(Standard):
+            return tyro.cli(TrainConfig, args=args)
+        task = training_task(run.standard, DodgeballConfig())
+        default = TrainConfig(env=EnvConfig(task=task))
+        return tyro.cli(TrainConfig, args=args, default=default)
+    if run.standard is not None:
+        raise ValueError("--standard cannot be changed on resume")
     stored = Run.open(run.resume).config
     # What the file lacks was filled with today's defaults.
     file, before = run.resume / "config.json", to_plain(stored)
@@ -282,8 +281,6 @@ class Run:
                 f"{path} exists already; choose another --run-dir"
                 + f", or go on with it by --resume {path}" * go_on
             )
-        if config.compile_kernels is None:
-            config = dataclasses.replace(config, compile_kernels=can_compile())
         (path / "policies").mkdir(parents=True)
         run = cls(path, config)
         skin.save(run.skin_path)

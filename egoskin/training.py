@@ -242,8 +242,7 @@ def open_trainer(run: Run, num_threads: int = 1) -> Iterator[Trainer]:
         checkpoint = None if run.is_new() else run.load_checkpoint()
         # It imports while the rest is made.
         start_server()
-        compile_kernels = bool(config.compile_kernels)
-        sources = sparse_sources(config.env, skin, compile_kernels)
+        sources = sparse_sources(config.env, skin)
         env = make_env(
             config.env,
             skin,
@@ -252,7 +251,6 @@ def open_trainer(run: Run, num_threads: int = 1) -> Iterator[Trainer]:
             num_workers=config.num_workers,
             num_threads=num_threads,
             sparse=bool(sources),
-            compile_kernels=compile_kernels,
         )
         try:
             trainer = Trainer(run, env, skin, sources)

@@ -34,17 +34,21 @@ from threading import Event, Thread
 from typing import NoReturn, TypeVar
 
 import torch
+import torchrl._utils
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase, ParallelEnv, Transform, TransformedEnv
-
-from egoskin import watchdog
-from egoskin.watchdog import Watch
 
 # How long the parent sleeps between looks at its workers: first this share of the time
 # that the last step took, then at least this [s], and this share of the time it has
 # waited since. That adds as much to a step; more looks take CPU from the workers.
 _SURE_SHARE, _POLL, _POLL_SHARE = 0.75, 2e-4, 0.01
+# How often the parent looks at what its workers do [s].
+_LOOK = 0.2
+# A worker without an answer for this long hangs [s]. Long, because one that computes,
+# compiles or waits for a core looks the same. It is counted in looks: while all are
+# suspended (SIGSTOP, a closed laptop) there are none.
+HANG_LIMIT = 600.0
 # The server tells of a death soon after the channel of the dead closes [s].
 _DEATH_NOTICE = 5.0
 
@@ -146,6 +150,8 @@ class _Build:
         if in_worker:
             keep_freed_memory()
             Thread(target=_end_with_parent, daemon=True).start()
+            # It ends with its parent, not after 10,000 s without a command.
+            torchrl._utils.BATCHED_PIPE_TIMEOUT = None
         with _reported(self._report):
             env = self._build()
             assert isinstance(env, TransformedEnv)
@@ -193,7 +199,7 @@ def _temporary_folder() -> str:
     """
     folder = util.get_temp_dir()
     script = 'trap "" INT TERM HUP; read -r line || rm -rf -- "$0"'
-    command = ["sh", "-c", script, folder]
+    command = ["/bin/sh", "-c", script, folder]
     # In a session of its own: a SIGKILL may go to the whole group.
     shell = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)
     atexit.register(shell.communicate, b"\n")
@@ -293,7 +299,7 @@ class WorkerPool(ParallelEnv):
         start_server()
         self._reports.mkdir(exist_ok=True)
         started = Event()
-        self._workers, self._hung, self._halves = [], {}, []
+        self._workers, self._hung, self._halves = [], set[int](), []
         # The halves share this list.
         self._failures: list[str] = []
         watch = Thread(target=self._watch_start, args=(started,), daemon=True)
@@ -306,16 +312,14 @@ class WorkerPool(ParallelEnv):
 
     def _watch_start(self, started: Event) -> None:
         """Kill workers that hang while they start: the parent blocks on a channel."""
-        watches: dict[int, Watch] = {}
-        while not started.wait(watchdog.INTERVAL):
-            for worker, process in enumerate(list(self._workers)):
-                if _ready(self._report(worker)).exists():
-                    continue
-                watch = watches.setdefault(worker, Watch(process.pid))
-                watch.look()
-                if watch.hangs(watchdog.LIMIT):
-                    self._hung[worker] = watch.describe()
-                    process.kill()
+        looks = 0
+        while not started.wait(_LOOK):
+            looks += 1
+            if looks * _LOOK > HANG_LIMIT:
+                for worker, process in enumerate(list(self._workers)):
+                    if not _ready(self._report(worker)).exists():
+                        self._hung.add(worker)
+                        process.kill()
 
     def _cleanup_failed_worker_startup(self) -> None:
         """Raise; TorchRL calls this when a worker has ended while it was started."""
@@ -325,7 +329,7 @@ class WorkerPool(ParallelEnv):
         """Sleep until the workers have set their flags; raise if one cannot."""
         workers, flags = list(workers_range), self._shm_done_flags
         indices, begin = self._worker_indices, time.monotonic()
-        time.sleep(min(_SURE_SHARE * self._last_step, watchdog.INTERVAL))
+        time.sleep(min(_SURE_SHARE * self._last_step, _LOOK))
         self._wait(workers, lambda worker: bool(flags[indices[worker]]))
         self._last_step = time.monotonic() - begin
         for worker in workers:
@@ -333,21 +337,20 @@ class WorkerPool(ParallelEnv):
 
     def _wait(self, workers: Iterable[int], answered: Callable[[int], bool]) -> None:
         """Sleep until the workers have answered a command; raise if one cannot."""
-        watches = {worker: Watch(self._workers[worker].pid) for worker in workers}
+        waiting, looks = list(workers), 0
         begin = looked = time.monotonic()
-        while watches := {i: w for i, w in watches.items() if not answered(i)}:
+        while waiting := [worker for worker in waiting if not answered(worker)]:
             if self._failures:
                 raise WorkerError(self._failures[0])
             now = time.monotonic()
-            if now - looked > watchdog.INTERVAL:
-                looked = now
-                for worker, watch in watches.items():
+            if now - looked > _LOOK:
+                looked, looks = now, looks + 1
+                for worker in waiting:
                     if not self._workers[worker].is_alive() and not answered(worker):
                         self._fail(worker, self._death(worker))
-                    watch.look()
-                    if watch.hangs(watchdog.LIMIT):
-                        self._fail(worker, f"hung: {watch.describe()}")
-            time.sleep(min(max(_POLL, _POLL_SHARE * (now - begin)), watchdog.INTERVAL))
+                if looks * _LOOK > HANG_LIMIT:
+                    self._fail(waiting[0], f"hung: no answer in {HANG_LIMIT:g} s")
+            time.sleep(min(max(_POLL, _POLL_SHARE * (now - begin)), _LOOK))
 
     @contextmanager
     def _death_explained(self) -> Iterator[None]:
@@ -375,7 +378,7 @@ class WorkerPool(ParallelEnv):
     def _death(self, worker: int) -> str:
         number = self._worker_indices[worker]
         if number in self._hung:
-            return f"hung while it started: {self._hung[number]}"
+            return f"hung while it started: no answer in {HANG_LIMIT:g} s"
         report = self._report(number)
         if report.exists():
             return f"raised\n{report.read_text()}"

@@ -4,13 +4,16 @@ python scripts/evaluate.py runs/NAME
 python scripts/evaluate.py localization
 python scripts/evaluate.py runs/NAME/policies/000005046272.safetensors --json out.json
 python scripts/evaluate.py runs/NAME --behaviour --check-substeps 8
+python scripts/evaluate.py runs/NAME --mask
 """
 
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import json
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,9 +25,15 @@ from egoskin.behaviour import Behaviour, Motion, behave
 from egoskin.cli import check_counts, check_output, clear_errors, counted
 from egoskin.draws import check_seed
 from egoskin.evaluation import Estimate, Evaluation, evaluate, standard_task
-from egoskin.make import EnvConfig, check_num_workers
+from egoskin.film import check_path
+from egoskin.make import MASK_ALL, EnvConfig, check_mask, check_num_workers
+from egoskin.operating_map import draw_map, operating_map
 from egoskin.policies import load_policy
 from egoskin.report import metres
+
+PICTURE_SUFFIXES = (".png", ".svg", ".pdf")
+# In a file a line of progress is written this often [s].
+_FILE_INTERVAL = 10.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,9 +47,12 @@ class EvaluateConfig:
     """Seed of the bank of throws."""
     episodes: int = 1024
     """Throw sequences in the bank."""
-    throw: Literal["standard", "run"] = "standard"
-    """The standard throw and ends of an episode whatever the run trained on, or the
-    run's own."""
+    standard: Literal["2", "1", "paper", "run"] = "2"
+    """Version of the standard throw to judge by, whatever the policy was trained on;
+    run: the throws and ends of its training."""
+    mask: tuple[str, ...] | None = None
+    """Links whose sensors detect nothing; alone: all sensors. What is left of the
+    success is not owed to them."""
     num_workers: int | None = None
     """Processes that simulate; None: the largest divisor of episodes <= cores."""
     behaviour: bool = False
@@ -48,18 +60,34 @@ class EvaluateConfig:
     check_substeps: int | None = None
     """Play the bank once more with this many physics steps in each control step, and
     say what is lost (8: 480 Hz)."""
-    numb: bool = False
-    """Play the bank once more with sensors that are told of no ball, and say what is
-    lost: the rest is done blindly."""
+    map: Path | None = None
+    """Picture to draw of success against speed, tempo, height and direction of the
+    throws, within and beyond what is trained on (a quarter of the episodes each)."""
     json: Path | None = None
     """File to write the figures to."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for values with which nothing can be played."""
         check_seed(self.bank_seed, "bank_seed")
-        check_counts(self, "check_substeps")
+        check_counts(self, "episodes", "check_substeps")
         check_num_workers(self.episodes, self.num_workers, "episodes")
         check_output(self.json, "--json")
+        if self.map is not None:
+            check_path(self.map, PICTURE_SUFFIXES)
+            check_matplotlib()
+
+    @property
+    def masked(self) -> tuple[str, ...]:
+        """The mask as `egoskin.evaluation` takes it."""
+        if self.mask is None:
+            return ()
+        return self.mask or MASK_ALL
+
+
+def check_matplotlib() -> None:
+    """Raise ValueError if the map's picture cannot be drawn here."""
+    if importlib.util.find_spec("matplotlib") is None:
+        raise ValueError("--map needs matplotlib: `pip install 'egoskin[plot]'`")
 
 
 def share(value: float | None) -> str:
@@ -82,6 +110,7 @@ def table(result: Evaluation, title: str, age: float) -> str:
     }
     rows = [
         (f"success (no contact for {age:g} s)", interval(result.success, 100, "%")),
+        ("  no contact for 5 s", interval(result.success_5s, 100, "%")),
         ("  same bank, robot held rigid", share(result.rigid_success)),
         ("survival time (at most 10 s)", interval(result.survival_time, 1, "s")),
         *((f"ended within {age:g} s by {how}", share(x)) for how, x in ends.items()),
@@ -104,6 +133,15 @@ def behaviour_table(result: Behaviour) -> str:
                 f"{share(group.first_hits)}    {share(group.later_hits)} "
                 f"{group.later_balls:4}"
             )
+    if result.waiting is not None:
+        waiting = result.waiting
+        lines += [
+            "",
+            "  before the first throw, from 0.5 s on",
+            f"    base speed       {waiting.base_speed:7.3f} m/s",
+            f"    mechanical power {waiting.power:7.1f} W",
+            f"    fallen           {share(waiting.fallen)}",
+        ]
     lines += ["", "  way from the start     mean   a tenth exceeds  base height     of"]
     for way in result.displacement:
         lines.append(
@@ -141,63 +179,113 @@ def physics_rate(config: EnvConfig) -> str:
     return f"{1 / config.task.physics.timestep:g} Hz"
 
 
+class Progress:
+    """Says on stderr how far the episodes are, in a terminal or in a file.
+
+    Args:
+        hz: Control steps in a second.
+    """
+
+    def __init__(self, hz: float) -> None:
+        self._hz, self._shown = hz, 0.0
+        self._live = sys.stderr.isatty()
+
+    def __call__(self, step: int, running: int) -> None:
+        """Show one step; the arguments are those of ``on_step``."""
+        self._show(f"{step / self._hz:5.2f} s played, {running} still running")
+
+    def points(self, done: int, total: int) -> None:
+        """Show how many points of a map are done."""
+        self._show(f"map: {done} of {total} points")
+
+    def _show(self, text: str) -> None:
+        now = time.monotonic()
+        if not self._live and now - self._shown < _FILE_INTERVAL:
+            return
+        self._shown = now
+        start, end = ("\r", "\x1b[K") if self._live else ("", "\n")
+        print(f"{start}{text}{end}", end="", file=sys.stderr, flush=True)
+
+    def finish(self) -> None:
+        """Leave the line."""
+        if self._live:
+            print("\r\x1b[K", end="", file=sys.stderr)
+
+
 def main(args: list[str]) -> None:
     """Run the command."""
     config = tyro.cli(EvaluateConfig, args=args)
     policy = load_policy(config.policy)
     env_config = policy.env_config
-    if config.throw == "standard":
-        env_config = standard_task(env_config)
-
-    def show(step: int, running: int) -> None:
-        if sys.stderr.isatty():
-            text = f"\r{step / env_config.task.physics.control_hz:5.2f} s, "
-            print(f"{text}{running} still running \x1b[K", end="", file=sys.stderr)
-
+    if config.standard != "run":
+        env_config = standard_task(env_config, config.standard)
+    check_mask(env_config, policy.skin, config.masked)
+    print(
+        f"playing {counted(config.episodes, 'episode')} of {config.policy}",
+        file=sys.stderr,
+        flush=True,
+    )
+    progress = Progress(env_config.task.physics.control_hz)
     bank: dict[str, Any] = {
         "bank_seed": config.bank_seed,
         "episodes": config.episodes,
         "num_workers": config.num_workers,
-        "on_step": show,
+        "mask": config.masked,
+        "on_step": progress,
     }
-    behaviour = None
+    behaviour = checked = None
+    substeps = config.check_substeps or env_config.task.physics.substeps
+    finer = with_substeps(env_config, substeps)
     if config.behaviour:
         result, behaviour = behave(policy, env_config, policy.skin, **bank)
     else:
         result = evaluate(policy, env_config, policy.skin, **bank)
-    # Under each one's name: what is changed, and how the success lost by it is called.
-    changes: dict[str, tuple[EnvConfig, str]] = {}
     if config.check_substeps is not None:
-        changed = with_substeps(env_config, config.check_substeps)
-        changes["checked"] = changed, "by the other physics rate"
-    if config.numb:
-        sensor = dataclasses.replace(env_config.sensor, numb=True)
-        changed = dataclasses.replace(env_config, sensor=sensor)
-        changes["numb"] = changed, "without what the sensors tell"
-    again = {
-        name: evaluate(policy, changed, policy.skin, **bank)
-        for name, (changed, _) in changes.items()
-    }
-    if sys.stderr.isatty():
-        print("\r\x1b[K", end="", file=sys.stderr)
+        checked = evaluate(policy, finer, policy.skin, **bank)
+    progress.finish()
+    trained = policy.env_config.standard
+    played = trained if config.standard == "run" else config.standard
     title = (
-        f"{config.policy}: {policy.spec.frames:,} frames; bank {config.bank_seed} of "
-        f"{counted(config.episodes, 'episode')}, {config.throw} throw, physics at "
+        f"{config.policy}: {policy.spec.frames:,} frames on standard {trained}; "
+        f"standard {played}, bank {config.bank_seed} of "
+        f"{counted(config.episodes, 'episode')}"
     )
+    if config.masked:
+        title += f", sensors masked: {', '.join(config.masked)}"
+    title += ", physics at "
     age = env_config.task.success_s
     print(table(result, title + physics_rate(env_config), age))
-    content = dataclasses.asdict(result)
+    content = {
+        **dataclasses.asdict(result),
+        "standard": played,
+        "trained_on": trained,
+        "bank_seed": config.bank_seed,
+        "frames": policy.spec.frames,
+        "mask": config.masked,
+    }
     if behaviour is not None:
         print(behaviour_table(behaviour))
         content["behaviour"] = dataclasses.asdict(behaviour)
-    if config.check_substeps is not None:
+    if checked is not None:
+        print("\n" + table(checked, title + physics_rate(finer), age))
+        lost = 100 * (result.success.mean - checked.success.mean)
+        print(f"  success lost by the other physics rate: {lost:.2f} points")
         content["check_substeps"] = config.check_substeps
-    for name, (changed, how) in changes.items():
-        rate = physics_rate(changed) + ", sensors numb" * changed.sensor.numb
-        print("\n" + table(again[name], title + rate, age))
-        lost = 100 * (result.success.mean - again[name].success.mean)
-        print(f"  success lost {how}: {lost:.2f} points")
-        content[name] = dataclasses.asdict(again[name])
+        content["checked"] = dataclasses.asdict(checked)
+    if config.map is not None:
+        lines = operating_map(
+            policy,
+            env_config,
+            policy.skin,
+            bank_seed=config.bank_seed,
+            episodes=max(config.episodes // 4, 1),
+            mask=config.masked,
+            on_point=progress.points,
+        )
+        progress.finish()
+        draw_map(config.map, lines, title.removesuffix(", physics at "))
+        content["map"] = [dataclasses.asdict(line) for line in lines]
+        print(f"\n{config.map}: success against speed, tempo, height and direction")
     if config.json is not None:
         config.json.write_text(json.dumps(content, indent=2) + "\n")
 

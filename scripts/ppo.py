@@ -17,11 +17,9 @@ from types import FrameType
 
 from egoskin.agents.ppo import NonFiniteError
 from egoskin.cli import clear_errors, counted
-from egoskin.compilation import is_compiled
 from egoskin.make import check_num_workers
 from egoskin.progress import ProgressLine
 from egoskin.runs import Run, parse_config
-from egoskin.sensors.kernels import SOURCE
 from egoskin.training import open_trainer, train
 from egoskin.workers import WorkerError
 
@@ -52,9 +50,6 @@ def main(args: list[str]) -> None:
         f"{counted(workers, 'worker')}, learner on {config.device} with "
         f"{counted(config.num_learner_threads, 'thread')}"
     )
-    compiles = run.config.compile_kernels and run.config.env.sensor.uses_skin
-    if compiles and not is_compiled(SOURCE):
-        print("compiling the sensor kernels: some seconds, once on a machine")
     stop = Stop()
     rollouts = math.ceil(config.total_frames / config.frames_per_batch)
     try:

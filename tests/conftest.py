@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import torch
 from hypothesis import settings
 from tensordict import TensorDict
 
+from egoskin import compilation
 from egoskin.robots import H1_2, RobotConfig
 from egoskin.sensors import Skin, place_sensors
 
@@ -19,6 +21,10 @@ settings.register_profile(
     "egoskin", deadline=None, derandomize=True, max_examples=50, database=None
 )
 settings.load_profile("egoskin")
+
+# Compiling takes longer than all the rest, and changes no result: only the tests of it
+# compile.
+os.environ[compilation.SETTING] = "0"
 
 
 @pytest.fixture(scope="session")

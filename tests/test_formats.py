@@ -44,7 +44,6 @@ def trained(tmp_path_factory) -> Path:
         num_envs=4,
         num_workers=1,
         total_frames=128,
-        compile_kernels=False,
     )
     run = Run.create(config)
     with open_trainer(run) as trainer:
@@ -206,7 +205,8 @@ def unsealed(run: Path) -> None:
     throws = config["env"]["task"]["throws"]
     throws.update(aim="body")
     del throws["first_delay"]
-    config.update(core_frames=[0, 0], slow_start=0.4)
+    config["env"]["sensor"]["numb"] = False
+    config.update(core_frames=[0, 0], slow_start=0.4, compile_kernels=True)
     (run / "config.json").write_text(json.dumps(config))
     starts = Run(run, TrainConfig()).starts()
     (run / "versions.json").write_text(json.dumps(starts))

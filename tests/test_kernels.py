@@ -2,10 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
+import ctypes
+import io
 import math
+import multiprocessing
+import os
 import pickle
+import resource
+import signal
+import stat
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -14,23 +28,34 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from egoskin import compilation
 from egoskin.chains import build_chain
 from egoskin.compilation import can_compile, load_library
 from egoskin.robots import H1_2
 from egoskin.sensors import Field, FieldSensor, Ray, RaySensor, Skin
 from egoskin.shapes import Box, Sphere
+from egoskin.workers import start_server
 from sensing import KEYS, SEED, assert_same_bits, measure
 
 BALLS = (Sphere(radius=0.15), Sphere(radius=0.4), Sphere(radius=0.02))
 DTYPES = st.sampled_from([torch.float32, torch.float64])
+
 needs_compiler = pytest.mark.skipif(not can_compile(), reason="needs a C++ compiler")
+
+
+@pytest.fixture(autouse=True)
+def compiling(monkeypatch) -> Iterator[None]:
+    """Compile, as users do and other tests do not."""
+    monkeypatch.delenv(compilation.SETTING)
+    yield
+    compilation._loaded.cache_clear()
 
 
 def pair(kind, *args, **options):
     """The same sensor in PyTorch and in C++."""
     plain, fast = (kind(*args, **options, compile=c) for c in (False, True))
     assert plain._kernels is None
-    assert fast._kernels is not None
+    assert fast._kernels._library is not None
     return plain, fast
 
 
@@ -205,30 +230,217 @@ def test_what_the_kernels_lack_is_computed_in_pytorch(skin, random_state):
         assert_same_bits(measure(asked, state), measure(plain, state))
 
 
-def test_without_a_compiler_sensors_run_as_they_are_and_say_so(skin, monkeypatch):
-    monkeypatch.setenv("PATH", "")
-    monkeypatch.delenv("CXX", raising=False)
-    with pytest.warns(UserWarning, match=r"install g\+\+.*uncompiled"):
-        sensor = FieldSensor(skin, H1_2.chain, BALLS, 1.0, compile=True)
-    assert sensor._kernels is None
+# --- the library ------------------------------------------------------------------
 
 
-def test_a_compiler_that_fails_is_quoted(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    source = tmp_path / "broken.cpp"
-    source.write_text("int main( {")
-    with pytest.raises(RuntimeError, match=r"broken.cpp: .*(error|no C\+\+ compiler)"):
-        load_library(source)
-    assert not list(tmp_path.glob("egoskin/*"))
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch) -> Path:
+    """The folder of the compiled libraries, not there yet."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return tmp_path / "cache" / "egoskin"
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    path = tmp_path / "one.cpp"
+    path.write_text('extern "C" int one() { return 1; }')
+    return path
+
+
+def load_anew(source: Path) -> ctypes.CDLL | None:
+    """Load as another process would."""
+    compilation._loaded.cache_clear()
+    return load_library(source)
+
+
+def is_one(library: ctypes.CDLL | None) -> bool:
+    return library is not None and library.one() == 1
+
+
+def told(caplog) -> list[str]:
+    """What was logged since the last call."""
+    messages = [record.getMessage() for record in caplog.records]
+    caplog.clear()
+    return messages
+
+
+def check_stays_plain(source: Path, caplog, *expected: str) -> None:
+    """Loading gives nothing, and says why in one line, once."""
+    assert load_anew(source) is None
+    assert load_library(source) is None
+    lines = [line for line in told(caplog) if not line.startswith("compiling")]
+    assert len(lines) == 1
+    for text in ("one.cpp stays uncompiled", *expected):
+        assert text in lines[0]
+    assert "\n" not in lines[0]
 
 
 @needs_compiler
-def test_a_folder_that_cannot_be_written_to_is_not_needed(tmp_path, monkeypatch):
-    (tmp_path / "file").touch()
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    source = tmp_path / "one.cpp"
-    source.write_text('extern "C" int one() { return 1; }')
-    assert load_library(source).one() == 1
+def test_a_library_is_compiled_once_for_this_user_alone(source, cache, caplog):
+    assert is_one(load_anew(source))
+    assert told(caplog) == ["compiling one.cpp: some seconds, once on a machine"]
+    (file,) = cache.iterdir()
+    assert stat.S_IMODE(cache.stat().st_mode) == 0o700
+    before = file.stat()
+    assert is_one(load_anew(source))
+    assert told(caplog) == []
+    assert file.stat() == before
+    # What others could write to is closed before anything is taken from it.
+    cache.chmod(0o777)
+    assert is_one(load_anew(source))
+    assert stat.S_IMODE(cache.stat().st_mode) == 0o700
+
+
+@needs_compiler
+@pytest.mark.parametrize("damage", ["cut", "empty", "bit", "folder"])
+def test_a_damaged_library_is_compiled_again(source, cache, caplog, damage):
+    load_anew(source)
+    (file,) = cache.iterdir()
+    content = file.read_bytes()
+    # Not in place: this process has it mapped.
+    file.unlink()
+    if damage == "folder":
+        file.mkdir()
+        # Its name is taken: nothing can be kept.
+        check_stays_plain(source, caplog, "Is a directory", str(file))
+        return
+    flipped = bytes([content[-1] ^ 1])
+    changed = {"cut": content[:4096], "empty": b"", "bit": content[:-1] + flipped}
+    file.write_bytes(changed[damage])
+    caplog.clear()
+    assert is_one(load_anew(source))
+    assert told(caplog) == ["compiling one.cpp: some seconds, once on a machine"]
+    assert [path.read_bytes() for path in cache.iterdir()] == [content]
+
+
+@needs_compiler
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a file away")
+def test_what_belongs_to_another_user_is_not_loaded(source, cache, caplog):
+    load_anew(source)
+    (file,) = cache.iterdir()
+    os.chown(file, 12345, -1)
+    assert is_one(load_anew(source))
+    assert file.stat().st_uid == 0
+    os.chown(cache, 12345, -1)
+    caplog.clear()
+    check_stays_plain(source, caplog, f"{cache} is no folder of this user")
+
+
+@needs_compiler
+def test_a_link_to_a_folder_is_no_cache(source, cache, caplog, tmp_path):
+    cache.parent.mkdir()
+    (tmp_path / "other").mkdir()
+    cache.symlink_to(tmp_path / "other")
+    check_stays_plain(source, caplog, f"{cache} is no folder of this user")
+    assert not list((tmp_path / "other").iterdir())
+
+
+@needs_compiler
+def test_a_cache_that_cannot_be_made_leaves_sensors_plain(source, cache, caplog):
+    cache.parent.write_text("")
+    check_stays_plain(source, caplog, f"Not a directory: '{cache}'")
+    cache.parent.unlink()
+    cache.parent.mkdir()
+    cache.write_text("")
+    check_stays_plain(source, caplog, f"File exists: '{cache}'")
+
+
+@needs_compiler
+def test_a_full_disk_leaves_sensors_plain(source, cache, caplog, monkeypatch):
+    compiled = compilation._compile
+
+    def fill_disk(*args) -> bytes:
+        content = compiled(*args)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (len(content) // 2, hard))
+        return content
+
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    monkeypatch.setattr(compilation, "_compile", fill_disk)
+    try:
+        check_stays_plain(source, caplog, "File too large", str(cache))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert not list(cache.iterdir())
+
+
+BROKEN = {
+    "fails": ("echo one; echo 'no error: but this' >&2; exit 1", "no error: but this"),
+    "says nothing": ("exit 3", "exit status 3"),
+    "is killed": ("kill -9 $$", "exit status -9"),
+    "writes nothing": ("exit 0", "No such file"),
+    "writes nonsense": ('for to; do :; done; echo nonsense > "$to"', "too short"),
+}
+
+
+@pytest.mark.parametrize("how", BROKEN)
+def test_a_broken_compiler_leaves_sensors_plain(
+    source, cache, caplog, tmp_path, monkeypatch, how
+):
+    script, expected = BROKEN[how]
+    compiler = tmp_path / "broken"
+    compiler.write_text(f"#!/bin/sh\n{script}\n")
+    compiler.chmod(0o755)
+    monkeypatch.setenv("CXX", str(compiler))
+    check_stays_plain(source, caplog, expected)
+    assert not list(cache.iterdir())
+
+
+def test_without_a_compiler_sensors_measure_the_same(
+    skin, random_state, monkeypatch, caplog
+):
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.delenv("CXX", raising=False)
+    compilation._loaded.cache_clear()
+    args, state = (skin, H1_2.chain, BALLS[:1], 1.0), random_state(20, objects=1)
+    plain, asked = (FieldSensor(*args, compile=c) for c in (False, True))
+    (line,) = told(caplog)
+    assert "no C++ compiler was found: install g++" in line
+    copied = copy.deepcopy(asked)
+    compilation._loaded.cache_clear()
+    for sensor in (asked, copied):
+        assert_same_bits(measure(sensor, state), measure(plain, state))
+
+
+@needs_compiler
+def test_a_worker_neither_compiles_nor_says_so(source, cache):
+    start_server()
+    forkserver = multiprocessing.get_context("forkserver")
+    with forkserver.Pool(1) as pool:
+        work = partial(pool.apply, in_worker, (source, str(cache.parent)))
+        assert work() == (False, "")
+        assert not list(cache.iterdir())
+        assert is_one(load_anew(source))
+        assert work() == (True, "")
+
+
+def in_worker(source: Path, cache: str) -> tuple[bool, str]:
+    """Load in a process whose environment is that of its server."""
+    os.environ["XDG_CACHE_HOME"] = cache
+    os.environ.pop(compilation.SETTING, None)
+    with contextlib.redirect_stderr(io.StringIO()) as said:
+        return is_one(load_anew(source)), said.getvalue()
+
+
+@needs_compiler
+def test_a_killed_compilation_leaves_nothing_in_the_cache(source, cache, tmp_path):
+    compiler = tmp_path / "slow"
+    compiler.write_text(f"#!/bin/sh\ntouch {tmp_path}/begun\nexec sleep 100\n")
+    compiler.chmod(0o755)
+    code = (
+        "import pathlib, sys\nfrom egoskin.compilation import load_library\n"
+        "load_library(pathlib.Path(sys.argv[1]))"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code, str(source)],
+        env={**os.environ, "CXX": str(compiler), "TMPDIR": str(tmp_path)},
+        start_new_session=True,
+        stderr=subprocess.DEVNULL,
+    ) as compiling:
+        while not (tmp_path / "begun").exists():
+            assert compiling.poll() is None
+            time.sleep(0.02)
+        os.killpg(compiling.pid, signal.SIGKILL)
+    assert not list(cache.iterdir())
 
 
 @needs_compiler

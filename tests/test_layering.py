@@ -22,7 +22,6 @@ ALLOWED = {
     "rounding": set(),
     "events": set(),
     "sparse": set(),
-    "watchdog": set(),
     "shapes": {"rounding"},
     "draws": set(),
     "kinematics": {"rounding"},

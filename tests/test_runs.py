@@ -31,7 +31,6 @@ def config(tmp_path: Path) -> TrainConfig:
         num_envs=4,
         num_workers=1,
         total_frames=192,
-        compile_kernels=False,
     )
 
 

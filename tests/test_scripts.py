@@ -323,8 +323,7 @@ CELLS = [
 
 @pytest.mark.parametrize("sensor", CELLS, ids=lambda args: "-".join(args[1::2]))
 def test_every_sensor_trains(sensor: list[str], tmp_path: Path, monkeypatch):
-    # Compiling would take longer than all the rest; test_faults has a run that does.
-    size = [*SMALL, "--total-frames", str(2 * BATCH), "--compile-kernels", "False"]
+    size = [*SMALL, "--total-frames", str(2 * BATCH)]
     args = [*size, "--run-dir", str(tmp_path / "run"), *sensor]
     monkeypatch.setattr(sys, "argv", ["ppo.py", *args])
     # As a user calls it, but in this process: importing takes most of a call.

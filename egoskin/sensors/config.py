@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -13,6 +13,7 @@ import numpy as np
 from tensordict import TensorDictBase
 from torchrl.envs import Transform
 
+from egoskin.draws import offset_seed
 from egoskin.robots import RobotConfig
 from egoskin.sensors.corruption import Corruption
 from egoskin.sensors.coverage import Field, Ray
@@ -111,8 +112,6 @@ class SensorConfig:
         default_factory=LocalizationConfig
     )
     """The position of the ball (signal=localization)."""
-    numb: bool = False
-    """Tell the sensors, or the oracle, of no ball: what does a policy do blindly?"""
 
     def __post_init__(self) -> None:
         """Raise ValueError for a range that is not positive, or what has no effect."""
@@ -126,7 +125,6 @@ class SensorConfig:
                 "validity": self.validity,
                 "corruption": self.corruption != "none",
                 "signal=localization": self.signal == "localization",
-                "numb": self.numb and self.coverage == "none",
             }
             for name, given in ignored.items():
                 if given:
@@ -195,7 +193,7 @@ class SensorConfig:
         seed: int = 0,
         row_offset: int = 0,
         out_key: str = "signal",
-        compile_kernels: bool = False,
+        masked: Collection[int] = (),
     ) -> list[Transform]:
         """Return the transforms that write the signal (none without a skin).
 
@@ -210,7 +208,7 @@ class SensorConfig:
             seed: Seed of what real sensors draw.
             row_offset: Global index of the first row.
             out_key: Key of the signal.
-            compile_kernels: Whether to compile the sensors; results are the same.
+            masked: Indices of sensors that detect nothing.
         """
         if not self.uses_skin:
             return []
@@ -222,9 +220,9 @@ class SensorConfig:
             part, key = skin.select(index), f"distance{suffix}"
             detected.append(f"object_detected{suffix}")
             out_keys = (key, detected[-1])
-            transforms.append(
-                self._sensor(robot, part, objects, out_keys, compile_kernels)
-            )
+            sensor = self._sensor(robot, part, objects, out_keys)
+            sensor.mask([i for i, own in enumerate(index) if own in masked])
+            transforms.append(sensor)
             if self.signal == "localization":
                 continue
             if self.corruption != "none":
@@ -235,7 +233,7 @@ class SensorConfig:
                         models,
                         dt=dt,
                         # Two groups of sensors must not fail alike.
-                        seed=(seed + number * _GROUP_SEED) % 2**32,
+                        seed=offset_seed(seed, number * _GROUP_SEED),
                         row_offset=row_offset,
                         in_keys=[key, "joint_vel"] if moving else [key],
                         out_keys=[f"reading{suffix}"],
@@ -262,7 +260,6 @@ class SensorConfig:
         robot: RobotConfig,
         skin: Skin,
         objects: Sequence[Shape],
-        compile_kernels: bool = False,
     ) -> SparseRays | None:
         """Return what gives the signal as sparse rows, or None if it is not sparse.
 
@@ -272,7 +269,6 @@ class SensorConfig:
             robot: The robot.
             skin: The sensors.
             objects: Shapes of what is sensed.
-            compile_kernels: Whether to compile the sensors; results are the same.
         """
         skin = self.filled(skin)
         dense = self.signal == "localization" or self.corruption != "none"
@@ -283,7 +279,7 @@ class SensorConfig:
             return None
 
         keys = ("distance", "object_detected")
-        sensor = self._sensor(robot, skin, objects, keys, compile_kernels)
+        sensor = self._sensor(robot, skin, objects, keys)
         assert isinstance(sensor, RaySensor)
         reading = self._signal(skin.select([0]), "distance", "signal")
         return SparseRays(sensor, reading)
@@ -318,14 +314,13 @@ class SensorConfig:
         skin: Skin,
         objects: Sequence[Shape],
         out_keys: Sequence[str],
-        compile_kernels: bool,
-    ) -> Transform:
+    ) -> FieldSensor | RaySensor:
         """Return the coverage of some sensors of one kind."""
         common: dict[str, Any] = {
             "body": robot.primitives if self.occlusion else (),
             "per_object": self.per_object and self.signal != "localization",
             "out_keys": out_keys,
-            "compile": compile_kernels,
+            "compile": True,
         }
         args = (skin, robot.chain, objects, self.range)
         if isinstance(skin.coverage[0], Ray):

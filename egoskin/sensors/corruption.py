@@ -21,7 +21,7 @@ from tensordict import NestedKey
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 
-from egoskin.draws import Stream, check_seed, halfwords, random_words
+from egoskin.draws import Stream, halfwords, random_words, stream_key
 from egoskin.transform import StatefulTransform
 
 State = dict[str, Tensor]
@@ -337,7 +337,7 @@ class Corruption(StatefulTransform):
     ) -> None:
         if not dt > 0:
             raise ValueError(f"dt must be positive, got {dt}")
-        check_seed(seed)
+        stream_key(seed, Stream.SENSOR)
         if len(models) > _MAX_MODELS:
             raise ValueError(f"at most {_MAX_MODELS} models, got {len(models)}")
         needed = ["distance"]

@@ -47,8 +47,8 @@ class FieldSensor(ProximitySensor):
         body: The robot's shapes, to hide what lies behind them: an object is seen if
             the straight path to its closest point is free. Empty: transparent.
         per_object: Write ``distance [*B, S, O]``, objects told apart.
-        compile: Use C++ kernels for balls and a transparent robot; results are the
-            same (float64: to the last bit or two).
+        compile: Use C++ kernels, where they can be compiled, for balls and a
+            transparent robot; results are the same (float64: to the last bit or two).
         in_keys: Keys of the four inputs, in the order above.
         out_keys: Keys of the two outputs, in the order above.
 

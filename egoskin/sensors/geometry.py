@@ -11,7 +11,6 @@ a reading of NaN, never one of nothing.
 
 from __future__ import annotations
 
-import warnings
 from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
@@ -24,7 +23,6 @@ from torch import Tensor
 from torchrl.data import Binary as BinarySpec
 from torchrl.data import Composite, TensorSpec, Unbounded
 
-from egoskin.compilation import can_compile
 from egoskin.kinematics import LinkKinematics, quat_to_entries
 from egoskin.robots import Primitive
 from egoskin.sensors.coverage import Coverage
@@ -172,6 +170,7 @@ class ProximitySensor(RowTransform):
         # Columns of the sensor frames in the link frames, [3 (axis), 3, S, 1].
         constant("_axes", skin.rotation().transpose(2, 1, 0)[..., None], torch.float64)
         constant("_range", skin.range[:, None], torch.float64)
+        self._skin_range = self._range.clone()
         # No object whose centre is farther from the base than this is in range in any
         # pose of the robot [m], [O].
         reach = np.array(self._kinematics.reach())[self._link.numpy()]
@@ -190,14 +189,6 @@ class ProximitySensor(RowTransform):
         balls = [shape for shape in self.objects if isinstance(shape, Sphere)]
         if self._occluder is not None or len(balls) < len(self.objects):
             return
-        if not can_compile():
-            # Python shows one warning from one place once.
-            warnings.warn(
-                "no C++ compiler was found (install g++): sensor kernels run "
-                "uncompiled, with the same results",
-                stacklevel=3,
-            )
-            return
         own = {
             "sensors": self.num_sensors,
             "apart": self.per_object,
@@ -208,6 +199,18 @@ class ProximitySensor(RowTransform):
             "farthest": np.array(self._farthest),
         }
         self._kernels = Kernels(kind, self._kinematics, balls, {**own, **constants})
+
+    def mask(self, sensors: Sequence[int]) -> None:
+        """Let some sensors, and no others, detect nothing from now on.
+
+        Args:
+            sensors: Their indices.
+        """
+        self._range.copy_(self._skin_range)
+        # No distance is within it.
+        self._range[list(sensors)] = -1.0
+        if self._kernels is not None:
+            self._kernels.set_constants(range=self._range.numpy())
 
     @property
     def num_joints(self) -> int:
@@ -270,7 +273,7 @@ class ProximitySensor(RowTransform):
         position = _writable(position, shape, joint_pos)
         rotation = _writable(rotation, (*shape, 3), joint_pos)
         out = position, rotation
-        if self._kernels is not None and Kernels.can(joint_pos, *out):
+        if self._kernels is not None and self._kernels.can(joint_pos, *out):
             self._kernels.poses(joint_pos, *out)
             return out
         rotation, position = self._kinematics.link_frames(joint_pos)
@@ -370,7 +373,7 @@ class ProximitySensor(RowTransform):
         each = (objects,) if self.per_object else ()
         out = _writable(out, (*each, batch, *self.readings), inputs[0])
         detected = torch.zeros(inputs[3].shape, dtype=torch.bool, device=out.device)
-        if self._kernels is not None and Kernels.can(*inputs[:3]):
+        if self._kernels is not None and self._kernels.can(*inputs[:3]):
             self._kernels.measure(inputs, out, detected)
         else:
             rows = self._rows_in_reach(*inputs)

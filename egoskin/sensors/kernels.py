@@ -57,15 +57,14 @@ class _Inputs(ctypes.Structure):
 class Kernels:
     """What C++ computes of balls and a skin on a robot that is transparent to it.
 
+    Where it cannot be compiled, `can` says no.
+
     Args:
         kind: Coverage of all sensors.
         kinematics: Of the links that they are on.
         balls: What is sensed.
         constants: What else `Tables` of kernels.cpp holds: counts, flags and arrays;
             what is missing is 0 or null.
-
-    Raises:
-        RuntimeError: If the kernels cannot be compiled here; see `can_compile`.
     """
 
     def __init__(
@@ -102,11 +101,21 @@ class Kernels:
         vars(self).update(state)
         self._library = load_library(SOURCE)
 
-    @staticmethod
-    def can(*inputs: Tensor) -> bool:
+    def set_constants(self, **constants: Any) -> None:
+        """Give some of the constants other values.
+
+        Args:
+            constants: As of the class.
+        """
+        self._constants.update(constants)
+        self._tables.clear()
+
+    def can(self, *inputs: Tensor) -> bool:
         """Whether the kernels take these inputs: on the CPU, and without gradients."""
+        if self._library is None or torch.compiler.is_compiling():
+            return False
         grad = torch.is_grad_enabled()
-        return not torch.compiler.is_compiling() and all(
+        return all(
             x.is_cpu and x.dtype in _NAMES and not (grad and x.requires_grad)
             for x in inputs
         )

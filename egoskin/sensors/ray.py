@@ -21,7 +21,7 @@ from egoskin.sensors.geometry import (
     checked,
     product,
 )
-from egoskin.sensors.kernels import VECTOR, Kernels
+from egoskin.sensors.kernels import VECTOR
 from egoskin.sensors.signals import Binary, Proximity
 from egoskin.sensors.skin import Skin
 from egoskin.shapes import Shape, first_hit
@@ -57,8 +57,8 @@ class RaySensor(ProximitySensor):
         body: The robot's shapes, to hide what lies behind them; empty: transparent.
         per_object: Objects told apart in a last dimension ``O``.
         cull: Skip pairs that cannot hit; results are the same.
-        compile: Use C++ kernels for balls and a transparent robot; results are the
-            same (float64: to the last bit or two).
+        compile: Use C++ kernels, where they can be compiled, for balls and a
+            transparent robot; results are the same (float64: to the last bit or two).
         in_keys: Keys of the four inputs, in the order above.
         out_keys: Keys of the two outputs, in the order above.
 
@@ -274,7 +274,7 @@ class RaySensor(ProximitySensor):
             Place in the flattened readings ``[B, S, K]`` of each beam that hits
             anything, ascending ``[n]`` int64, and its reading [m], ``[n]``.
         """
-        if self._kernels is not None and Kernels.can(*inputs[:3]):
+        if self._kernels is not None and self._kernels.can(*inputs[:3]):
             return self._kernels.hits(inputs)
         places, readings = [torch.empty(0, dtype=torch.int64)], [inputs[0].new_empty(0)]
         rows = self._rows_in_reach(*inputs)

@@ -23,7 +23,6 @@ from egoskin.agents.networks import RunningNorm
 from egoskin.agents.ppo import PPO, PPOConfig
 from egoskin.checkpoint import part
 from egoskin.collection import collect
-from egoskin.compilation import can_compile
 from egoskin.envs.dodgeball import DodgeballEnv
 from egoskin.envs.physics import Physics
 from egoskin.make import (
@@ -143,7 +142,7 @@ class _Loop:
         self.config, self._coverage = config, coverage
         self._skin = config.env.skin.build(config.env.robot_config)
         self._workers = check_num_workers(config.num_envs, config.num_workers)
-        self._sources = sparse_sources(config.env, self._skin, can_compile())
+        self._sources = sparse_sources(config.env, self._skin)
         self._steps = config.ppo.rollout_steps
 
     def rows(self) -> list[Row]:
@@ -180,7 +179,6 @@ class _Loop:
             seed=config.seed,
             bare=bare,
             sparse=bool(self._sources),
-            compile_kernels=can_compile(),
         )
 
     def _train_and_record(self) -> Row:
