@@ -252,11 +252,11 @@ def check_finite(agent: Agent, what: str) -> None:
         if key in agent.norms:
             x = agent.norms[key](x.fill_(torch.finfo(x.dtype).max))
         largest.append(x)
-    if not (
-        body(*largest).isfinite().all() and agent.head.log_std.exp().isfinite().all()
-    ):
+    scale = agent.head.log_std.exp()
+    if not (body(*largest).isfinite().all() and scale.isfinite().all()):
         raise ValueError(
-            f"{what} is damaged: its weights are so large that actions may not be finite"
+            f"{what} is damaged: with weights as large as its own, actions need not be "
+            "finite"
         )
 
 

@@ -21,6 +21,7 @@ from __future__ import annotations
 import argparse
 import csv
 import datetime
+import errno
 import fcntl
 import io
 import itertools
@@ -44,6 +45,7 @@ from egoskin.checkpoint import (
     PARTIAL,
     append,
     load_tensors,
+    named,
     save_tensors,
     write_file,
 )
@@ -283,7 +285,10 @@ class Run:
             )
         (path / "policies").mkdir(parents=True)
         run = cls(path, config)
-        skin.save(run.skin_path)
+        try:
+            skin.save(run.skin_path)
+        except OSError as error:
+            raise named(error, run.skin_path) from error
         run._skin_hash = content_hash(read_json(run.skin_path))
         # Last: a folder with a configuration can be resumed.
         run.write_config()
@@ -425,14 +430,24 @@ class Run:
         Raises:
             ValueError: If one does already.
         """
-        with open(self.path / "lock", "w") as file:
+        path = self.path / "lock"
+        flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+        try:
+            descriptor = os.open(path, flags, 0o666)
+        except OSError as error:
+            if error.errno != errno.ELOOP:
+                raise
+            raise ValueError(f"{path} is a link, which is not followed") from error
+        try:
             try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 raise ValueError(
                     f"{self.path} is being trained by another process"
                 ) from None
             yield
+        finally:
+            os.close(descriptor)
 
     def is_new(self) -> bool:
         """Whether there is nothing to go on from, though it may have been started."""
@@ -494,9 +509,13 @@ class Run:
         The folder of the policies, if somebody removed it, is made again, and so is the
         log of metrics if somebody removed, edited or damaged it.
         """
-        (self.path / "policies").mkdir(exist_ok=True)
-        for left in self.path.rglob(PARTIAL):
-            left.unlink()
+        policies = self.path / "policies"
+        if policies.is_symlink():
+            raise ValueError(f"{policies} is a link, which is not followed")
+        policies.mkdir(exist_ok=True)
+        for folder in (self.path, policies):
+            for left in folder.glob(PARTIAL):
+                left.unlink()
         path, text = self._metrics_path, self._metrics.encode()
         try:
             if not read_regular(path, sys.maxsize).startswith(text):

@@ -155,17 +155,20 @@ class Trainer:
         hz = task.physics.control_hz
         ended = float(infos["terminated"].sum())
         terms = infos["reward_terms"].mean(0).mean(0).tolist()
+        # A ball that hits may throw the robot over: each end has one cause.
+        hit = infos["hit"]
+        fallen = infos["fallen"] & ~hit
 
-        def share_of_ends(key: str) -> float:
-            return float(infos[key].sum()) / ended if ended else float("nan")
+        def share_of_ends(cause: Tensor) -> float:
+            return float(cause.sum()) / ended if ended else float("nan")
 
         return {
             "episode/survival_s": self.survival.mean() / hz,
             "episode/success": self.survival.probability(
                 round(min(task.success_s, task.episode_length_s) * hz)
             ),
-            "episode/ended_by_ball": share_of_ends("hit"),
-            "episode/ended_by_fall": share_of_ends("fallen"),
+            "episode/ended_by_ball": share_of_ends(hit),
+            "episode/ended_by_fall": share_of_ends(fallen),
             "episode/diverged": float(infos["diverged"].sum()),
             "episode/self_contact": float(infos["self_contact"].float().mean()),
             "reward/mean": float(infos["reward"].mean()),
@@ -200,17 +203,14 @@ class Trainer:
         names = [field.name for field in dataclasses.fields(Progress)]
         known = {name: header[name] for name in names if name in header}
         progress = from_plain(Progress, known, what)
-        agent, optimizer = part("agent", tensors), part("optimizer", tensors)
-        learner = {*prefixed("agent", agent), *prefixed("optimizer", optimizer)}
-        others = {k: v for k, v in tensors.items() if k not in learner}
         self.root = self.env.reset()
         own = self._other_tensors()
-        if missing := own.keys() - others.keys():
+        if missing := own.keys() - tensors.keys():
             raise ValueError(f"{what}: tensor {min(missing)!r} is missing")
-        check_like(own, others, what)
-        load_agent_tensors(self.agent, agent, what)
+        check_like(own, {name: tensors[name] for name in own}, what)
+        load_agent_tensors(self.agent, part("agent", tensors), what)
         check_finite(self.agent, what)
-        self.ppo.load_state(optimizer, progress.learning_rate)
+        self.ppo.load_state(part("optimizer", tensors), progress.learning_rate)
         self.root = load_env_state(self.env, part("env", tensors))
         self.survival.at_risk.copy_(tensors["survival/at_risk"])
         self.survival.ended.copy_(tensors["survival/ended"])
