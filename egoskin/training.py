@@ -30,6 +30,7 @@ from egoskin.plain import from_plain, to_plain
 from egoskin.policies import (
     PolicySpec,
     agent_tensors,
+    check_agent_tensors,
     check_finite,
     check_like,
     load_agent_tensors,
@@ -196,8 +197,8 @@ class Trainer:
         """Continue from a checkpoint of the run.
 
         Raises:
-            ValueError: If it is that of another agent or environment, or damaged;
-                nothing is loaded then.
+            ValueError: If it is that of another agent or environment, then nothing is
+                loaded; or if it holds numbers with which no policy acts.
         """
         what = str(self.run.checkpoint_path)
         names = [field.name for field in dataclasses.fields(Progress)]
@@ -208,9 +209,11 @@ class Trainer:
         if missing := own.keys() - tensors.keys():
             raise ValueError(f"{what}: tensor {min(missing)!r} is missing")
         check_like(own, {name: tensors[name] for name in own}, what)
-        load_agent_tensors(self.agent, part("agent", tensors), what)
-        check_finite(self.agent, what)
+        agent = part("agent", tensors)
+        check_agent_tensors(agent_tensors(self.agent), agent, what)
         self.ppo.load_state(part("optimizer", tensors), progress.learning_rate)
+        load_agent_tensors(self.agent, agent, what)
+        check_finite(self.agent, what)
         self.root = load_env_state(self.env, part("env", tensors))
         self.survival.at_risk.copy_(tensors["survival/at_risk"])
         self.survival.ended.copy_(tensors["survival/ended"])

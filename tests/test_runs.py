@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,7 +25,7 @@ from egoskin.formats import read_sealed, sealed_json
 from egoskin.make import EnvConfig
 from egoskin.runs import Run, TrainConfig, parse_config
 from egoskin.sensors.config import SensorConfig
-from egoskin.training import METRIC_KEYS, open_trainer, train
+from egoskin.training import METRIC_KEYS, Trainer, open_trainer, train
 
 
 @pytest.fixture
@@ -37,6 +38,21 @@ def config(tmp_path: Path) -> TrainConfig:
         num_workers=1,
         total_frames=192,
     )
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory) -> Iterator[Trainer]:
+    """A trainer after one rollout of 64 frames."""
+    config = TrainConfig(
+        env=EnvConfig(sensor=SensorConfig(coverage="none")),
+        run_dir=tmp_path_factory.mktemp("trained") / "run",
+        num_envs=4,
+        num_workers=1,
+        total_frames=64,
+    )
+    with open_trainer(Run.create(config)) as trainer:
+        train(trainer)
+        yield trainer
 
 
 def test_a_run_learns_with_its_own_number_of_threads(config: TrainConfig):
@@ -213,19 +229,18 @@ def test_a_metrics_file_turned_into_a_link_while_it_trains_is_not_followed(
     ],
 )
 def test_a_tensor_that_does_not_fit_is_named_before_anything_is_loaded(
-    name, value, message, config: TrainConfig
+    name, value, message, trained: Trainer
 ):
-    run = Run.create(config)
-    with open_trainer(run) as trainer:
-        train(trainer)
-    tensors, header = load_tensors(run.checkpoint_path)
+    tensors, header = trained.run.load_checkpoint()
+    before = trained.agent.head.log_std.detach().clone()
+    tensors["agent/head.log_std"] = before / 2
     if value is None:
         del tensors[name]
     else:
         tensors[name] = value
-    save_tensors(run.checkpoint_path, tensors, header)
-    with pytest.raises(ValueError, match=message), open_trainer(Run.open(run.path)):
-        pass
+    with pytest.raises(ValueError, match=message):
+        trained.load(tensors, header)
+    assert torch.equal(trained.agent.head.log_std, before)
 
 
 @pytest.mark.parametrize(
@@ -239,36 +254,31 @@ def test_a_tensor_that_does_not_fit_is_named_before_anything_is_loaded(
         ("learning_rate", [1]),
     ],
 )
-def test_a_header_that_no_training_writes_is_refused(name, value, config: TrainConfig):
-    run = Run.create(config)
-    with open_trainer(run):
-        pass
-    tensors, header = load_tensors(run.checkpoint_path)
+def test_a_header_that_no_training_writes_is_refused(name, value, trained: Trainer):
+    tensors, header = trained.run.load_checkpoint()
     if value is None:
         del header[name]
     else:
         header[name] = value
-    save_tensors(run.checkpoint_path, tensors, header)
-    with pytest.raises(ValueError, match=name), open_trainer(Run.open(run.path)):
-        pass
+    with pytest.raises(ValueError, match=name):
+        trained.load(tensors, header)
 
 
 # --- what is logged -----------------------------------------------------------------
 
 
-def test_an_episode_ends_by_one_cause(config: TrainConfig):
-    with open_trainer(Run.create(config)) as trainer:
-        flags = {k: torch.zeros(4, dtype=torch.bool) for k in METRIC_KEYS}
-        # Of four: hit and thrown over; hit; fallen; and one that goes on.
-        flags["hit"][:2] = True
-        flags["fallen"][[0, 2]] = True
-        flags["terminated"][:3] = True
-        info = TensorDict({k: v[None, :, None] for k, v in flags.items()}, [1, 4])
-        for key in ("episode_step", "first_throw_step"):
-            info[key] = torch.zeros(1, 4, 1, dtype=torch.int64)
-        info["reward"] = torch.zeros(1, 4, 1)
-        info["reward_terms"] = torch.zeros(1, 4, len(TERMS))
-        metrics = trainer._episode_metrics(info)
+def test_an_episode_ends_by_one_cause(trained: Trainer):
+    flags = {k: torch.zeros(4, dtype=torch.bool) for k in METRIC_KEYS}
+    # Of four: hit and thrown over; hit; fallen; and one that goes on.
+    flags["hit"][:2] = True
+    flags["fallen"][[0, 2]] = True
+    flags["terminated"][:3] = True
+    info = TensorDict({k: v[None, :, None] for k, v in flags.items()}, [1, 4])
+    for key in ("episode_step", "first_throw_step"):
+        info[key] = torch.zeros(1, 4, 1, dtype=torch.int64)
+    info["reward"] = torch.zeros(1, 4, 1)
+    info["reward_terms"] = torch.zeros(1, 4, len(TERMS))
+    metrics = trained._episode_metrics(info)
     assert metrics["episode/ended_by_ball"] == pytest.approx(2 / 3)
     assert metrics["episode/ended_by_fall"] == pytest.approx(1 / 3)
 
