@@ -456,7 +456,10 @@ class Run:
     def how_to_go_on(self) -> str:
         """Return what to do after a stop or a failure."""
         if not (self.path / "config.json").is_file():
-            return f"{self.path} cannot be gone on with: start a new run"
+            return (
+                f"{self.path} is gone: start a new run or, if it was only renamed, "
+                "--resume it by its new name"
+            )
         return f"go on with: python scripts/ppo.py --resume {self.path}"
 
     def save_checkpoint(

@@ -120,7 +120,7 @@ def test_claims_of_a_header_take_no_memory(changes, tmp_path):
         changes = {"network": {**header["policy"]["network"], **changes["network"]}}
     save_changed(path, changes)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    with pytest.raises(ValueError, match="large.*its header claims a size of"):
+    with pytest.raises(ValueError, match=r"large.*its header claims a size of"):
         egoskin.load_policy(path)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000
 
@@ -128,16 +128,16 @@ def test_claims_of_a_header_take_no_memory(changes, tmp_path):
 def test_sizes_that_the_tensors_do_not_have_are_refused(tmp_path):
     path = tmp_path / "other.safetensors"
     save_changed(path, {"num_actions": 22})
-    with pytest.raises(
-        ValueError, match=r"other.*expected \[22\] of float32, got \[21"
-    ):
+    with pytest.raises(ValueError, match=r"other.*expected \[22\] of .*, got \[21"):
         egoskin.load_policy(path)
 
 
 def test_an_action_that_is_not_finite_ends_an_evaluation():
     policy = egoskin.load_policy("field_proximity")
+    named = policy.named_parameters()
+    (bias,) = (p for name, p in named if name.endswith("head.body.tail.3.bias"))
     with torch.no_grad():
-        dict(policy.named_parameters())["_agent.head.body.tail.3.bias"][4] = torch.nan
+        bias[4] = torch.nan
     config = standard_task(policy.env_config)
     with pytest.raises(ValueError, match="action is not finite at step 1"):
         evaluate(policy, config, policy.skin, bank_seed=0, episodes=4, num_workers=1)

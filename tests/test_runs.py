@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import shutil
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,8 +21,10 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensordict import TensorDict
 
 import egoskin
-from egoskin.checkpoint import load_tensors, save_tensors
+from egoskin.agents.ppo import NonFiniteError
+from egoskin.checkpoint import PARTIAL, load_tensors, save_tensors
 from egoskin.envs.rewards import TERMS
+from egoskin.events import EventFile
 from egoskin.formats import read_sealed, sealed_json
 from egoskin.make import EnvConfig
 from egoskin.runs import Run, TrainConfig, parse_config
@@ -204,6 +208,63 @@ def test_a_metrics_file_turned_into_a_link_while_it_trains_is_not_followed(
         with pytest.raises(OSError, match=r"metrics\.csv"):
             train(trainer)
     assert victim.read_text() == "mine"
+
+
+# --- the disk -----------------------------------------------------------------------
+
+
+@contextmanager
+def full_disk() -> Iterator[None]:
+    """Let no file grow beyond some bytes."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (16, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.parametrize(
+    ("write", "name"),
+    [
+        (lambda t: t.run.log({"frames": 64}), "metrics.csv"),
+        (lambda t: t.run._events.log({"frames": 64, "x": 1.0}), "events.out.tfevents"),
+        (lambda t: EventFile(t.run.path, 0), "events.out.tfevents"),
+        (lambda t: t.run.write_config(), "config.json"),
+        (lambda t: t.run.record_start(), "versions.json"),
+        (lambda t: t.save(), "checkpoint.safetensors"),
+        (lambda t: t.keep_policy(), "000000000064.safetensors"),
+        (lambda t: t.dump(NonFiniteError("x", TensorDict())), "not-finite-"),
+        (lambda t: Run.create(replace(t.config, run_dir=t.run.path / "new")), "skin"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_a_full_disk_names_the_file(write, name: str, trained: Trainer):
+    with pytest.raises(OSError, match="File too large") as error, full_disk():
+        write(trained)
+    assert Path(str(error.value.filename)).name.startswith(name)
+    assert not list(trained.run.path.rglob(PARTIAL))
+
+
+def test_a_folder_renamed_while_it_trains_ends_with_one_clear_error(
+    config: TrainConfig,
+):
+    run = Run.create(config)
+    moved = run.path.with_name("moved")
+    with (
+        pytest.raises(OSError, match=r"No such file .*run/metrics\.csv"),
+        open_trainer(run) as trainer,
+    ):
+        run.log(trainer.iterate())
+        trainer.save()
+        run.path.rename(moved)
+        train(trainer)
+    assert not run.path.exists()
+    assert "--resume it by its new name" in run.how_to_go_on()
+    again = Run(moved, parse_config(["--resume", str(moved)]))
+    with open_trainer(again) as trainer:
+        assert trainer.frames == 64
+        train(trainer)
 
 
 # --- checkpoints that do not fit ----------------------------------------------------
