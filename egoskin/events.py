@@ -38,9 +38,13 @@ class EventFile:
         # Unbuffered: nothing is left that closing could fail to write.
         file = open(self._path, "xb", buffering=0)  # noqa: SIM115
         self._writer = RecordWriter(file)
-        self._write(Event(file_version="brain.Event:2"))
         start = SessionLog(status=SessionLog.START)
-        self._write(Event(step=frames + 1, session_log=start))
+        try:
+            self._write(Event(file_version="brain.Event:2"))
+            self._write(Event(step=frames + 1, session_log=start))
+        except OSError:
+            self.close()
+            raise
 
     def log(self, metrics: Mapping[str, float]) -> None:
         """Append the metrics of a rollout; "frames" is the x axis."""

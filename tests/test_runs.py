@@ -251,14 +251,12 @@ def test_a_folder_renamed_while_it_trains_ends_with_one_clear_error(
 ):
     run = Run.create(config)
     moved = run.path.with_name("moved")
-    with (
-        pytest.raises(OSError, match=r"No such file .*run/metrics\.csv"),
-        open_trainer(run) as trainer,
-    ):
+    with open_trainer(run) as trainer:
         run.log(trainer.iterate())
         trainer.save()
         run.path.rename(moved)
-        train(trainer)
+        with pytest.raises(OSError, match=r"No such file .*run/metrics\.csv"):
+            train(trainer)
     assert not run.path.exists()
     assert "--resume it by its new name" in run.how_to_go_on()
     again = Run(moved, parse_config(["--resume", str(moved)]))
