@@ -8,7 +8,10 @@ python scripts/results.py write                    # docs/results.md and its pic
 
 from __future__ import annotations
 
-import egoskin  # noqa: F401  (before torch: it says how torch's threads wait)
+from egoskin.interrupts import end_quietly
+
+if __name__ == "__main__":
+    end_quietly()
 
 # isort: split
 

@@ -6,7 +6,10 @@ python scripts/verify.py --iterations 4 --sensor.coverage ray --num-envs 512
 
 from __future__ import annotations
 
-import egoskin  # noqa: F401  (before torch: it says how torch's threads wait)
+from egoskin.interrupts import end_quietly
+
+if __name__ == "__main__":
+    end_quietly()
 
 # isort: split
 

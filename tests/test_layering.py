@@ -17,7 +17,7 @@ MODULES = sorted(
 ALLOWED = {
     "files": set(),
     "chains": set(),
-    "robots": {"chains"},
+    "robots": {"files", "chains"},
     "compilation": set(),
     "rounding": set(),
     "events": set(),
