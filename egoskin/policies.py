@@ -135,6 +135,8 @@ class PolicySpec:
         Raises:
             ValueError: If it is no such description.
         """
+        if not isinstance(header, Mapping):
+            raise ValueError(f"{what} holds no policy: it must be an object")
         missing = [f.name for f in dataclasses.fields(cls) if f.name not in header]
         if missing:
             raise ValueError(f"{what} holds no policy: {missing[0]!r} is missing")
@@ -148,9 +150,13 @@ class PolicySpec:
         env = from_plain(EnvConfig, header["env"], what)
         if lacking := set(env.critic_keys) - sizes.keys():
             raise ValueError(f"{what} holds no policy: no size of {min(lacking)!r}")
+        try:
+            skin = Skin.from_dict(header["skin"])
+        except ValueError as error:
+            raise ValueError(f"{what} holds no policy: {error}") from error
         return cls(
             env=env,
-            skin=Skin.from_dict(header["skin"]),
+            skin=skin,
             network=from_plain(NetworkConfig, header["network"], what),
             sizes=sizes,
             num_actions=header["num_actions"],
@@ -248,7 +254,8 @@ def check_finite(agent: Agent, what: str) -> None:
         weight.abs_()
     largest = []
     for key, layer in zip(agent.actor_keys, body.inputs, strict=True):
-        x = layer.weight.new_full((1, layer.weight.shape[1]), _LARGEST_SIGNAL)
+        assert isinstance(layer, nn.Linear)
+        x = layer.weight.new_full((1, layer.in_features), _LARGEST_SIGNAL)
         if key in agent.norms:
             x = agent.norms[key](x.fill_(torch.finfo(x.dtype).max))
         largest.append(x)

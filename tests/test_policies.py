@@ -51,7 +51,13 @@ def test_a_file_that_lacks_a_tensor_is_refused(name, tmp_path):
 
 @pytest.mark.parametrize(
     ("field", "value"),
-    [("sizes", {}), ("sizes", "many"), ("num_actions", "21"), ("frames", None)],
+    [
+        ("sizes", {}),
+        ("sizes", "many"),
+        ("num_actions", "21"),
+        ("frames", None),
+        ("skin", {}),
+    ],
 )
 def test_a_header_that_describes_no_policy_is_refused(field, value, tmp_path):
     tensors, header = load_tensors(ASSETS / "field_proximity.safetensors")
@@ -59,6 +65,14 @@ def test_a_header_that_describes_no_policy_is_refused(field, value, tmp_path):
     save_tensors(tmp_path / "odd.safetensors", tensors, header)
     with pytest.raises(ValueError, match=r"odd.* holds no policy"):
         egoskin.load_policy(tmp_path / "odd.safetensors")
+
+
+def test_a_header_without_a_policy_is_refused(tmp_path):
+    tensors, _ = load_tensors(ASSETS / "field_proximity.safetensors")
+    for header in ({}, {"policy": 5}, {"policy": None}):
+        save_tensors(tmp_path / "odd.safetensors", tensors, header)
+        with pytest.raises(ValueError, match=r"odd.* holds no policy"):
+            egoskin.load_policy(tmp_path / "odd.safetensors")
 
 
 def save_changed(path: Path, changes: dict[str, Any]) -> None:
