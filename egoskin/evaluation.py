@@ -198,6 +198,12 @@ def play_bank(
                 action = torch.zeros(episodes, env.action_spec.shape[-1])
             else:
                 action = policy(flat)["action"]
+                # MuJoCo would take NaN for zero, and the figures would look ordinary.
+                if not action.isfinite().all():
+                    raise ValueError(
+                        f"the policy's action is not finite at step {step}: its "
+                        "weights, or what it was given, are not those of training"
+                    )
             root["action"] = action.reshape(*root.batch_size, -1)
             data, root = env.step_and_maybe_reset(root)
             following = data["next"]

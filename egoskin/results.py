@@ -207,7 +207,7 @@ def _without(args: Sequence[str], option: str) -> list[str]:
 def same_but_length(one: TrainConfig, two: TrainConfig) -> bool:
     """Return whether two configurations are those of one run, or of its longer self."""
     names = changed_fields(to_plain(one), to_plain(two))
-    return set(names) <= _NO_RECIPE - {"seed"}
+    return set(names) <= MACHINE_FIELDS | {"total_frames"}
 
 
 def load_runs(folder: Path) -> list[StoredRun]:

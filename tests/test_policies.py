@@ -5,9 +5,11 @@ from __future__ import annotations
 import copy
 import math
 import pickle
+import resource
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -227,7 +229,13 @@ def test_a_file_that_lacks_a_tensor_is_refused(name, tmp_path):
 
 @pytest.mark.parametrize(
     ("field", "value"),
-    [("sizes", {}), ("sizes", "many"), ("num_actions", "21"), ("frames", None)],
+    [
+        ("sizes", {}),
+        ("sizes", "many"),
+        ("num_actions", "21"),
+        ("frames", None),
+        ("skin", {}),
+    ],
 )
 def test_a_header_that_describes_no_policy_is_refused(field, value, tmp_path):
     tensors, header = load_tensors(ASSETS / "field_proximity.safetensors")
@@ -235,6 +243,96 @@ def test_a_header_that_describes_no_policy_is_refused(field, value, tmp_path):
     save_tensors(tmp_path / "odd.safetensors", tensors, header)
     with pytest.raises(ValueError, match=r"odd.* holds no policy"):
         egoskin.load_policy(tmp_path / "odd.safetensors")
+
+
+def test_a_header_without_a_policy_is_refused(tmp_path):
+    tensors, _ = load_tensors(ASSETS / "field_proximity.safetensors")
+    for header in ({}, {"policy": 5}, {"policy": None}):
+        save_tensors(tmp_path / "odd.safetensors", tensors, header)
+        with pytest.raises(ValueError, match=r"odd.* holds no policy"):
+            egoskin.load_policy(tmp_path / "odd.safetensors")
+
+
+def save_changed(path: Path, changes: dict[str, Any]) -> None:
+    """Write a shipped policy with some tensors, or header fields, changed."""
+    tensors, header = load_tensors(ASSETS / "field_proximity.safetensors")
+    for name, change in changes.items():
+        if name in header["policy"]:
+            header["policy"][name] = change
+        else:
+            value = tensors[f"agent/{name}"]
+            if isinstance(change, torch.dtype):
+                tensors[f"agent/{name}"] = value.to(change)
+            else:
+                value.view(-1)[0] = change
+    save_tensors(path, tensors, header)
+
+
+@pytest.mark.parametrize(
+    ("name", "number", "message"),
+    [
+        # Kept in float64, computed with in float32.
+        ("norms.signal.mean", 1e300, "'norms.signal.mean' is not finite"),
+        ("norms.observation.var", 1e300, "'norms.observation.var' is not finite"),
+        ("norms.observation.var", -1.0, "'norms.observation.var' is negative"),
+        ("head.log_std", float("nan"), "'head.log_std' is not finite"),
+        ("head.log_std", 1e3, "actions need not be finite"),
+        # Finite by themselves, not in use.
+        ("head.body.inputs.0.weight", 3e38, "actions need not be finite"),
+        ("head.body.inputs.1.weight", -3e38, "actions need not be finite"),
+        ("head.body.tail.1.weight", 3e38, "actions need not be finite"),
+        ("head.body.tail.3.bias", float("inf"), "'head.body.tail.3.bias' is not fini"),
+        ("head.body.tail.3.weight", torch.float64, "got .21, 32. of float64"),
+        ("norms.signal.mean", torch.float32, "expected .1. of float64, got .1. of"),
+    ],
+)
+def test_numbers_that_give_no_finite_action_are_refused(
+    name, number, message, tmp_path
+):
+    save_changed(tmp_path / "bad.safetensors", {name: number})
+    with pytest.raises(ValueError, match=f"bad.safetensors.*{message}"):
+        egoskin.load_policy(tmp_path / "bad.safetensors")
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"network": {"hidden": [10**7, 10**7]}},
+        {"network": {"hidden": [32] * 10**5}},
+        {"sizes": {"observation": 10**9, "signal": 64, "privileged_observation": 9}},
+        {"num_actions": 10**12},
+        {"num_actions": -1},
+    ],
+    ids=str,
+)
+def test_claims_of_a_header_take_no_memory(changes, tmp_path):
+    path = tmp_path / "large.safetensors"
+    if "network" in changes:
+        _, header = load_tensors(ASSETS / "field_proximity.safetensors")
+        changes = {"network": {**header["policy"]["network"], **changes["network"]}}
+    save_changed(path, changes)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(ValueError, match=r"large.*its header claims a size of"):
+        egoskin.load_policy(path)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000
+
+
+def test_sizes_that_the_tensors_do_not_have_are_refused(tmp_path):
+    path = tmp_path / "other.safetensors"
+    save_changed(path, {"num_actions": 22})
+    with pytest.raises(ValueError, match=r"other.*expected \[22\] of .*, got \[21"):
+        egoskin.load_policy(path)
+
+
+def test_an_action_that_is_not_finite_ends_an_evaluation():
+    policy = egoskin.load_policy("field_proximity")
+    named = policy.named_parameters()
+    (bias,) = (p for name, p in named if name.endswith("head.body.tail.3.bias"))
+    with torch.no_grad():
+        bias[4] = torch.nan
+    config = standard_task(policy.env_config)
+    with pytest.raises(ValueError, match="action is not finite at step 1"):
+        evaluate(policy, config, policy.skin, bank_seed=0, episodes=4, num_workers=1)
 
 
 def test_a_file_that_is_there_comes_before_a_name(tmp_path, monkeypatch):
