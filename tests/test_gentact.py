@@ -334,6 +334,14 @@ GOOD = f"0,0.093,0.02,0.2,1,0,0,0.01,{TORSO},v"
         (current(GOOD, f"1,nan,0,0,1,0,0,0.01,{TORSO},v"), "export:3: x must be a "),
         (current(GOOD, "", f"1,0,inf,0,1,0,0,0,{TORSO},v"), "export:4: y must be a "),
         (current(GOOD, f"1,0,0,zero,1,0,0,0,{TORSO},v"), "number, got 'zero'"),
+        (
+            current(GOOD, f"1,1e308,1e308,0,1,0,0,0,{TORSO},v"),
+            "export:3: .* lies 1.41e.308 m",
+        ),
+        (
+            current(GOOD, f"1,0,0,0,1e308,1e308,0,0,{TORSO},v"),
+            "length 1, got 1.414e.308",
+        ),
         (current(GOOD, f"1,0,0,0,1,0,0,-1,{TORSO},v"), "export:3: the radius must no"),
         (current(GOOD, f"1,0,0,0,1,0,0,big,{TORSO},v"), "export:3: the radius must be"),
         (current(GOOD, f"1,0,0,0,0,0,0,0.01,{TORSO},v"), "length 1, got 0"),
