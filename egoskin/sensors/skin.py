@@ -40,8 +40,9 @@ FARTHEST = 2.0
 
 def _is_number(value: object) -> bool:
     """Whether a JSON value is a finite number; Python also reads NaN and 10^400."""
-    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    return is_number and abs(value) <= sys.float_info.max
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return False
+    return abs(value) <= sys.float_info.max
 
 
 def _is_vector(value: object) -> bool:
