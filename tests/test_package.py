@@ -91,6 +91,9 @@ def test_one_shape_needs_no_list(kind, compiled, robot, skin, random_state):
     assert torch.equal(one["distance"], listed["distance"])
     with pytest.raises(ValueError, match="at least one object"):
         kind(skin, robot.chain, [], 2.0)
+    for wrong in (0.3, [0.3]):
+        with pytest.raises(ValueError, match=r"must be shapes .* got 0\.3"):
+            kind(skin, robot.chain, wrong, 2.0)
 
 
 # --- README -----------------------------------------------------------------------
