@@ -334,14 +334,14 @@ class Policy(TensorDictModuleBase):
 
     def _mean(self, tensordict: TensorDictBase) -> Tensor:
         """Return the mean action, ``[*B, J]``."""
-        inputs = []
-        for key in self.in_keys:
+        keys, inputs = self.env_config.actor_keys, []
+        for key in keys:
             value, size = tensordict.get(key, None), self.policy_spec.sizes[key]
             if value is None:
                 raise KeyError(
-                    f"the policy reads {', '.join(self.in_keys)}; {key!r} is missing"
+                    f"the policy reads {', '.join(keys)}; {key!r} is missing"
                 )
-            if value.shape[-1] != size:
+            if value.shape[-1:] != (size,):
                 raise ValueError(
                     f"the policy was trained with {key!r} [*B, {size}], got "
                     f"{list(value.shape)}: is it the environment of "

@@ -125,7 +125,7 @@ def make_env(skin: Skin, num_envs: int) -> TransformedEnv:
     sensor = FieldSensor(skin, build_chain(MODEL, "torso"), BALL, RANGE)
     return TransformedEnv(
         GymWrapper(envs),
-        Compose(StepCounter(), HumanoidState(), sensor, Proximity(sensor)),
+        Compose([StepCounter(), HumanoidState(), sensor, Proximity(sensor)]),
     )
 
 

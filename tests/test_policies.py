@@ -154,11 +154,10 @@ def test_a_policy_works_under_vmap_and_with_other_parameters(policy):
 def test_what_a_policy_cannot_read_is_said(policy):
     with pytest.raises(KeyError, match="observation, signal; 'signal' is missing"):
         policy(given(3).select("observation"))
-    other = given(3)
-    other["signal"] = torch.ones(3, 32)
-    text = r"trained with 'signal' \[\*B, 64\], got \[3, 32\].*make_env"
-    with pytest.raises(ValueError, match=text):
-        policy(other)
+    for wrong, shape in ((torch.ones(3, 32), r"\[3, 32\]"), (torch.ones(3), r"\[3\]")):
+        text = rf"trained with 'signal' \[\*B, 64\], got {shape}.*make_env"
+        with pytest.raises(ValueError, match=text):
+            policy(given(3).set("signal", wrong))
 
 
 FORMS = {

@@ -12,7 +12,7 @@ a reading of NaN, never one of nothing.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -129,7 +129,8 @@ class ProximitySensor(RowTransform):
         out_keys: Keys of readings and detections.
 
     Raises:
-        ValueError: If the skin does not fit the chain, or there is no object.
+        ValueError: If the skin does not fit the chain, there is no object, or one that
+            is no shape.
     """
 
     _link: Tensor
@@ -151,9 +152,16 @@ class ProximitySensor(RowTransform):
         super().__init__(in_keys, out_keys)
         skin.check_links(chain.get_link_names())
         self.num_sensors = len(skin)
-        self.objects = (objects,) if isinstance(objects, Shape) else tuple(objects)
+        several = isinstance(objects, Iterable)
+        self.objects = tuple(objects) if several else (objects,)
         if not self.objects:
             raise ValueError("a proximity sensor needs at least one object to sense")
+        for shape in self.objects:
+            if not isinstance(shape, Shape):
+                raise ValueError(
+                    "objects must be shapes (egoskin.shapes: Sphere, Box, ..), got "
+                    f"{shape!r}"
+                )
         self.per_object = per_object
         self.readings = torch.Size((len(skin), *num_readings))
         links = list(dict.fromkeys(skin.links))
