@@ -30,6 +30,7 @@ from egoskin.robots import RobotConfig
 from egoskin.sensors import Skin
 from egoskin.sensors.config import SensorConfig
 from egoskin.shapes import Sphere
+from throwing import TASK
 
 SIZE = (160, 90)
 SCRIPT = Path(__file__).parents[1] / "scripts" / "render.py"
@@ -193,7 +194,7 @@ def test_the_end_of_an_episode_is_named(flags, expected):
 
 @pytest.mark.usefixtures("painter")
 def test_a_rigid_robot_is_hit_and_the_last_frame_says_so(skin: Skin):
-    frames = render(EnvConfig(), skin, hold=True, fps=5)
+    frames = render(EnvConfig(task=TASK), skin, hold=True, fps=5)
     assert frames[-1].ending == "hit"
     assert frames[-1].gap < 0.05
     assert all(f.ending is None for f in frames[:-1])
@@ -209,7 +210,7 @@ def test_without_a_skin_there_are_no_sensors_to_draw(coverage, skin: Skin):
 
 @pytest.mark.usefixtures("painter")
 def test_an_episode_is_the_row_of_the_bank(skin: Skin):
-    config, row, steps = EnvConfig(), 5, 6
+    config, row, steps = EnvConfig(task=TASK), 5, 6
     seen = []
 
     def still(td: TensorDictBase) -> TensorDictBase:

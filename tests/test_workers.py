@@ -33,8 +33,10 @@ from egoskin.workers import (
     default_num_workers,
     in_halves,
 )
+from throwing import TASK
 
 NUM_ENVS = 32
+CONFIG = EnvConfig(task=TASK)
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +45,7 @@ def skin():
 
 
 def make_pool(skin, number: int, num_envs: int = NUM_ENVS) -> WorkerPool:
-    return make_env(EnvConfig(), skin, num_envs=num_envs, seed=5, num_workers=number)
+    return make_env(CONFIG, skin, num_envs=num_envs, seed=5, num_workers=number)
 
 
 def steps(pool: WorkerPool, root, count: int, seed: int):
