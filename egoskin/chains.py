@@ -6,6 +6,8 @@ is keyed by an enum that no longer equals an integer) and keeps the root's offse
 
 from __future__ import annotations
 
+import sys
+
 import mujoco
 import numpy as np
 import pytorch_kinematics as pk
@@ -19,14 +21,43 @@ JOINT_TYPES = {
 """Joints that pytorch-kinematics has, by MuJoCo's type."""
 
 
+_BODY, _JOINT = mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_JOINT
+
+
 def body_name(model: mujoco.MjModel, body: int) -> str:
-    """Return the name of a body, ``body2`` if the model gives it none."""
-    return model.body(body).name or f"body{body}"
+    """Return the name of a body; one of its own if the model gives it none.
+
+    That is ``body2``, or ``body2_`` where another body has that name.
+    """
+    return model.body(body).name or _made_name(model, _BODY, f"body{body}")
 
 
 def joint_name(model: mujoco.MjModel, joint: int) -> str:
-    """Return the name of a joint, ``joint3`` if the model gives it none."""
-    return model.joint(joint).name or f"joint{joint}"
+    """Return the name of a joint; one of its own if the model gives it none.
+
+    That is ``joint3``, or ``joint3_`` where another joint has that name.
+    """
+    return model.joint(joint).name or _made_name(model, _JOINT, f"joint{joint}")
+
+
+def _made_name(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str) -> str:
+    """Return a name, with as many underscores after it as make it new."""
+    while mujoco.mj_name2id(model, kind, name) >= 0:
+        name += "_"
+    return name
+
+
+def body_id(model: mujoco.MjModel, name: str) -> int:
+    """Return which body has a name, given or made.
+
+    Raises:
+        KeyError: If none has it.
+    """
+    names = [body_name(model, body) for body in range(model.nbody)]
+    if name not in names:
+        known = ", ".join(map(repr, sorted(names)))
+        raise KeyError(f"the model has no body {name!r}; it has {known}")
+    return names.index(name)
 
 
 def _body_frames(
@@ -69,7 +100,8 @@ def _body_frames(
             before, after = -reference * joint.axis, np.zeros(3)
         mujoco.mju_mulPose(position, quat, position.copy(), quat.copy(), before, turn)
         append(
-            f"{name}:{own_name}",
+            # Frames need names of their own: no body may be called so, too.
+            _made_name(model, _BODY, f"{name}:{own_name}"),
             pk_frame.Joint(
                 own_name,
                 axis=torch.tensor(joint.axis),
@@ -100,26 +132,31 @@ def build_chain(
 
     Returns:
         A chain whose joints and links are the joints below the base and the bodies from
-        it on, in the order and with the names of the model (unnamed ones: ``joint3``,
-        ``body2``). A body with several joints, or one that does not turn about the
+        it on, in the order and with the names of the model (unnamed ones: `joint_name`,
+        `body_name`). A body with several joints, or one that does not turn about the
         body's origin, has further frames, ``body:joint``.
 
     Raises:
         KeyError: If the model has no body of the base's name.
-        ValueError: If a joint below the base is neither hinge nor slide.
+        ValueError: If a joint below the base is neither hinge nor slide, or too many
+            bodies hang on each other in a row.
     """
-
-    def attach(parent: pk_frame.Frame, parent_id: int) -> None:
-        """Append all that hangs on a body to its frame."""
-        for body_id in range(1, model.nbody):
-            if model.body_parentid[body_id] == parent_id:
-                frame = parent
-                for next_frame in _body_frames(model, body_id, dtype):
-                    frame.add_child(next_frame)
-                    frame = next_frame
-                attach(frame, body_id)
-
     joint = pk_frame.Joint(f"{base}_fixed", dtype=dtype)
     root = pk_frame.Frame(base, link=pk_frame.Link(base), joint=joint)
-    attach(root, model.body(base).id)
-    return pk.Chain(root, dtype=dtype)
+    ends = {body_id(model, base): root}
+    # A body comes after its parent.
+    for body in range(1, model.nbody):
+        end = ends.get(int(model.body_parentid[body]))
+        if end is None or body in ends:
+            continue
+        for frame in _body_frames(model, body, dtype):
+            end.add_child(frame)
+            end = frame
+        ends[body] = end
+    try:
+        return pk.Chain(root, dtype=dtype)
+    except RecursionError:
+        raise ValueError(
+            f"too many bodies hang on each other below {base!r}: pytorch-kinematics "
+            f"follows a row of about {sys.getrecursionlimit() - 100} at most"
+        ) from None

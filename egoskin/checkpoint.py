@@ -1,6 +1,7 @@
 """Named tensors with a JSON header in one file, written atomically.
 
-The format is safetensors: loading runs no code from the file.
+The format is safetensors: loading runs no code from the file. Tensors and header are
+sealed together, see `egoskin.formats`: a damaged file does not load.
 """
 
 from __future__ import annotations
@@ -15,6 +16,8 @@ from typing import Any
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
+
+from egoskin.formats import present_header, seal, unseal
 
 _HEADER = "egoskin"
 # Names of files that were being written when their writer was killed.
@@ -34,10 +37,8 @@ def save_tensors(
     Raises:
         OSError: If it cannot be written; what stood there before is intact.
     """
-    content = save(
-        {key: value.detach().cpu().contiguous() for key, value in tensors.items()},
-        metadata={_HEADER: json.dumps(header)},
-    )
+    own = {key: value.detach().cpu().contiguous() for key, value in tensors.items()}
+    content = save(own, metadata={_HEADER: json.dumps(seal(header, own))})
     write_file(path, content)
 
 
@@ -64,6 +65,24 @@ def write_file(path: Path, content: bytes) -> None:
         raise OSError(error.errno, error.strerror, str(path)) from error
 
 
+def append(path: Path, content: bytes) -> None:
+    """Append to a file that is there, and is no link.
+
+    Raises:
+        OSError: If it is not there or cannot be written; the text names it.
+    """
+    try:
+        with open(path, "ab", opener=_open_to_append) as file:
+            file.write(content)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error
+
+
+def _open_to_append(path: str, flags: int) -> int:
+    kept = flags & ~os.O_CREAT
+    return os.open(path, kept | os.O_NOFOLLOW | os.O_NONBLOCK)
+
+
 def sync(path: Path) -> None:
     """Wait until a file or folder is on disk."""
     descriptor = os.open(path, os.O_RDONLY)
@@ -76,9 +95,11 @@ def sync(path: Path) -> None:
 def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Return (tensors by name, header) of a file that `save_tensors` wrote.
 
+    Configurations in the header are brought into the present format.
+
     Raises:
-        ValueError: If the file is missing, truncated or another format; the text
-            names it.
+        ValueError: If the file is missing, damaged or another format; the text names
+            it.
     """
     if not path.is_file():
         raise ValueError(f"no such file: {path}")
@@ -94,11 +115,12 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         raise ValueError(f"{path} was not written by egoskin")
     try:
         header = json.loads(metadata[_HEADER])
-    except json.JSONDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is damaged: its header is not JSON") from error
     if not isinstance(header, dict):
         raise ValueError(f"{path} is damaged: its header is no object")
-    return tensors, header
+    header, number = unseal(header, str(path), tensors)
+    return tensors, present_header(header, number, str(path))
 
 
 def prefixed(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -12,7 +12,8 @@ offset the root itself has, so that they depend on the joint positions alone.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -77,34 +78,34 @@ class LinkKinematics:
         links: Names of the links wanted, in the order of the results.
 
     Raises:
-        ValueError: If a link is not in the chain.
+        ValueError: If a link is not in the chain, or the chain does not say which
+            joint or link is meant: two have one name, or an axis is none.
     """
 
     def __init__(self, chain: pk.Chain, links: Sequence[str]) -> None:
         self.links = tuple(links)
         joint_names = chain.get_joint_parameter_names()
         self.num_joints = len(joint_names)
+        joint_index = {str(name): i for i, name in enumerate(joint_names)}
+        _check_different("joints", joint_names)
+        frames = _frames(chain)
+        _check_different("links", [frame.name for frame, _ in frames])
+        wanted = {frame.name for frame, _ in frames} & set(self.links)
+        # Only what leads to a wanted link is evaluated.
+        needed = [frame.name in wanted for frame, _ in frames]
+        for i in range(len(frames) - 1, 0, -1):
+            needed[frames[i][1]] |= needed[i]
         steps: list[tuple[int, pk.Frame]] = []
-        slots: dict[str, int] = {}
-        root = chain._root  # the public methods return frames by name only
-
-        def visit(frame: pk.Frame, parent: int) -> bool:
-            """Append the step to a frame if it leads to a wanted link."""
-            mark = len(steps)
-            slot = parent
-            if frame is not root:
-                slot = mark + 1
-                steps.append((parent, frame))
-            wanted = frame.name in self.links
-            if wanted:
-                slots[frame.name] = slot
-            below = [visit(child, slot) for child in frame.children]
-            if not wanted and not any(below):
-                del steps[mark:]
-                return False
-            return True
-
-        visit(root, 0)
+        slot = {0: 0}
+        for i, (frame, parent) in enumerate(frames):
+            if i > 0 and needed[i]:
+                steps.append((slot[parent], frame))
+                slot[i] = len(steps)
+        slots = {
+            frame.name: slot[i]
+            for i, (frame, _) in enumerate(frames)
+            if frame.name in wanted
+        }
         missing = [name for name in self.links if name not in slots]
         if missing:
             raise ValueError(
@@ -113,7 +114,7 @@ class LinkKinematics:
             )
         self.frames = np.array([slots[name] for name in self.links], dtype=np.int64)
         """Frame of each link; see `Steps`."""
-        columns = [_step(parent, frame, joint_names) for parent, frame in steps]
+        columns = [_step(parent, frame, joint_index) for parent, frame in steps]
         shapes = [(), (), (3, 3), (3, 3), (3, 3), (3,), (3,)]
         types = [np.int64] * 2 + [np.float64] * 5
         self.steps = Steps(
@@ -209,7 +210,30 @@ class LinkKinematics:
         return rotation[wanted].permute(1, 2, 0, 3), position[wanted].transpose(0, 1)
 
 
-def _step(parent: int, frame: pk.Frame, joint_names: Sequence[str]) -> tuple:
+def _frames(chain: pk.Chain) -> list[tuple[pk.Frame, int]]:
+    """Return all frames, each with the place of its parent, depth first."""
+    found: list[tuple[pk.Frame, int]] = []
+    # The public methods of a chain return frames by name only.
+    left = [(chain._root, -1)]
+    while left:
+        frame, parent = left.pop()
+        found.append((frame, parent))
+        below = [(child, len(found) - 1) for child in frame.children]
+        left += reversed(below)
+    return found
+
+
+def _check_different(what: str, names: Sequence[str]) -> None:
+    """Raise ValueError if two names are equal: which is meant nobody could say."""
+    twice = [name for name, number in Counter(names).items() if number > 1]
+    if twice:
+        raise ValueError(
+            f"two {what} of the chain have the name {twice[0]!r}: give each a name of "
+            "its own in the robot's file"
+        )
+
+
+def _step(parent: int, frame: pk.Frame, joint_index: Mapping[str, int]) -> tuple:
     """Return what `Steps` holds of the step to a frame."""
     joint = frame.joint
     offset = _matrix(frame.link.offset) @ _matrix(joint.offset)
@@ -221,7 +245,12 @@ def _step(parent: int, frame: pk.Frame, joint_names: Sequence[str]) -> tuple:
         along, skew = np.outer(axis, axis), np.cross(np.eye(3), axis)
     elif joint.joint_type == "prismatic":
         slide = turn @ axis
-    number = -1 if joint.joint_type == "fixed" else joint_names.index(joint.name)
+    number = -1 if joint.joint_type == "fixed" else joint_index[str(joint.name)]
+    if number >= 0 and not np.isfinite(axis).all():
+        raise ValueError(
+            f"the axis of joint {joint.name!r} must have a direction; the robot's file "
+            "says 0 0 0"
+        )
     return (
         *(parent, number),
         *(turn @ along, turn @ (np.eye(3) - along), turn @ skew),

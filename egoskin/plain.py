@@ -10,6 +10,8 @@ from typing import Any, TypeVar
 
 import dacite
 
+from egoskin.files import read_regular
+
 T = TypeVar("T")
 
 
@@ -18,10 +20,12 @@ def read_json(path: Path) -> Any:
 
     Raises:
         ValueError: If it is none; the text names it.
+        OSError: If it cannot be read.
     """
+    content = read_regular(path)
     try:
-        return json.loads(path.read_text())
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        return json.loads(content)
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not JSON: {error}") from error
 
 

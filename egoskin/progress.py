@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import sys
 import time
 from collections.abc import Mapping
@@ -16,6 +17,9 @@ class ProgressLine:
     Args:
         frames: Frames done before.
         total: Frames at the end.
+
+    Attributes:
+        is_unread: Whether nobody reads it any more.
     """
 
     def __init__(self, frames: int, total: int) -> None:
@@ -23,14 +27,16 @@ class ProgressLine:
         self._start = time.monotonic()
         self._shown = float("-inf")
         self._live = sys.stdout.isatty()
+        self.is_unread = False
 
     def update(self, metrics: Mapping[str, float]) -> None:
         """Show the state after a rollout."""
         now, frames = time.monotonic(), metrics["frames"]
+        total = f"{self._total:,}"
         # Before any episode was old enough there is none to tell of.
         success = f"{metrics['episode/success']:6.1%}".replace("nan%", "   -")
         text = (
-            f"{frames / 1e6:8.2f} M / {self._total / 1e6:.1f} M frames  "
+            f"{frames:{len(total)},.0f} / {total} frames  "
             f"{frames / self._total:6.1%}  ETA {self._left(now, frames)}  "
             f"{metrics['time/steps_per_s']:8,.0f} steps/s  "
             f"survival {metrics['episode/survival_s']:5.2f} s  "
@@ -38,15 +44,27 @@ class ProgressLine:
             f"reward {metrics['reward/mean']:+.4f}"
         )
         if self._live:
-            print(f"\r{text}\x1b[K", end="", flush=True)
+            self._print(f"\r{text}\x1b[K", end="")
         elif now - self._shown >= _FILE_INTERVAL or frames >= self._total:
-            print(text, flush=True)
+            self._print(text)
             self._shown = now
 
     def finish(self) -> None:
         """Leave the line."""
         if self._live:
-            print(flush=True)
+            self._print("")
+
+    def _print(self, text: str, end: str = "\n") -> None:
+        """Print, and note if nobody reads it: the run is to end with a checkpoint."""
+        if self.is_unread:
+            return
+        try:
+            print(text, end=end, flush=True)
+        except OSError as error:
+            # A closed pipe, a closed terminal.
+            if error.errno not in (errno.EPIPE, errno.EIO):
+                raise
+            self.is_unread = True
 
     def _left(self, now: float, frames: float) -> str:
         done = frames - self._first

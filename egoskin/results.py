@@ -25,38 +25,19 @@ from typing import Any
 
 import numpy as np
 
+from egoskin.formats import migrate, read_sealed
 from egoskin.plain import changed_fields, from_plain, read_json, to_plain
-from egoskin.runs import Run, TrainConfig
+from egoskin.runs import MACHINE_FIELDS, SKIN_HASH, Run, TrainConfig
 
 # Environment steps between the stored lines of metrics (about 250 in the paper's 1000
 # epochs), and their significant digits.
 _THIN_FRAMES, _DIGITS = 2**18, 6
-# How a run was called and where, which changes no result; and what names a cell.
-_NO_RECIPE = {
-    "seed",
-    "total_frames",
-    "num_workers",
-    "device",
-    "learner_threads",
-    "run_dir",
-    "snapshot_frames",
-    "checkpoint_interval",
-    "resume",
-}
+# What makes no other recipe of a run; and what names a cell.
+_NO_RECIPE = MACHINE_FIELDS | {"seed", "total_frames", "device"}
 # What tells most comes first in tables and pictures.
 _COVERAGES = ("oracle", "field", "ray", "none")
 _SIGNALS = ("localization", "proximity", "closeness", "binary")
 _CELL = {"env.sensor.coverage", "env.sensor.signal", "env.sensor.range"}
-# Options of stored runs that are no more, and their values without effect: steps over
-# which what of a ball touches grew, the price of the distance from the start (from
-# "drift_start" on), and the speed of the balls (from "slow_start", 0.4 of it, on); and
-# whether an oracle was told first of the ball that passes next.
-_RETIRED = {
-    "core_frames": [0, 0],
-    "drift_frames": [0, 0],
-    "slow_start_frames": 0,
-    "told_next_first": False,
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,12 +161,11 @@ def record(run: Run, frames: int) -> Record:
     Raises:
         ValueError: If the folder does not say.
     """
-    file = run.path / "versions.json"
-    if not file.is_file():
+    starts = run.starts()
+    if not starts:
         raise ValueError(f"{run.path} has not been started: it has no versions.json")
-    starts = read_json(file)
-    with open(run.path / "metrics.csv", newline="") as source:
-        rows = [r for r in csv.DictReader(source) if int(r["frames"]) <= frames]
+    lines = csv.DictReader(io.StringIO(run.metrics()))
+    rows = [row for row in lines if int(row["frames"]) <= frames]
     script, *args = starts[0]["command"]
     # Where a run's folder was is of no interest anywhere else.
     args = _without(args, "--run-dir")
@@ -262,12 +242,10 @@ def load_run(path: Path) -> StoredRun:
     ).reshape(-1, 2)
     # No estimate before an episode could have lasted so long.
     curve = curve[np.isfinite(curve[:, 1])]
-    content = read_json(path / "config.json")
-    content.pop("drift_start", None)
-    content.pop("slow_start", None)
-    content.pop("compile_kernels", None)
-    used = {name: content.pop(name, off) for name, off in _RETIRED.items()}
-    retired = {name: used[name] for name in used if used[name] != _RETIRED[name]}
+    # Stored runs are under version control, with a seal or without.
+    content, number = read_sealed(path / "config.json", quiet=True)
+    content.pop(SKIN_HASH, None)
+    content, retired = migrate(content, number)
     return StoredRun(
         name=path.name,
         config=from_plain(TrainConfig, content, str(path / "config.json")),

@@ -8,8 +8,9 @@ once, in the properties of the configuration.
 from __future__ import annotations
 
 import fnmatch
+import re
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
@@ -18,7 +19,8 @@ import mujoco
 import numpy as np
 import pytorch_kinematics as pk
 
-from egoskin.chains import JOINT_TYPES, body_name, build_chain, joint_name
+from egoskin.chains import JOINT_TYPES, body_id, body_name, build_chain, joint_name
+from egoskin.files import check_regular, read_regular
 
 ASSETS = Path(__file__).parent / "assets"
 
@@ -90,7 +92,8 @@ class RobotConfig:
     name: str
     """Name by which configurations refer to the robot."""
     model_path: Path
-    """MJCF; only what hangs on the base counts."""
+    """MJCF or URDF; only what hangs on the base counts. Of a URDF links on fixed joints
+    are links, too, and meshes, which seldom lie where it says, are left out."""
     base: str
     """Root of `chain`, the *robot's centre frame*: the body with the free joint or, of
     a robot that stands fixed, one that is welded to the world, or ``"world"``."""
@@ -109,16 +112,38 @@ class RobotConfig:
     @cached_property
     def model(self) -> mujoco.MjModel:
         """The robot alone, compiled."""
-        return mujoco.MjModel.from_xml_path(str(self.model_path))
+        spec = self.spec()
+        try:
+            return spec.compile()
+        except ValueError as error:
+            raise _unreadable(self.model_path, error) from error
 
     def spec(self) -> mujoco.MjSpec:
-        """Return a fresh, editable specification of the robot."""
-        return mujoco.MjSpec.from_file(str(self.model_path))
+        """Return a fresh, editable specification of the robot.
+
+        Raises:
+            ValueError: If the file is no MJCF or URDF that MuJoCo can read.
+            OSError: If there is no such file.
+        """
+        path = self.model_path
+        is_urdf = _root_tag(read_regular(path)) == "robot"
+        try:
+            spec = mujoco.MjSpec.from_file(str(path))
+        except ValueError as error:
+            raise _unreadable(path, error) from error
+        if is_urdf:
+            for element in (*_mesh_geoms(spec), *spec.meshes):
+                spec.delete(element)
+            spec.compiler.fusestatic = False
+            # A URDF may leave out masses, and MuJoCo wants them where joints move.
+            spec.compiler.boundmass = spec.compiler.boundinertia = 1e-6
+            spec.compiler.balanceinertia = True
+        return spec
 
     @cached_property
     def _bodies(self) -> list[int]:
         """The base, be it the world, and all that hangs on it, in MuJoCo's order."""
-        bodies = [self.model.body(self.base).id]
+        bodies = [body_id(self.model, self.base)]
         for body in range(bodies[0] + 1, self.model.nbody):
             if self.model.body_parentid[body] in bodies:
                 bodies.append(body)
@@ -249,6 +274,53 @@ class RobotConfig:
     def chain(self) -> pk.Chain:
         """Kinematic chain from the base, for pytorch-kinematics."""
         return build_chain(self.model, self.base)
+
+
+def read_robot(path: Path | str) -> RobotConfig:
+    """Return the robot of an MJCF or URDF file, to place or import sensors on.
+
+    Its base is the one body that stands in the world, or the world itself where several
+    do; all its links may carry skin. Its name is the model's, or else the file's.
+
+    Raises:
+        ValueError: If the file is no MJCF or URDF that MuJoCo can read.
+        OSError: If there is no such file.
+    """
+    path = Path(path)
+    # Elsewhere MuJoCo does not know the format, and logs a warning.
+    if path.suffix.lower() not in (".xml", ".urdf"):
+        check_regular(path)
+        raise ValueError(f"{path} must be an MJCF (.xml) or a URDF (.urdf, .xml)")
+    whole = RobotConfig(name=path.stem, model_path=path, base="world", skin_links=())
+    model, name = whole.model, whole.spec().modelname
+    in_world = np.flatnonzero(model.body_parentid[1:] == 0) + 1
+    one = len(in_world) == 1
+    return replace(
+        whole,
+        # That of a model without a name.
+        name=whole.name if name in ("", "MuJoCo Model") else name,
+        base=body_name(model, int(in_world[0])) if one else "world",
+        skin_links=whole.links,
+    )
+
+
+def _root_tag(content: bytes) -> str:
+    """Name of the outermost element of an XML file, "" if there is none."""
+    content = re.sub(rb"<!--.*?-->", b"", content, flags=re.DOTALL)
+    tag = re.search(rb"<([A-Za-z][\w:.-]*)", content)
+    return "" if tag is None else tag[1].decode()
+
+
+def _mesh_geoms(spec: mujoco.MjSpec) -> list[mujoco.MjsGeom]:
+    """Return the geoms that are meshes."""
+    return [g for g in spec.geoms if g.type == mujoco.mjtGeom.mjGEOM_MESH]
+
+
+def _unreadable(path: Path, error: ValueError) -> ValueError:
+    """The error for a file that MuJoCo refuses, on one line."""
+    return ValueError(
+        f"{path} is no robot that MuJoCo can read: {' '.join(str(error).split())}"
+    )
 
 
 def _primitive_kind(model: mujoco.MjModel, geom: int) -> str:

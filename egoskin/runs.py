@@ -11,7 +11,9 @@
 
 Contract: a checkpoint is written atomically, metrics written after it are dropped on
 resume, and one process trains at a time, so that a log has neither a gap nor a
-repetition.
+repetition. A checkpoint holds the configuration it was trained with, a hash of the
+skin, and both logs: a run whose files were edited, exchanged or damaged either goes on
+as if they had not been, or does not.
 """
 
 from __future__ import annotations
@@ -20,9 +22,8 @@ import argparse
 import csv
 import datetime
 import fcntl
-import importlib.metadata
 import io
-import json
+import itertools
 import os
 import platform
 import subprocess
@@ -33,20 +34,37 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, get_args
 
+import numpy as np
 import torch
 import tyro
 from torch import Tensor
 
 from egoskin.agents.ppo import PPOConfig
-from egoskin.checkpoint import PARTIAL, load_tensors, save_tensors, sync, write_file
+from egoskin.checkpoint import (
+    PARTIAL,
+    append,
+    load_tensors,
+    save_tensors,
+    write_file,
+)
 from egoskin.cli import check_counts
 from egoskin.draws import check_seed
 from egoskin.envs.dodgeball import DodgeballConfig
 from egoskin.envs.standards import Standard, training_task
 from egoskin.events import EventFile
+from egoskin.files import read_regular
+from egoskin.formats import (
+    content_hash,
+    package_version,
+    present_config,
+    read_sealed,
+    sealed_json,
+    unseal,
+)
 from egoskin.make import EnvConfig, check_num_workers
 from egoskin.plain import changed_fields, check_numbers, from_plain, read_json, to_plain
 from egoskin.policies import CHECKPOINT_NAME
+from egoskin.sensors import Skin
 from egoskin.workers import available_cores
 
 _PACKAGES = ("egoskin", "torch", "torchrl", "tensordict", "mujoco", "numpy")
@@ -83,7 +101,8 @@ class TrainConfig:
     checkpoint_interval: float = 60.0
     """A checkpoint is at most this old [s]."""
     resume: Path | None = None
-    """Run folder to go on with; only --total-frames may be changed, to a later end."""
+    """Run folder to go on with; changed may be --total-frames, to a later end, and what
+    changes no result: workers, threads, when checkpoints and policies are kept."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for values with which no run can start."""
@@ -137,15 +156,33 @@ class TrainConfig:
         return device
 
 
+MACHINE_FIELDS = frozenset(
+    (
+        "num_workers",
+        "learner_threads",
+        "snapshot_frames",
+        "checkpoint_interval",
+        "run_dir",
+        "resume",
+        "standard",
+    )
+)
+"""Fields that say where a run is computed and what is kept of it: they change no
+result, to the last bit, and may change at a resume. The device is none of them: sums
+on another one round otherwise."""
 # What a run's stored configuration leaves out: it says how a run was called.
 _CALL_FIELDS = ("run_dir", "resume", "standard")
+SKIN_HASH = "skin_sha256"
+"""What config.json holds beside the configuration: the hash of the skin."""
+# Where a checkpoint keeps the metrics.
+_METRICS = "log/metrics"
 
 
 def parse_config(args: list[str]) -> TrainConfig:
     """Return the configuration of a command line.
 
     With ``--resume RUN`` the stored configuration of the run is the default, and no
-    field but ``total_frames`` may differ from it.
+    field but ``total_frames`` and `MACHINE_FIELDS` may differ from it.
 
     Args:
         args: Arguments, without the program's name.
@@ -169,23 +206,22 @@ def parse_config(args: list[str]) -> TrainConfig:
     stored = Run.open(run.resume).config
     # What the file lacks was filled with today's defaults.
     file, before = run.resume / "config.json", to_plain(stored)
-    if lacking := changed_fields(_stored(file), before):
+    if lacking := changed_fields(_read_config(file)[0], before):
         raise ValueError(
             f"{file} lacks {', '.join(lacking)}: another version made it. Go on with "
-            "that version (its commit is in versions.json), or add what it lacks"
+            "that version (its commit is in versions.json)"
         )
     config = tyro.cli(TrainConfig, args=args, default=stored)
-    after = to_plain(config)
-    for name in _CALL_FIELDS:
-        del before[name], after[name]
     if config.run_dir is not None:
         raise ValueError("--run-dir cannot be changed on resume")
-    changed = [n for n in changed_fields(before, after) if n != "total_frames"]
+    free = MACHINE_FIELDS | {"total_frames"}
+    changed = [n for n in changed_fields(before, to_plain(config)) if n not in free]
     if changed:
         names = ", ".join(n.removeprefix("env.") for n in changed)
+        may = sorted(free - set(_CALL_FIELDS))
         raise ValueError(
             f"a resumed run keeps its configuration; changed: {names}. Only "
-            "--total-frames may be, to a later end"
+            f"{', '.join(map(_option, may))} may be"
         )
     if config.total_frames < stored.total_frames:
         raise ValueError(
@@ -195,13 +231,19 @@ def parse_config(args: list[str]) -> TrainConfig:
     return config
 
 
-def _stored(file: Path) -> Any:
-    """Return the plain values of a stored configuration, without a field of old."""
-    content = read_json(file)
-    if isinstance(content, dict):
-        # Sensors were compiled as it said; now they are where they can be.
-        content.pop("compile_kernels", None)
-    return content
+def _option(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
+def _read_config(file: Path) -> tuple[dict[str, Any], str | None]:
+    """Return (configuration in the present format, hash of the skin if it holds one).
+
+    Raises:
+        ValueError: If it is damaged, or has options that are no more.
+    """
+    content, number = read_sealed(file)
+    skin = content.pop(SKIN_HASH, None)
+    return present_config(content, number, str(file)), skin
 
 
 class Run:
@@ -215,7 +257,10 @@ class Run:
     def __init__(self, path: Path, config: TrainConfig) -> None:
         self.path, self.config = path, config
         self._events: EventFile | None = None
-        self._columns: list[str] | None = None
+        self._skin_hash = ""
+        # The logs up to now: a line for each rollout, an entry for each start.
+        self._metrics = ""
+        self._starts: list[dict[str, Any]] = []
 
     @classmethod
     def create(cls, config: TrainConfig) -> Run:
@@ -241,6 +286,7 @@ class Run:
         (path / "policies").mkdir(parents=True)
         run = cls(path, config)
         skin.save(run.skin_path)
+        run._skin_hash = content_hash(read_json(run.skin_path))
         # Last: a folder with a configuration can be resumed.
         run.write_config()
         return run
@@ -255,34 +301,98 @@ class Run:
         file = path / "config.json"
         if not file.is_file():
             raise ValueError(f"{path} is no run folder: it has no config.json")
-        return cls(path, from_plain(TrainConfig, _stored(file), str(file)))
+        return cls(path, from_plain(TrainConfig, _read_config(file)[0], str(file)))
 
     def write_config(self) -> None:
-        """Write the configuration (again, with a later end)."""
+        """Write the configuration (again, with a later end) and the skin's hash."""
         content = to_plain(self.config)
         for name in _CALL_FIELDS:
             content[name] = None
-        self._write_json("config.json", content)
+        content[SKIN_HASH] = self._skin_hash
+        write_file(self.path / "config.json", sealed_json(content))
+
+    def load_skin(self) -> Skin:
+        """Return the skin the run was started with.
+
+        Raises:
+            ValueError: If there is none, or it is another.
+        """
+        skin = Skin.load(self.skin_path)
+        self._skin_hash = content_hash(read_json(self.skin_path))
+        _, written = _read_config(self.path / "config.json")
+        if written not in (None, self._skin_hash):
+            raise ValueError(
+                f"{self.skin_path} is damaged or was edited: it is not the skin that "
+                "the run was started with; put it back as it was"
+            )
+        return skin
+
+    def _trained_with(self) -> dict[str, Any]:
+        """Return what decides the run's results: its configuration, the skin's hash."""
+        free = MACHINE_FIELDS | {"total_frames"}
+        content = {k: v for k, v in to_plain(self.config).items() if k not in free}
+        return {**content, SKIN_HASH: self._skin_hash}
+
+    def _check_trained_with(self, before: Mapping[str, Any]) -> None:
+        """Raise ValueError if a checkpoint was trained with anything else."""
+        changed = changed_fields(dict(before), self._trained_with())
+        if SKIN_HASH in changed:
+            raise ValueError(
+                f"{self.skin_path} is not the skin that {self.checkpoint_path} was "
+                "trained with: put that back"
+            )
+        if changed:
+            names = ", ".join(name.removeprefix("env.") for name in changed)
+            raise ValueError(
+                f"{self.path / 'config.json'} is not what {self.checkpoint_path} was "
+                f"trained with: put that back (changed: {names})"
+            )
+
+    def starts(self) -> list[dict[str, Any]]:
+        """Return versions, machine, git state and command of each start so far.
+
+        Raises:
+            ValueError: If the file that says so is damaged.
+        """
+        if not self._versions_path.exists():
+            return []
+        content, what = read_json(self._versions_path), str(self._versions_path)
+        if isinstance(content, list):
+            # So it was in format 1.
+            return unseal({"starts": content}, what)[0]["starts"]
+        if not isinstance(content, dict) or "sha256" not in content:
+            raise ValueError(f"{what} is damaged or was edited")
+        return unseal(content, what)[0]["starts"]
 
     def record_start(self) -> None:
-        """Append versions, machine, git state and command of this start."""
-        file = self.path / "versions.json"
-        starts = read_json(file) if file.exists() else []
-        starts.append(
+        """Add versions, machine, git state and command of this start to the log."""
+        try:
+            # What was started after the latest checkpoint is in the file alone.
+            starts = self.starts() or self._starts
+            if starts[: len(self._starts)] != self._starts:
+                raise ValueError(f"{self._versions_path} is that of another run")
+            self._starts = starts
+        except ValueError as error:
+            self._put_aside(self._versions_path, str(error))
+        self._starts.append(
             {
                 "time": datetime.datetime.now(datetime.timezone.utc).isoformat(),
                 "command": sys.argv,
                 "python": platform.python_version(),
                 "machine": f"{platform.system()} {platform.machine()}",
                 "cores": os.cpu_count(),
-                "packages": {p: _version(p) for p in _PACKAGES},
+                "packages": {p: package_version(p) for p in _PACKAGES},
                 "git": _git_state(),
             }
         )
-        self._write_json(file.name, starts)
+        write_file(self._versions_path, sealed_json({"starts": self._starts}))
 
-    def _write_json(self, name: str, content: Any) -> None:
-        write_file(self.path / name, (json.dumps(content, indent=2) + "\n").encode())
+    def _put_aside(self, path: Path, why: str) -> None:
+        """Rename a damaged log, over no other file, and say so."""
+        names = (f"{path.stem}-damaged-{i}{path.suffix}" for i in itertools.count(1))
+        free = next(n for n in map(path.with_name, names) if not os.path.lexists(n))
+        path.rename(free)
+        print(f"note: {why}; it is now {free.name}", file=sys.stderr)
 
     @property
     def skin_path(self) -> Path:
@@ -305,6 +415,10 @@ class Run:
     @property
     def _metrics_path(self) -> Path:
         return self.path / "metrics.csv"
+
+    @property
+    def _versions_path(self) -> Path:
+        return self.path / "versions.json"
 
     @contextmanager
     def locked(self) -> Iterator[None]:
@@ -335,38 +449,68 @@ class Run:
     def save_checkpoint(
         self, tensors: Mapping[str, Tensor], header: Mapping[str, Any]
     ) -> None:
-        """Replace the checkpoint; all metrics so far are on disk before it."""
-        if self._metrics_path.exists():
-            sync(self._metrics_path)
-        save_tensors(self.checkpoint_path, tensors, header)
+        """Replace the checkpoint; it holds all logs so far, and what was trained."""
+        log = np.frombuffer(self._metrics.encode(), np.uint8).copy()
+        save_tensors(
+            self.checkpoint_path,
+            {**tensors, _METRICS: torch.from_numpy(log)},
+            {**header, "config": self._trained_with(), "starts": self._starts},
+        )
 
     def load_checkpoint(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Return what `save_checkpoint` wrote last."""
-        return load_tensors(self.checkpoint_path)
+        """Return what `save_checkpoint` wrote last, and take the logs from it.
+
+        Raises:
+            ValueError: If it is damaged, or was trained with another configuration or
+                skin; the text names them.
+        """
+        self.load_skin()
+        tensors, header = load_tensors(self.checkpoint_path)
+        # Checkpoints of format 1 hold none of these.
+        if "config" in header:
+            self._check_trained_with(header.pop("config"))
+        self._starts = header.pop("starts", [])
+        if _METRICS in tensors:
+            self._metrics = _text(tensors.pop(_METRICS))
+        else:
+            self._metrics = _whole_rows(self._metrics_path, header.get("frames", 0))
+        return tensors, header
+
+    def metrics(self) -> str:
+        """Return the log of the rollouts up to the latest checkpoint, as CSV.
+
+        Raises:
+            ValueError: If there is none, or the checkpoint is damaged.
+        """
+        if self.checkpoint_path.exists():
+            tensors, _ = load_tensors(self.checkpoint_path)
+            if _METRICS in tensors:
+                return _text(tensors[_METRICS])
+        if not self._metrics_path.is_file():
+            raise ValueError(f"{self.path} has not been trained: it has no metrics.csv")
+        return self._metrics_path.read_text()
 
     def start_metrics(self, frames: int) -> None:
         """Open the logs, dropping what was logged after a number of frames.
 
-        The folder of the policies, if somebody removed it, is made again.
+        The folder of the policies, if somebody removed it, is made again, and so is the
+        log of metrics if somebody removed, edited or damaged it.
         """
         (self.path / "policies").mkdir(exist_ok=True)
         for left in self.path.rglob(PARTIAL):
             left.unlink()
-        if self._metrics_path.exists():
-            with open(self._metrics_path, newline="") as source:
-                rows = list(csv.DictReader(source))
-            # A line that a crash cut short lacks columns.
-            whole = [row for row in rows if None not in row.values()]
-            kept = [row for row in whole if int(row["frames"]) <= frames]
-            if kept:
-                self._columns = list(kept[0])
-                text = io.StringIO()
-                writer = csv.DictWriter(text, self._columns)
-                writer.writeheader()
-                writer.writerows(kept)
-                write_file(self._metrics_path, text.getvalue().encode())
-            else:
-                self._metrics_path.unlink()
+        path, text = self._metrics_path, self._metrics.encode()
+        try:
+            if not read_regular(path, sys.maxsize).startswith(text):
+                raise ValueError(f"{path} is damaged or was edited")
+        except FileNotFoundError:
+            pass
+        except ValueError as error:
+            self._put_aside(path, str(error))
+        if text:
+            write_file(path, text)
+        else:
+            path.unlink(missing_ok=True)
         self._events = EventFile(self.path, frames)
 
     def log(self, metrics: Mapping[str, float]) -> None:
@@ -376,14 +520,18 @@ class Run:
             metrics: Values by name; "frames" is the x axis.
         """
         assert self._events is not None, "start_metrics first"
-        first = self._columns is None
-        if self._columns is None:
-            self._columns = list(metrics)
-        with open(self._metrics_path, "a", newline="") as file:
-            writer = csv.DictWriter(file, self._columns)
-            if first:
-                writer.writeheader()
-            writer.writerow(dict(metrics))
+        first, line = not self._metrics, io.StringIO()
+        columns = metrics if first else next(csv.reader(self._metrics.splitlines()))
+        writer = csv.DictWriter(line, list(columns))
+        if first:
+            writer.writeheader()
+        writer.writerow(dict(metrics))
+        self._metrics += line.getvalue()
+        try:
+            append(self._metrics_path, line.getvalue().encode())
+        except FileNotFoundError:
+            # The first line, or somebody removed the file.
+            write_file(self._metrics_path, self._metrics.encode())
         self._events.log(metrics)
 
     def close(self) -> None:
@@ -392,11 +540,25 @@ class Run:
             self._events.close()
 
 
-def _version(package: str) -> str | None:
+def _text(characters: Tensor) -> str:
+    """Return the text that a checkpoint keeps as a tensor of bytes."""
+    return characters.numpy().tobytes().decode()
+
+
+def _whole_rows(path: Path, frames: int) -> str:
+    """Return a log of metrics up to some frames, as far as it can be read."""
     try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None
+        text = read_regular(path, sys.maxsize).decode()
+        first, *lines = text.splitlines(keepends=True)
+        columns = first.strip().split(",")
+        # A line that a crash cut short lacks columns.
+        rows = [(line, line.strip().split(",")) for line in lines]
+        whole = [(line, row) for line, row in rows if len(row) == len(columns)]
+        place = columns.index("frames")
+        kept = [line for line, row in whole if int(row[place]) <= frames]
+    except (OSError, ValueError):
+        return ""
+    return "".join([first, *kept]) if kept else ""
 
 
 def _git_state() -> dict[str, Any] | None:

@@ -271,13 +271,22 @@ def outside_primitives(
     """
     shift, turn = default_frames(robot)
     frames = [robot.links.index(shape.link) for shape in shapes]
+    centres = [
+        shift[i] + turn[i] @ shape.position
+        for shape, i in zip(shapes, frames, strict=True)
+    ]
 
     def side(points: np.ndarray, normals: np.ndarray, stand_off: float) -> np.ndarray:
         outside = np.ones(len(points))
         for height in {0.0, stand_off}:
             at = points + height * normals
-            for shape, i in zip(shapes, frames, strict=True):
-                outside *= distance_to(shape, (at - shift[i]) @ turn[i]) > -_INSIDE
+            for shape, i, centre in zip(shapes, frames, centres, strict=True):
+                # No shape reaches farther from its centre than the sum of its sizes.
+                away = at - centre
+                reach = shape.size.sum()
+                near = np.flatnonzero(np.einsum("ij,ij->i", away, away) < reach**2)
+                local = (at[near] - shift[i]) @ turn[i]
+                outside[near] *= distance_to(shape, local) > -_INSIDE
         return outside
 
     return side

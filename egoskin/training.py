@@ -238,7 +238,7 @@ def open_trainer(run: Run, num_threads: int = 1) -> Iterator[Trainer]:
     torch.set_num_threads(1)
     with run.locked():
         # What cannot be read is told of before the workers start.
-        skin = Skin.load(run.skin_path)
+        skin = run.load_skin()
         checkpoint = None if run.is_new() else run.load_checkpoint()
         # It imports while the rest is made.
         start_server()

@@ -19,16 +19,20 @@ import subprocess
 import tempfile
 import time
 import traceback
+import weakref
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from multiprocessing import (
+    active_children,
+    current_process,
     forkserver,
     parent_process,
     resource_tracker,
     set_forkserver_preload,
     util,
 )
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from threading import Event, Thread
 from typing import NoReturn, TypeVar
@@ -38,6 +42,8 @@ import torchrl._utils
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase, ParallelEnv, Transform, TransformedEnv
+
+from egoskin.interrupts import ENDING
 
 # How long the parent sleeps between looks at its workers: first this share of the time
 # that the last step took, then at least this [s], and this share of the time it has
@@ -54,6 +60,15 @@ _DEATH_NOTICE = 5.0
 
 
 T = TypeVar("T")
+
+# Exit status of a worker that would start workers itself, and what to do about it.
+_UNGUARDED = 97
+_GUARD = (
+    "error: workers import the script that starts them, and this one would start them "
+    'again: put what it does into a function, called under `if __name__ == "__main__":`'
+)
+# What to end when this process ends.
+_processes: weakref.WeakSet[BaseProcess] = weakref.WeakSet()
 
 # Numbers of glibc mallopt, and the threshold that every version of it takes [bytes].
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _MMAP_MOST = -1, -3, 2**25
@@ -176,17 +191,26 @@ def start_server() -> None:
     Workers are forked from a clean server that has imported everything once: no thread
     of this process is copied, and no import is paid for per worker.
     """
+    _check_guarded()
     _temporary_folder()
     set_forkserver_preload(["egoskin.make"])
-    # Ctrl-C and a batch system's SIGTERM reach the whole group, but when to end is the
-    # parent's decision. The server and the workers inherit the signal mask. The tracker
-    # comes first: its own start unblocks them.
-    resource_tracker.ensure_running()
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+    # Ctrl-C, a batch system's SIGTERM and a closed terminal reach the whole group, but
+    # when to end is the parent's decision. All others inherit the signal mask. The
+    # tracker comes first: its own start unblocks what it ignores.
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP})
     try:
+        resource_tracker.ensure_running()
+        signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
         forkserver.ensure_running()
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+
+
+def _check_guarded() -> None:
+    """End a worker that imports its parent's script and meets what starts workers."""
+    # The attribute is there while multiprocessing imports.
+    if hasattr(current_process(), "_inheriting"):
+        os._exit(_UNGUARDED)
 
 
 @functools.cache
@@ -195,15 +219,34 @@ def _temporary_folder() -> str:
 
     It is multiprocessing's own, with the socket of the server that forks the workers.
     A process that is killed removes nothing, so a shell waits for its end: for a line
-    if multiprocessing will remove the folder, for the end of file if nobody does.
+    if multiprocessing will remove the folder, for the end of file if nobody does. Then
+    it removes the semaphores, too, unless multiprocessing's tracker still has.
     """
     folder = util.get_temp_dir()
-    script = 'trap "" INT TERM HUP; read -r line || rm -rf -- "$0"'
-    command = ["/bin/sh", "-c", script, folder]
-    # In a session of its own: a SIGKILL may go to the whole group.
-    shell = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)
+    # Of multiprocessing: what the names of this process's semaphores begin with.
+    name = Path(folder).name
+    current_process()._config["semprefix"] = f"/{name}"
+    script = """trap "" INT TERM HUP
+        read -r line || { rm -rf -- "$0"; sleep 2; rm -f /dev/shm/sem."$1"-*; }"""
+    shell = subprocess.Popen(
+        ["/bin/sh", "-c", script, folder, name],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        # A SIGKILL may go to the whole group.
+        start_new_session=True,
+    )
     atexit.register(shell.communicate, b"\n")
+    # Before multiprocessing waits for them.
+    atexit.register(_kill, _processes)
     return folder
+
+
+def _kill(processes: Iterable[BaseProcess]) -> None:
+    """End workers that nobody waits for any more."""
+    for process in processes:
+        if process.is_alive():
+            process.kill()
 
 
 def _ready(report: Path) -> Path:
@@ -219,6 +262,7 @@ class WorkerPool(ParallelEnv):
     """
 
     def __init__(self, builders: Sequence[Callable[[], EnvBase]]) -> None:
+        _check_guarded()
         self._reports = Path(tempfile.mkdtemp(dir=_temporary_folder()))
         self._num_all, self._last_step = len(builders), 0.0
         self._halves: list[WorkerPool] = []
@@ -302,10 +346,21 @@ class WorkerPool(ParallelEnv):
         self._workers, self._hung, self._halves = [], set[int](), []
         # The halves share this list.
         self._failures: list[str] = []
+        others = set(active_children())
         watch = Thread(target=self._watch_start, args=(started,), daemon=True)
         watch.start()
         try:
             super()._start_workers()
+            _processes.update(self._workers)
+        except BaseException as error:
+            # Ctrl-C, too: nobody else knows of them.
+            _kill(set(active_children()) - others)
+            if not isinstance(error, (EOFError, ConnectionError)):
+                raise
+            raise WorkerError(
+                "a worker, or the server that forks them, ended before it was given "
+                "its environment"
+            ) from None
         finally:
             started.set()
             watch.join()
@@ -383,6 +438,9 @@ class WorkerPool(ParallelEnv):
         if report.exists():
             return f"raised\n{report.read_text()}"
         code = self._workers[worker].exitcode
+        if code == _UNGUARDED:
+            self._end()
+            raise SystemExit(_GUARD)
         if code is not None and code < 0:
             return f"was killed by {signal.Signals(-code).name}"
         return f"ended with exit status {code}"
@@ -445,4 +503,11 @@ def in_halves(
     with ThreadPoolExecutor(
         len(halves), "collector", torch.set_num_threads, (threads,)
     ) as pool:
-        return list(pool.map(run, halves, roots, rows))
+        try:
+            return list(pool.map(run, halves, roots, rows))
+        except BaseException:
+            # Ctrl-C, too: the other half is not waited for to its end.
+            for half in halves:
+                if isinstance(half, WorkerPool):
+                    half._failures.append("it was interrupted: start anew")
+            raise

@@ -9,7 +9,10 @@ python scripts/bench.py gradients --run runs/NAME
 
 from __future__ import annotations
 
-import egoskin  # noqa: F401  (before torch: it says how torch's threads wait)
+from egoskin.interrupts import end_quietly
+
+if __name__ == "__main__":
+    end_quietly()
 
 # isort: split
 

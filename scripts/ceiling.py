@@ -12,6 +12,13 @@ is a matter of learning, or of what its sensors do not tell.
 
 from __future__ import annotations
 
+from egoskin.interrupts import end_quietly
+
+if __name__ == "__main__":
+    end_quietly()
+
+# isort: split
+
 import json
 import sys
 import time

@@ -13,6 +13,13 @@ signals can set them apart.
 
 from __future__ import annotations
 
+from egoskin.interrupts import end_quietly
+
+if __name__ == "__main__":
+    end_quietly()
+
+# isort: split
+
 import dataclasses
 import json
 import sys

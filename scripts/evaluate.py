@@ -9,6 +9,13 @@ python scripts/evaluate.py runs/NAME --mask
 
 from __future__ import annotations
 
+from egoskin.interrupts import end_quietly
+
+if __name__ == "__main__":
+    end_quietly()
+
+# isort: split
+
 import dataclasses
 import importlib.util
 import json

@@ -15,6 +15,13 @@ too high, never too low: a perfect fit gives half the spacing of the points.
 
 from __future__ import annotations
 
+from egoskin.interrupts import end_quietly
+
+if __name__ == "__main__":
+    end_quietly()
+
+# isort: split
+
 import math
 import sys
 from collections.abc import Iterator
@@ -29,6 +36,7 @@ import tyro
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from egoskin.cli import clear_errors
 from egoskin.robots import H1_2
 from egoskin.surface import sample_surface
 
@@ -228,4 +236,5 @@ def main(options: Options) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Options, description=__doc__)))
+    with clear_errors():
+        sys.exit(main(tyro.cli(Options, description=__doc__)))

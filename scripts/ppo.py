@@ -6,17 +6,20 @@ python scripts/ppo.py --resume runs/NAME --total-frames 100_000_000
 
 from __future__ import annotations
 
-import egoskin  # noqa: F401  (before torch: it says how torch's threads wait)
+from egoskin.interrupts import end_quietly
+
+if __name__ == "__main__":
+    end_quietly()
 
 # isort: split
 
 import math
-import signal
 import sys
 from types import FrameType
 
 from egoskin.agents.ppo import NonFiniteError
 from egoskin.cli import clear_errors, counted
+from egoskin.interrupts import ENDING, end_next_time, say, take
 from egoskin.make import check_num_workers
 from egoskin.progress import ProgressLine
 from egoskin.runs import Run, parse_config
@@ -25,18 +28,16 @@ from egoskin.workers import WorkerError
 
 
 class Stop:
-    """Notes the first Ctrl-C or SIGTERM; a second one ends the process at once."""
+    """Notes the first signal that ends a script; a second Ctrl-C ends it at once."""
 
     def __init__(self) -> None:
         self.requested = False
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._note)
+        take(self._note, *ENDING)
 
     def _note(self, number: int, frame: FrameType | None) -> None:
         self.requested = True
-        print("\nstopping after this rollout, with a checkpoint", file=sys.stderr)
-        for again in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(again, signal.SIG_DFL)
+        end_next_time()
+        say("stopping after this rollout, with a checkpoint")
 
 
 def main(args: list[str]) -> None:
@@ -50,12 +51,12 @@ def main(args: list[str]) -> None:
         f"{counted(workers, 'worker')}, learner on {config.device} with "
         f"{counted(config.num_learner_threads, 'thread')}"
     )
-    stop = Stop()
     rollouts = math.ceil(config.total_frames / config.frames_per_batch)
     try:
         with open_trainer(run) as trainer:
+            stop = Stop()
             line = ProgressLine(trainer.frames, rollouts * config.frames_per_batch)
-            train(trainer, lambda: stop.requested, line.update)
+            train(trainer, lambda: stop.requested or line.is_unread, line.update)
             line.finish()
     except (WorkerError, NonFiniteError, OSError) as error:
         raise SystemExit(f"error: {error}\n{run.how_to_go_on()}") from error

@@ -6,6 +6,13 @@ python scripts/render.py --hold --sensor.range 1 --out rigid.gif
 
 from __future__ import annotations
 
+from egoskin.interrupts import end_quietly
+
+if __name__ == "__main__":
+    end_quietly()
+
+# isort: split
+
 import os
 import sys
 from dataclasses import dataclass, field

@@ -5,7 +5,10 @@ python scripts/replay.py runs/NAME/not-finite-000001048576.safetensors
 
 from __future__ import annotations
 
-import egoskin  # noqa: F401  (before torch: it says how torch's threads wait)
+from egoskin.interrupts import end_quietly
+
+if __name__ == "__main__":
+    end_quietly()
 
 # isort: split
 

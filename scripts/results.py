@@ -8,7 +8,10 @@ python scripts/results.py write                    # docs/results.md and its pic
 
 from __future__ import annotations
 
-import egoskin  # noqa: F401  (before torch: it says how torch's threads wait)
+from egoskin.interrupts import end_quietly
+
+if __name__ == "__main__":
+    end_quietly()
 
 # isort: split
 
@@ -98,8 +101,7 @@ class Add:
         """Evaluate the last policy the run kept and store what is small."""
         run = Run.open(self.run)
         policies = sorted((self.run / "policies").glob("*.safetensors"))
-        metrics = self.run / "metrics.csv"
-        if not policies or not metrics.is_file():
+        if not policies:
             raise ValueError(f"{self.run} has not been trained: nothing to store")
         policy = load_policy(policies[-1])
         frames = policy.spec.frames
@@ -114,7 +116,7 @@ class Add:
         (folder / "policies").mkdir(parents=True, exist_ok=True)
         contents = {
             f"policies/{policies[-1].name}": policies[-1].read_bytes(),
-            "metrics.csv": thin(metrics.read_text()).encode(),
+            "metrics.csv": thin(run.metrics()).encode(),
             f"evaluation_{frames:012d}.json": _json(evaluation),
             "config.json": (self.run / "config.json").read_bytes(),
             "run.json": to_json(made).encode(),

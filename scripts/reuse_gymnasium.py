@@ -8,7 +8,10 @@ the joints and the objects are, then the sensors as they come.
 
 from __future__ import annotations
 
-import egoskin  # noqa: F401  (before torch: it says how torch's threads wait)
+from egoskin.interrupts import end_quietly
+
+if __name__ == "__main__":
+    end_quietly()
 
 # isort: split
 
@@ -25,6 +28,7 @@ from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 from torchrl.envs import Compose, GymEnv, StepCounter, TransformedEnv
 
 from egoskin.chains import build_chain
+from egoskin.cli import clear_errors
 from egoskin.sensors import FieldSensor, Proximity, Skin
 from egoskin.shapes import Sphere
 from egoskin.transform import RowTransform
@@ -137,4 +141,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    with clear_errors():
+        tyro.cli(main)

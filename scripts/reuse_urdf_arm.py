@@ -8,7 +8,10 @@ fixed has a constant base pose.
 
 from __future__ import annotations
 
-import egoskin  # noqa: F401  (before torch: it says how torch's threads wait)
+from egoskin.interrupts import end_quietly
+
+if __name__ == "__main__":
+    end_quietly()
 
 # isort: split
 
@@ -19,6 +22,7 @@ import tyro
 from tensordict import TensorDict
 from torchrl.envs import Compose
 
+from egoskin.cli import clear_errors
 from egoskin.sensors import FieldSensor, Ray, RaySensor, Skin
 from egoskin.shapes import Sphere
 
@@ -110,4 +114,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    with clear_errors():
+        tyro.cli(main)

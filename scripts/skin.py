@@ -2,13 +2,17 @@
 
 python scripts/skin.py place --num-sensors 64 --method poisson_disk --out skin.json
 python scripts/skin.py import gentact.xacro --parent torso_link --out skin.json
+python scripts/skin.py import *.csv --robot panda.urdf --out skin.json
 python scripts/skin.py export skin.json --out gentact.csv
 python scripts/skin.py show skin.json --picture skin.png
 """
 
 from __future__ import annotations
 
-import egoskin  # noqa: F401  (before torch: it says how torch's threads wait)
+from egoskin.interrupts import end_quietly
+
+if __name__ == "__main__":
+    end_quietly()
 
 # isort: split
 
@@ -17,6 +21,7 @@ import sys
 import textwrap
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Literal
@@ -30,13 +35,15 @@ from egoskin.cli import clear_errors, counted
 from egoskin.film import check_path, save_picture
 from egoskin.kinematics import LinkKinematics
 from egoskin.rendering import CameraConfig, Painter
-from egoskin.robots import ROBOTS, RobotConfig, RobotName
+from egoskin.robots import ROBOTS, Primitive, RobotConfig, RobotName, read_robot
 from egoskin.sensors import Skin
 from egoskin.sensors.coverage import Coverage
 from egoskin.sensors.gentact import load_gentact, save_gentact
 from egoskin.sensors.mesh_surface import Meshes, meshes_in_folder, meshes_of_mjcf
 from egoskin.sensors.placement import place_sensors
 
+# So many sensors take long enough to say so.
+_MANY = 10_000
 # Sensors farther from the robot than this are told of [m].
 _FAR_OFF = 0.15
 # The picture: size of each of its two views [px], and how normals are drawn [m].
@@ -103,6 +110,8 @@ class Place:
                     f"--density: the weight of {link} must be a number, got {weight!r}"
                 ) from None
         robot = ROBOTS[self.robot]
+        if self.num_sensors is None or self.num_sensors >= _MANY:
+            print("placing many sensors: this may take some minutes", flush=True)
         skin = place_sensors(
             robot,
             self.num_sensors,
@@ -122,42 +131,74 @@ class Place:
 class Import:
     """Turn an export of GenTact's (CSV, xacro, URDF) into a skin file."""
 
-    file: Annotated[Path, tyro.conf.Positional]
-    """File exported from GenTact."""
+    files: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Files exported from GenTact; their sensors come one after the other."""
     out: Path
     """Skin file to write (JSON)."""
-    robot: RobotName = "h1_2"
-    """Robot by name."""
+    robot: str = "h1_2"
+    """Robot by name, or the path of its MJCF or URDF."""
     scale: float | None = None
-    """Metres of one unit of the file; None: that of the dialect."""
+    """Metres of one unit of the files; None: that of the dialect."""
     link_map: tuple[str, ...] = ()
-    """Link for a part of a Parent path, or for a whole path, PART=LINK."""
+    """Link for a part of a Parent path, for a whole path, a link of the URDF or the
+    name of a xacro's macro, PART=LINK."""
     parent: str | None = None
     """Link of the sensors in a file that names none (xacro)."""
+    skip_invalid: bool = False
+    """Leave out sensors that cannot be read for certain, and list them."""
 
     def run(self) -> None:
         """Write the skin."""
         check_path(self.out, (".json",))
-        robot = ROBOTS[self.robot]
+        robot = _robot(self.robot)
         skin = load_gentact(
-            self.file,
+            self.files,
             robot_name=robot.name,
             links=robot.links,
-            primitives=robot.primitives,
+            primitives=_known_shapes(robot),
             scale=self.scale,
             link_map=_pairs(self.link_map, "--link-map"),
             parent=self.parent,
+            skip_invalid=self.skip_invalid,
         )
         skin.save(self.out)
         print(table(skin, str(self.out)))
-        nearest, farthest = skin.provenance.get("distance_to_primitives", (0, 0))
-        off = max(abs(nearest), abs(farthest))
+        for name in skin.provenance.get("unused_link_map", ()):
+            print(f"remark: no file needs {name!r} of --link-map")
+        for text in skin.provenance.get("left_out", ()):
+            print(f"left out: {text}")
+        files = skin.provenance.get("files", [skin.provenance])
+        extents = [f.get("distance_to_primitives", (0, 0)) for f in files]
+        off = max(abs(end) for extent in extents for end in extent)
         if off > _FAR_OFF:
             print(
                 f"warning: a sensor is {off:.2f} m off the robot's surface: is it the "
                 "right --scale and --link-map? Look at: python scripts/skin.py "
                 f"show {self.out} --picture skin.png"
             )
+
+
+def _robot(name: str) -> RobotConfig:
+    """Return the robot of a name or of a file."""
+    if name in ROBOTS:
+        return ROBOTS[name]
+    try:
+        return read_robot(name)
+    except FileNotFoundError:
+        raise ValueError(
+            f"--robot must be one of {', '.join(ROBOTS)}, or the path of an MJCF or "
+            f"URDF; there is no {name}"
+        ) from None
+
+
+def _known_shapes(robot: RobotConfig) -> list[Primitive]:
+    """Return the shapes of those links whose shapes are all primitives."""
+    shapes: list[Primitive] = []
+    for link in robot.links:
+        # Beside a shape that is unknown the others do not tell where the surface is.
+        with suppress(ValueError):
+            shapes += robot.primitives_on([link])
+    return shapes
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,7 +6,10 @@ python scripts/verify.py --iterations 4 --sensor.coverage ray --num-envs 512
 
 from __future__ import annotations
 
-import egoskin  # noqa: F401  (before torch: it says how torch's threads wait)
+from egoskin.interrupts import end_quietly
+
+if __name__ == "__main__":
+    end_quietly()
 
 # isort: split
 
@@ -74,7 +77,8 @@ def run_hash(run: Run) -> str:
     """Return a hash of a run's checkpoint and of its metrics but for times."""
     digest = hashlib.sha256()
     tensors, header = load_tensors(run.checkpoint_path)
-    del header["wall_s"]
+    # When and how long is no result; the metrics follow, without times.
+    del header["wall_s"], header["starts"], tensors["log/metrics"]
     digest.update(json.dumps(header, sort_keys=True).encode())
     for name in sorted(tensors):
         value = tensors[name].contiguous()

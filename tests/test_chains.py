@@ -182,6 +182,53 @@ def test_unnamed_bodies_and_joints_get_names():
     assert chain.get_joint_parameter_names() == ["joint0", "joint1"]
 
 
+TWINS = """<mujoco><worldbody><body name="b"><geom size=".05" mass="1"/>
+<body name="x" pos="1 0 0"><joint axis="0 0 1"/><geom size=".1"/></body>
+<body name="y" pos="0 1 0"><joint name="joint0" axis="0 0 1"/><geom size=".1"/>
+  <body name="yy" pos=".5 0 0"><geom size=".1"/>
+    <body pos=".1 0 0"><geom size=".1"/></body></body></body>
+<body name="body5" pos="0 0 1"><geom size=".1"/></body>
+<body name="d" pos="0 0 2"><geom size=".1"/>
+  <joint name="j" axis="0 1 0" pos="1 0 0"/><joint axis="1 0 0"/></body>
+<body name="d:j" pos="0 0 3"><joint name="joint3" axis="0 1 0"/><geom size=".1"/></body>
+</body></worldbody></mujoco>"""
+
+
+def test_made_names_differ_from_those_that_the_model_gives():
+    # The model itself uses the names that its unnamed joints and bodies, and the
+    # frames between two joints of a body, would get.
+    model = mujoco.MjModel.from_xml_string(TWINS)
+    chain = build_chain(model, "b", torch.float64)
+    joints, links = chain.get_joint_parameter_names(), chain.get_link_names()
+    assert joints == ["joint0_", "joint0", "j", "joint3_", "joint3"]
+    assert links == ["b", "x", "y", "yy", "body5_", "body5", "d", "d:j"]
+    joint_pos = torch.tensor([[0.3, 1.1, -0.4, 0.8, 0.2]], dtype=torch.float64)
+    expected = mujoco_poses(model, "b", joint_pos.numpy())
+    assert_poses_agree(chain, links, joint_pos, expected, 1e-12)
+    # yy, worked out: half a metre from y, turned by 1.1.
+    position, _ = LinkKinematics(chain, ["yy"]).poses_b(joint_pos)
+    yy = [0.5 * np.cos(1.1), 1 + 0.5 * np.sin(1.1), 0]
+    np.testing.assert_allclose(position[0, 0], yy, atol=1e-12)
+
+
+def test_an_unnamed_base_goes_by_its_made_name():
+    model = mujoco.MjModel.from_xml_string(TWINS.replace('name="b"', ""))
+    chain = build_chain(model, "body1")
+    assert chain.get_link_names()[:2] == ["body1", "x"]
+    with pytest.raises(KeyError, match="no body 'b'; it has 'body1', 'body5'"):
+        build_chain(model, "b")
+
+
+def test_a_row_of_bodies_too_long_to_follow_is_refused():
+    spec = mujoco.MjSpec()
+    body = spec.worldbody
+    for _ in range(1000):
+        body = body.add_body()
+        body.add_geom(size=[0.1, 0, 0])
+    with pytest.raises(ValueError, match="too many bodies hang on each other"):
+        build_chain(spec.compile(), "world")
+
+
 def test_joint_limits_are_those_of_the_model():
     joints = "<joint name='a' range='-1 2'/><joint name='b' axis='1 0 0'/>"
     low, high = build_chain(one_body(joints), "base").get_joint_limits()

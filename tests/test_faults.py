@@ -5,9 +5,11 @@ from __future__ import annotations
 import csv
 import json
 import os
+import pty
 import random
 import resource
 import runpy
+import select
 import shutil
 import signal
 import subprocess
@@ -26,6 +28,7 @@ from egoskin import compilation
 from egoskin.agents.networks import Agent, NetworkConfig
 from egoskin.agents.ppo import PPO, NonFiniteError, PPOConfig
 from egoskin.checkpoint import load_tensors, save_tensors
+from egoskin.formats import read_sealed, sealed_json
 
 ROOT = Path(__file__).parents[1]
 SMALL = ("--num-envs", "32", "--num-workers", "2", "--ppo.num-mini-batches", "2")
@@ -161,6 +164,13 @@ def rows(run: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(source))
 
 
+def check_equal(one: dict[str, torch.Tensor], two: dict[str, torch.Tensor]) -> None:
+    """Assert that two checkpoints hold the same, but for the times in their logs."""
+    assert one.keys() == two.keys()
+    for key in one.keys() - {"log/metrics"}:
+        assert torch.equal(one[key], two[key]), key
+
+
 def check_failed_clearly(training: Training, *expected: str, code: int = 1) -> None:
     assert training.end() == code
     for text in expected:
@@ -177,6 +187,13 @@ def written(run: Path) -> bool:
     return any(run.glob(".checkpoint.*.partial"))
 
 
+def plan(run: Path, end: int) -> None:
+    """Let a run end after some frames."""
+    config, _ = read_sealed(run / "config.json")
+    content = sealed_json({**config, "total_frames": end})
+    (run / "config.json").write_bytes(content)
+
+
 def check_logs_have_no_gap(run: Path) -> None:
     frames = [int(row["frames"]) for row in rows(run)]
     assert frames == [BATCH * (i + 1) for i in range(len(frames))]
@@ -190,16 +207,15 @@ def test_a_trainer_killed_while_it_writes_a_checkpoint_goes_on(start, tmp_path):
     training.note_shared_memory()
     assert len(training.workers()) == 2
     training.wait_for(lambda: written(run))
-    training.process.kill()
+    # All of them: also the one that multiprocessing has tidy up.
+    os.killpg(training.process.pid, signal.SIGKILL)
     training.end()
     training.check_nothing_is_left()
     saved = load_tensors(run / "checkpoint.safetensors")[1]["frames"]
     assert saved >= 2 * BATCH
     end = saved + 4 * BATCH
     # The planned end of a run cannot come earlier: only a test's can.
-    config = json.loads((run / "config.json").read_text())
-    config["total_frames"] = end
-    (run / "config.json").write_text(json.dumps(config))
+    plan(run, end)
     again = start("--resume", run)
     assert again.end() == 0, again.text()
     assert int(rows(run)[-1]["frames"]) == end
@@ -220,6 +236,57 @@ def test_a_trainer_killed_while_it_starts_leaves_nothing(
     kill(training.process.pid, signal.SIGKILL)
     training.end()
     training.check_nothing_is_left()
+
+
+def test_ctrl_c_twice_while_workers_start_is_one_line(start, tmp_path, temporary):
+    training = start(*SMALL, "--run-dir", tmp_path / "run")
+    training.wait_for(lambda: list(temporary.glob("*/listener-*")))
+    for _ in range(2):
+        os.killpg(training.process.pid, signal.SIGINT)
+    assert training.end() == 130
+    assert training.text().splitlines()[1:] == ["stopped"]
+    training.check_nothing_is_left()
+
+
+def test_a_closed_terminal_leaves_a_checkpoint(tmp_path, temporary):
+    run = tmp_path / "run"
+    command = [sys.executable, str(ROOT / "scripts/ppo.py"), *SMALL, "--run-dir"]
+    pid, terminal = pty.fork()
+    if pid == 0:
+        os.environ["TMPDIR"] = str(temporary)
+        os.execv(sys.executable, [*command, str(run)])
+    deadline = time.monotonic() + 120
+    while len(rows(run)) < 2:
+        assert time.monotonic() < deadline
+        # What it prints must be read, or it waits.
+        if select.select([terminal], [], [], 0.01)[0]:
+            os.read(terminal, 1000)
+    os.close(terminal)
+    _, status = os.waitpid(pid, 0)
+    assert os.WIFEXITED(status)
+    saved = load_tensors(run / "checkpoint.safetensors")[1]["frames"]
+    assert saved == int(rows(run)[-1]["frames"]) >= 2 * BATCH
+    deadline = time.monotonic() + 10
+    while list(temporary.iterdir()):
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+
+
+def test_a_training_that_nobody_reads_ends_with_a_checkpoint(run):
+    args = ("--resume", run, "--total-frames", 10**6)
+    command = [sys.executable, ROOT / "scripts/ppo.py", *map(str, args)]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as training:
+        assert training.stdout is not None
+        assert training.stderr is not None
+        assert training.stdout.readline().startswith("run ")
+        # As `head -n 1` does.
+        training.stdout.close()
+        assert training.stderr.read() == ""
+    assert training.returncode == 128 + signal.SIGPIPE
+    saved = load_tensors(run / "checkpoint.safetensors")[1]["frames"]
+    assert saved == int(rows(run)[-1]["frames"]) > 2 * BATCH
 
 
 @pytest.mark.slow
@@ -255,21 +322,18 @@ def test_a_trainer_killed_twenty_times_loses_at_most_an_interval_each(start, tmp
             ]
             # The rollout in which it was killed is in no log.
             assert sum(BATCH / speed for speed in lost) <= interval
-    config = json.loads((run / "config.json").read_text())
-    saved = load_tensors(run / "checkpoint.safetensors")[1]["frames"]
-    config["total_frames"] = saved + BATCH
-    (run / "config.json").write_text(json.dumps(config))
+    end = load_tensors(run / "checkpoint.safetensors")[1]["frames"] + BATCH
+    plan(run, end)
     last = start("--resume", run)
     assert last.end() == 0, last.text()
     check_logs_have_no_gap(run)
     # What never stopped is the same, bit for bit.
     whole = tmp_path / "whole"
-    size = ("--run-dir", whole, "--total-frames", str(config["total_frames"]))
+    size = ("--run-dir", whole, "--total-frames", str(end))
     unbroken = start(*SMALL, *size)
     assert unbroken.end(600) == 0, unbroken.text()
     tensors = [load_tensors(r / "checkpoint.safetensors")[0] for r in (run, whole)]
-    for key, value in tensors[0].items():
-        assert torch.equal(value, tensors[1][key]), key
+    check_equal(*tensors)
 
 
 @pytest.mark.slow
@@ -487,16 +551,18 @@ def test_compiled_training_is_the_same_and_goes_on_without_a_compiler(
         assert training.end() == 0, training.text()
         assert training.text().count("kernels.cpp stays uncompiled") == 1
     tensors = [load_tensors(r / "checkpoint.safetensors")[0] for r in (plain, run)]
-    for key, value in tensors[0].items():
-        assert torch.equal(value, tensors[1][key]), key
+    check_equal(*tensors)
 
 
 def test_a_run_that_stored_whether_to_compile_goes_on(run):
     file = run / "config.json"
     content = json.loads(file.read_text())
-    file.write_text(json.dumps({**content, "compile_kernels": True}))
+    # As it was written before there were checksums.
+    old = {k: v for k, v in content.items() if k not in ("format", "egoskin", "sha256")}
+    del old["skin_sha256"]
+    file.write_text(json.dumps({**old, "compile_kernels": True}))
     here("ppo.py", "--resume", run, "--total-frames", 3 * BATCH)
-    assert json.loads(file.read_text()) == {**content, "total_frames": 3 * BATCH}
+    assert "compile_kernels" not in json.loads(file.read_text())
 
 
 # --- memory ---------------------------------------------------------------------

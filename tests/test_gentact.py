@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -16,6 +17,7 @@ from hypothesis.extra.numpy import arrays
 from egoskin.robots import H1_2
 from egoskin.sensors import Field, Skin
 from egoskin.sensors.gentact import load_gentact, save_gentact
+from egoskin.sensors.gentact.description import Xml
 
 CURRENT = "Index,X,Y,Z,NormX,NormY,NormZ,Radius,Parent,Object Name in Blender"
 PLAIN = "Index,X,Y,Z,Radius,Parent"
@@ -106,13 +108,167 @@ def test_a_print_export_has_clips_names_and_blanks_between_its_sensors(load):
 
 
 def test_an_old_print_export_needs_its_unit(load):
-    # Once it had the header of the table in metres, and clips give it away.
-    content = f"{PLAIN}\nCLIP,1,2,3,0.1,{TORSO}\n1,9.3,2,20,0.004,{TORSO}\n"
+    # Once it had the header of the table in metres, and clips give it away. Its radii
+    # are in the unit of its positions: 1.6 cm.
+    content = f"{PLAIN}\nCLIP,1,2,3,0.1,{TORSO}\n1,9.3,2,20,1.6,{TORSO}\n"
     with pytest.raises(ValueError, match="unit is unknown; give scale"):
         load(content)
     skin = load(content, scale=0.01)
     np.testing.assert_allclose(skin.position, [FRONT], atol=1e-15)
+    assert skin.radius == pytest.approx(0.016)
+    metres = content.replace("9.3,2,20,1.6", "0.093,0.02,0.2,0.016")
+    np.testing.assert_allclose(load(metres, scale=1.0).radius, 0.016)
+
+
+def test_a_print_export_with_headings_has_its_radii_in_metres(load):
+    # The exporter that writes them scales the positions alone.
+    row = f"1,93,20,200,0.016,{TORSO}"
+    content = f"{PLAIN}\n,,,,,\nvisuals.002,,,,,\nCLIP,1,2,3,0.1,{TORSO}\n{row}\n"
+    skin = load(content, scale=1e-3)
+    np.testing.assert_allclose(skin.position, [FRONT], atol=1e-15)
+    assert skin.radius == pytest.approx(0.016)
+
+
+@pytest.mark.parametrize(
+    ("header", "row", "options"),
+    [
+        # Radii in the other unit than taken: 16 um, 16 m.
+        (PLAIN, "CLIP,,,,,\n1,93,20,200,0.016,", {"scale": 1e-3}),
+        (PRINT, "1,93,20,200,,,,16,", {}),
+    ],
+)
+def test_a_radius_that_no_sensor_has_is_refused(header, row, options, load):
+    content = f"{header}\n{row}{TORSO}\n"
+    with pytest.raises(ValueError, match=r"the radius is 1\.?6.* in the header"):
+        load(content, **options)
+    unit = "m" if "0.016" in row else "mm"
+    skin = load(content.replace("Radius", f"Radius [{unit}]"), **options)
+    assert skin.radius == pytest.approx(0.016)
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "Sensor Name, X Offset, Y Offset, Z Offset, Norm X, Norm Y, Norm Z, Radius, "
+        "Parent Path",
+        "index,x [m],y [m],z [m],norm_x,norm_y,norm_z,radius (m),PARENTS",
+        "Sensor Number,RelX,RelY,RelZ,nx,ny,nz,Radii,Path",
+        "id,Pos X,Pos Y,Pos Z,Normal.X,Normal.Y,Normal.Z,Sensor Radius,Link",
+    ],
+)
+def test_columns_are_known_by_other_names_too(header, load):
+    rows = [r.rpartition(",")[0] for r in DIALECTS[CURRENT]]
+    skin, expected = load("\n".join((header, *rows))), load(current(*DIALECTS[CURRENT]))
+    np.testing.assert_array_equal(skin.position, expected.position)
+    np.testing.assert_array_equal(skin.normal, expected.normal)
+    np.testing.assert_array_equal(skin.radius, expected.radius)
+    assert skin.links == expected.links
+
+
+def test_sensors_may_have_names_and_stand_in_another_order_of_columns(load):
+    skin = load(
+        "Parent Path,Sensor Name,Z Offset,Y Offset,X Offset\n"
+        f"{TORSO},palm 1,0.2,0.02,0.093\n{TORSO},palm 2,0.3,-0.01,-0.093"
+    )
+    np.testing.assert_array_equal(skin.position, [FRONT, BACK])
+    assert np.isnan(skin.radius).all()
+
+
+def test_the_oldest_table_has_neither_radius_nor_normal(load):
+    skin = load(
+        "SensorNum, RelX, RelY, RelZ, path\n1,0.093,0.02,0.2,/Ant/Arm_01/Upper_Arm",
+        link_map={"Upper_Arm": "torso_link"},
+    )
+    np.testing.assert_array_equal(skin.position, [FRONT])
+    assert skin.links == ("torso_link",)
+
+
+def test_a_table_without_parents_takes_the_users(load):
+    content = "Index,X,Y,Z,NormX,NormY,NormZ\n0,0,0,0,1,0,0\n1,0,0,0,1,0,0"
+    assert load(content, parent="pelvis").links == ("pelvis", "pelvis")
+    # Said once, not for each row.
+    with pytest.raises(ValueError, match="export:1: the file does not say on") as error:
+        load(content)
+    assert str(error.value).count("does not say") == 1
+
+
+def test_units_in_the_header_count(load):
+    content = f"Index,X [mm],Y [mm],Z [mm],Radius [cm],Parent\n0,93,20,200,0.4,{TORSO}"
+    skin = load(content)
+    np.testing.assert_allclose(skin.position, [FRONT], atol=1e-15)
     assert skin.radius == pytest.approx(0.004)
+    assert load(content, scale=1e-3).radius == pytest.approx(0.004)
+    with pytest.raises(ValueError, match=r"header says 0\.001 m .* scale says 1"):
+        load(content, scale=1.0)
+    # The radius goes with the positions; 100 mm, too, is GenTact's word for none.
+    content = content.replace("Radius [cm]", "Radius").replace(",0.4,", ",4,")
+    assert load(content).radius == pytest.approx(0.004)
+    assert np.isnan(load(content.replace(",4,", ",100,")).radius).all()
+
+
+@pytest.mark.parametrize(
+    ("header", "expected"),
+    [
+        ("Index,X,Y,Z,Radius,Parent,Path", "'Parent' and 'Path' are both the sensor's"),
+        ("Index,X,RelX,Y,Z,Parent", "'X' and 'RelX' are both the sensor's x"),
+        ("Index,X,Y,Parent", "there is no column z"),
+        ("Index,X,Y,Z,NormX,NormZ,Parent", "there is no column normy"),
+        ("Index,X [mm],Y [mm],Z [cm],Parent", "x, y and z must have one unit"),
+        ("Index,X [mm],Y,Z,Parent", "x, y and z must have one unit"),
+        ("Index,X [furlong],Y,Z,Parent", r"unit of 'X \[furlong\]' must be one of m"),
+        ("Index,X,Y,Z,Roll,Parent", "take out the column 'Roll'"),
+        ("Index,X,Y,Z,,Parent", "take out the column ''"),
+        ("Index,X,Y,Z", "these are vertices"),
+    ],
+)
+def test_a_header_that_may_mean_two_things_is_refused(header, expected, load):
+    with pytest.raises(ValueError, match=f"export:1: .*{expected}"):
+        load(f"{header}\n0,1,2,3,4,5,6")
+
+
+@pytest.mark.parametrize("skip", [False, True])
+def test_all_bad_rows_are_told_at_once_or_left_out(skip, load):
+    bad = {
+        3: f"1,nan,0,0,1,0,0,0,{TORSO},v",
+        4: f"2,0,0,0,1,0,0,-1,{TORSO},v",
+        5: f"3,0,0,0,0.5,0,0,0,{TORSO},v",
+        6: "4,0,0,0,1,0,0,0,/bot/chest,v",
+        7: "5,0,0",
+        8: f"0,0,0,0,1,0,0,0,{TORSO},v",
+        9: f"7,9,0,0,1,0,0,0,{TORSO},v",
+        10: f"8,0,0,0,1,0,0,50,{TORSO},v",
+        11: "9,0,0,0,1,0,0,0,/bot/torso_link/head_link/visuals,v",
+        12: "10,0,0,0,1,0,0,0,,v",
+    }
+    content = current(GOOD, *bad.values(), GOOD.replace("0,", "11,", 1))
+    if skip:
+        skin = load(content, skip_invalid=True)
+        np.testing.assert_array_equal(skin.position, [FRONT, FRONT])
+        told = skin.provenance["left_out"]
+        assert len(told) == len(bad)
+    else:
+        with pytest.raises(ValueError, match="10 sensors cannot be read") as error:
+            load(content)
+        told = str(error.value).splitlines()
+        # What to do is said once for all rows.
+        assert str(error.value).count("the links of h1_2 are") == 1
+    for line in bad:
+        assert sum(f"export:{line}: " in text for text in told) == 1
+
+
+def test_bad_sensors_of_descriptions_are_left_out_too(load):
+    tags = [sensor_tag(i, (0, 0, 1), UPRIGHT) for i in range(3)]
+    tags[1] = tags[1].replace('normal_x="0.0"', 'normal_x="2"')
+    with pytest.raises(ValueError, match="--skip-invalid"):
+        load(xacro(*tags), parent="left_elbow_link")
+    skin = load(xacro(*tags), parent="left_elbow_link", skip_invalid=True)
+    assert len(skin) == 2
+    content = urdf("", '<origin xyz="0 0"/>')
+    assert len(load(content, skip_invalid=True)) == 1
+    with pytest.raises(
+        ValueError, match=r"no sensor can be read; the first: .*export:2"
+    ):
+        load(current(f"0,9,9,9,1,0,0,0,{TORSO},v"), skip_invalid=True)
 
 
 def test_scale_turns_positions_and_radii_into_metres(load):
@@ -247,6 +403,34 @@ def test_a_part_that_may_be_a_sibling_is_refused(load):
 
 
 @pytest.mark.parametrize(
+    ("below", "kept"),
+    [
+        ("visuals", True),
+        ("visuals.004", True),
+        ("collisions_1/geometry", True),
+        ("geometry2/visuals.001", True),
+        ("head_link/visuals", False),
+        ("visuals/head_link", False),
+        ("torso_mesh/ID71_001", False),
+    ],
+)
+def test_below_a_link_there_may_only_be_its_shapes(below, kept, load):
+    # A link that the robot lacks is not its parent: it sits elsewhere, and may turn.
+    content = current(f"0,0,0,0,1,0,0,0.01,/r/torso_link/{below},v")
+    if kept:
+        assert load(content).links == ("torso_link",)
+        return
+    with pytest.raises(
+        ValueError, match=r"a link that h1_2 lacks; .* link_map"
+    ) as error:
+        load(content)
+    # As the error says it.
+    part = re.search(r"--link-map (.*)=", str(error.value))
+    assert part is not None
+    assert load(content, link_map={part[1]: "pelvis"}).links == ("pelvis",)
+
+
+@pytest.mark.parametrize(
     ("parent", "hint"),
     [
         ("/bot/chest/visuals", "map a part of it"),
@@ -279,7 +463,6 @@ def test_the_users_map_goes_before_names_and_a_path_before_its_parts(load):
     ("options", "expected"),
     [
         ({"link_map": {"chest": "torso_lnk"}}, "did you mean 'torso_link'"),
-        ({"link_map": {"chest": "torso_link"}}, "link_map's 'chest' decides nothing"),
         ({"parent": "torso_link"}, "parent decides nothing"),
         ({"parent": "chest"}, "no link 'chest'"),
     ],
@@ -287,6 +470,30 @@ def test_the_users_map_goes_before_names_and_a_path_before_its_parts(load):
 def test_what_the_user_says_in_vain_is_refused(options, expected, load):
     with pytest.raises(ValueError, match=expected):
         load(current(GOOD), **options)
+
+
+def test_one_map_and_one_call_serve_the_files_of_a_whole_robot(tmp_path):
+    parts = {"chest": "torso_link", "arm": "left_elbow_link", "tail": "pelvis"}
+    files = [tmp_path / name for name in ("chest", "arm")]
+    for path in files:
+        path.write_text(current(f"0,0.1,0,0,1,0,0,0.01,/bot/{path.name}/visuals,v"))
+    options = {"robot_name": "h1_2", "links": H1_2.links, "link_map": parts}
+    alone = load_gentact(files[0], **options)
+    assert alone.links == ("torso_link",)
+    assert alone.provenance["unused_link_map"] == ["arm", "tail"]
+    skin = load_gentact(files, **options)
+    assert skin.links == ("torso_link", "left_elbow_link")
+    assert skin.provenance["unused_link_map"] == ["tail"]
+    assert [f["file"] for f in skin.provenance["files"]] == ["chest", "arm"]
+    assert skin.provenance["files"][1]["parents"] == {"/bot/arm/visuals": parts["arm"]}
+    with pytest.raises(ValueError, match="at least one file"):
+        load_gentact([], **options)
+
+
+def test_the_map_may_name_the_skin_of_a_xacro(load):
+    content = xacro(sensor_tag(0, (0, 0, 1), UPRIGHT))
+    skin = load(content, link_map={"left_elbow_skin": "left_elbow_link"})
+    assert skin.links == ("left_elbow_link",)
 
 
 def test_the_users_parent_holds_for_rows_without_one(load):
@@ -342,7 +549,9 @@ def test_missing_normals_need_a_shape_with_a_surface_nearby(small_robot, load):
     robot = small_robot(SHAPES)
     content = f"{PLAIN}\n0,0,-0.4,0,0.1,/base"
     options = {"robot_name": "small", "links": robot.links}
-    with pytest.raises(ValueError, match=r"export:2: .* base has no shape to take"):
+    with pytest.raises(
+        ValueError, match=r"export:2: .* base has no primitive shape to "
+    ):
         load(content, **options, primitives=())
     # The centre of the sphere.
     with pytest.raises(ValueError, match="equally near all around"):
@@ -523,6 +732,60 @@ def test_a_sensor_of_a_urdf_is_where_mujoco_puts_it(load):
         np.testing.assert_allclose(frame, own, atol=2e-3)
         np.testing.assert_allclose(skin.normal[i], own[:, 2], atol=1e-9)
     np.testing.assert_array_equal(skin.radius, 0.005)
+
+
+@pytest.mark.parametrize("name", ["left_elbow/sensor", "sensor", "a/b_tof_sensor"])
+def test_namespaces_are_divided_as_one_likes(name, load):
+    content = urdf('<origin xyz="0.1 0 0"/>', "")
+    skin = load(content.replace("left_elbow_sensor", name))
+    np.testing.assert_array_equal(skin.radius, [0.005, 0.005])
+    np.testing.assert_array_equal(skin.position, load(content).position)
+
+
+def test_a_link_on_two_joints_is_refused(load):
+    twice = (
+        '<joint name="j" type="fixed"><parent link="pelvis"/><child link="{}"/></joint>'
+    )
+    content = urdf("").replace("</robot>", twice.format("left_elbow_skin") + "</robot>")
+    with pytest.raises(
+        ValueError, match="'left_elbow_skin' hangs on another joint alr"
+    ):
+        load(content)
+
+
+def test_a_long_row_of_links_is_climbed_once(load, monkeypatch):
+    fixed = (
+        '<joint name="{0}" type="fixed"><parent link="{1}"/><child link="{2}"/>'
+        '<origin xyz="0 0 0.001"/></joint>'
+    )
+    rows, above = [], "pelvis"
+    for i in range(1000):
+        rows.append(fixed.format(f"j{i}", above, f"l{i}"))
+        rows.append(fixed.format(f"a_sensor_{i}_joint", f"l{i}", f"s{i}"))
+        above = f"l{i}"
+    calls = 0
+    frame = Xml.frame
+
+    def counted(*args):
+        nonlocal calls
+        calls += 1
+        return frame(*args)
+
+    monkeypatch.setattr(Xml, "frame", counted)
+    skin = load(f"<robot name='r'>{''.join(rows)}</robot>")
+    # Sensor i is i + 2 steps of 1 mm below the pelvis.
+    heights = 1e-3 * (np.arange(1000) + 2)
+    np.testing.assert_allclose(skin.position[:, 2], heights, atol=1e-12)
+    assert calls == 2000
+
+
+@pytest.mark.parametrize("kind", ["a named pipe", "a device"])
+def test_only_files_are_imported(kind, tmp_path):
+    path = Path("/dev/zero") if kind == "a device" else tmp_path / "pipe"
+    if kind != "a device":
+        os.mkfifo(path)
+    with pytest.raises(ValueError, match=f"must be a file, and is {kind}"):
+        load_gentact(path, robot_name="h1_2", links=H1_2.links)
 
 
 def test_a_link_of_the_urdf_can_be_mapped(load):

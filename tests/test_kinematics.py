@@ -8,6 +8,7 @@ import math
 import mujoco
 import numpy as np
 import pytest
+import pytorch_kinematics as pk
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -67,6 +68,34 @@ def test_link_poses_equal_those_of_pytorch_kinematics(
         matrix = frames[name].get_matrix().expand(200, 4, 4)
         np.testing.assert_allclose(position[:, i], matrix[:, :3, 3], 0, TOLERANCE)
         np.testing.assert_allclose(rotation[:, i], matrix[:, :3, :3], 0, TOLERANCE)
+
+
+URDF = """<robot name="r"><link name="base"/><link name="a"/><link name="b"/>
+<joint name="first" type="continuous"><parent link="base"/><child link="a"/>
+  <axis xyz="0 0 1"/></joint>
+<joint name="second" type="prismatic"><parent link="base"/><child link="b"/>
+  <axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
+</robot>"""
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ('"second"', '"first"', "two joints of the chain have the name 'first'"),
+        (
+            'child link="b"',
+            'child link="a"',
+            "two links of the chain have the name 'a'",
+        ),
+        ("0 1 0", "0 0 0", "axis of joint 'second' must have a direction"),
+    ],
+)
+def test_a_chain_that_does_not_say_what_is_meant_is_refused(old, new, expected):
+    LinkKinematics(pk.build_chain_from_urdf(URDF), ["a", "b"])
+    chain = pk.build_chain_from_urdf(URDF.replace(old, new))
+    links = [name for name in ("a", "b") if name in chain.get_link_names()]
+    with pytest.raises(ValueError, match=expected):
+        LinkKinematics(chain, links)
 
 
 @given(st.lists(st.sampled_from(H1_2.links), min_size=1, max_size=6, unique=True))

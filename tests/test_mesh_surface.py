@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 
@@ -214,6 +215,27 @@ def test_a_folder_gives_the_meshes_named_after_links(tmp_path):
     (torso,) = meshes["torso_link"]
     np.testing.assert_allclose(torso.extents, [0.1, 0.2, 0.3], rtol=1e-6)
     assert torso.metadata["name"] == "torso_link.STL"
+
+
+def test_meshes_are_read_from_regular_files_alone(tmp_path):
+    os.mkfifo(tmp_path / "pelvis.stl")
+    with pytest.raises(
+        ValueError, match=r"pelvis.stl must be a file, and is a named p"
+    ):
+        meshes_in_folder(tmp_path, ["pelvis"])
+    with pytest.raises(
+        ValueError, match=r"pelvis.stl must be a file, and is a named p"
+    ):
+        meshes_of_mjcf(tmp_path / "pelvis.stl")
+
+
+def test_damaged_meshes_are_refused_by_name(tmp_path):
+    raw = trimesh.creation.box().export(file_type="stl")
+    path = tmp_path / "pelvis.stl"
+    for content in (raw[:300], b""):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=r"pelvis\.stl is no mesh that trimesh"):
+            meshes_in_folder(tmp_path, ["pelvis"])
 
 
 def test_a_folder_without_meshes_or_with_two_of_a_link_is_refused(tmp_path):

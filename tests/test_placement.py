@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import mujoco
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from egoskin.robots import H1_2, RobotConfig
-from egoskin.sensors import Skin
+from egoskin.sensors import Skin, placement
 from egoskin.sensors.placement import eliminate, place_sensors, throw_darts
 from egoskin.surface import distance_to, sample_surface
 
@@ -271,6 +273,36 @@ def test_darts_stick_unless_they_meet_one_that_stuck_before(seed, n, most):
     assert throw_darts(points, radius, most).tolist() == stuck
 
 
+def test_the_time_of_an_elimination_grows_as_the_number_of_points():
+    rng, times = np.random.default_rng(0), []
+    for n in (3_000, 30_000):
+        points = rng.random((n, 3)) * [1, 1, 0]
+        start = time.process_time()
+        left = eliminate(points, np.ones(n), n // 5, 1.0)
+        times.append(time.process_time() - start)
+    # Ten times as many; comparing all pairs takes a hundred times as long.
+    assert times[1] < 35 * times[0]
+    # As far apart as few are: most keep the closest distance that counts.
+    closest = 2 * (1 / (2 * 3**0.5 * n / 5)) ** 0.5 * 0.65 * (1 - 0.2**1.5)
+    kept = throw_darts(points[left], np.full(len(left), closest / 2), n)
+    assert len(kept) > 0.98 * n / 5
+
+
+def test_darts_are_thrown_in_lots_until_there_are_enough(small_robot, monkeypatch):
+    robot = small_robot("<geom size='.5'/>")
+    options = {"method": "poisson_disk", "spacing": 0.08}
+    once = place_sensors(robot, 300, **options)
+    monkeypatch.setattr(placement, "_MAX_DARTS", 400)
+    lots = place_sensors(robot, 300, **options)
+    for skin in (once, lots):
+        assert len(skin) == 300
+        assert pair_distances(skin.position).min() >= 0.08 - 2e-6
+    # Each lot is another.
+    assert not np.array_equal(once.position, lots.position)
+    with pytest.raises(ValueError, match=r"only \d+ sensors fit"):
+        place_sensors(robot, 1000, **options)
+
+
 # --- errors ---------------------------------------------------------------------
 
 
@@ -278,6 +310,7 @@ def test_darts_stick_unless_they_meet_one_that_stuck_before(seed, n, most):
     ("arguments", "message"),
     [
         ({"num_sensors": 0}, "must be positive, got 0"),
+        ({"num_sensors": 10**9}, "must be at most 400,000, got 1000000000"),
         ({"seed": -1}, "seed of a placement must not be negative, got -1"),
         ({"links": ["torso_link", "chest"]}, "no link 'chest'"),
         ({"links": []}, "at least one link to cover"),

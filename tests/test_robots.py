@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,7 +15,8 @@ from tensordict import TensorDict
 
 from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
 from egoskin.envs.physics import PhysicsConfig, build_scene
-from egoskin.robots import H1_2, RobotConfig
+from egoskin.kinematics import LinkKinematics
+from egoskin.robots import H1_2, RobotConfig, read_robot
 from egoskin.sensors import FieldSensor, place_sensors
 from egoskin.shapes import Sphere
 from egoskin.surface import default_frames, distance_to
@@ -158,6 +160,88 @@ def test_other_collision_shapes_are_refused_with_the_remedy(small_robot, kind):
     with pytest.raises(ValueError, match=text):
         _ = robot.default_base_height
     assert [shape.link for shape in robot.primitives_on(["base"])] == ["base"]
+
+
+# --- robots of files ------------------------------------------------------------
+
+URDF = """<?xml version="1.0"?><!-- <mujoco> -->
+<robot name="crane"><link name="foot"/>
+<joint name="mount" type="fixed"><parent link="foot"/><child link="mast"/>
+  <origin xyz="0 0 1"/></joint>
+<link name="mast"><visual><geometry><mesh filename="package://a/v.dae"/></geometry>
+  </visual><collision><geometry><mesh filename="package://a/c.stl"/></geometry>
+  </collision></link>
+<joint name="turn" type="revolute"><parent link="mast"/><child link="boom"/>
+  <origin xyz="0 0 2"/><limit lower="-3" upper="3" effort="1" velocity="1"/></joint>
+<link name="boom"><collision><origin xyz="0 1 0"/><geometry><box size=".2 2 .2"/>
+  </geometry></collision></link>
+<joint name="grip" type="fixed"><parent link="boom"/><child link="hook"/>
+  <origin xyz="0 2 0"/></joint><link name="hook"/></robot>"""
+
+
+def test_a_urdf_is_a_robot_with_all_its_links(tmp_path):
+    (tmp_path / "some.urdf").write_text(URDF)
+    robot = read_robot(tmp_path / "some.urdf")
+    assert robot.name == "crane"
+    assert robot.links == robot.skin_links == ("foot", "mast", "boom", "hook")
+    assert robot.joints == ("turn",)
+    (shape,) = robot.primitives
+    assert shape.link == "boom"
+    np.testing.assert_allclose(shape.size, [0.1, 1, 0.1])
+    # A joint without <axis> turns about x: a quarter turn lifts the hook.
+    quarter = torch.tensor([[torch.pi / 2]])
+    position, _ = LinkKinematics(robot.chain, ["hook"]).poses_b(quarter)
+    np.testing.assert_allclose(position[0, 0], [0, 0, 5], atol=1e-6)
+    assert len(place_sensors(robot, 5, links=["boom"])) == 5
+
+
+def test_an_mjcf_is_a_robot_whatever_stands_in_its_world(tmp_path):
+    path = tmp_path / "two.xml"
+    body = "<body name='{}'><freejoint/><geom size='.1'/><body><geom size='.1'/></body>"
+    for names, base, links in (
+        (["a"], "a", ("a", "body2")),
+        (["a", "b"], "world", ("a", "body2", "b", "body4")),
+        ([""], "body1", ("body1", "body2")),
+    ):
+        world = "".join(body.format(name) + "</body>" for name in names)
+        path.write_text(f"<mujoco><worldbody>{world}</worldbody></mujoco>")
+        robot = read_robot(str(path))
+        assert (robot.name, robot.base, robot.links) == ("two", base, links)
+    assert read_robot(H1_2.model_path).links == H1_2.links
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "expected"),
+    [
+        (
+            "r.xml",
+            "<mujoco><bod/></mujoco>",
+            "r.xml is no robot that MuJoCo can read: ",
+        ),
+        ("r.urdf", "", "r.urdf is no robot"),
+        ("r.csv", "Index,X", r"must be an MJCF \(.xml\) or a URDF"),
+        (
+            "r.xml",
+            '<mujoco><asset><mesh name="m" file="m.stl"/></asset></mujoco>',
+            "r.xml is no robot .*m.stl",
+        ),
+    ],
+)
+def test_a_file_that_is_no_robot_is_refused_in_one_line(
+    tmp_path, name, content, expected
+):
+    (tmp_path / name).write_text(content)
+    with pytest.raises(ValueError, match=expected) as error:
+        read_robot(tmp_path / name)
+    assert "\n" not in str(error.value)
+
+
+def test_a_robot_in_a_pipe_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "r.xml")
+    with pytest.raises(ValueError, match="named pipe"):
+        read_robot(tmp_path / "r.xml")
+    with pytest.raises(FileNotFoundError):
+        read_robot(tmp_path / "none.xml")
 
 
 # --- sensors on it --------------------------------------------------------------

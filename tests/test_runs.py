@@ -15,6 +15,7 @@ import torch
 
 import egoskin
 from egoskin.checkpoint import load_tensors, save_tensors
+from egoskin.formats import read_sealed, sealed_json
 from egoskin.make import EnvConfig
 from egoskin.runs import Run, TrainConfig, parse_config
 from egoskin.sensors.config import SensorConfig
@@ -78,9 +79,9 @@ def test_a_run_of_another_version_is_not_gone_on_with(config: TrainConfig):
     args = ["--resume", str(run.path)]
     assert parse_config(args) == replace(run.config, run_dir=None, resume=run.path)
     file = run.path / "config.json"
-    content = json.loads(file.read_text())
+    content, _ = read_sealed(file)
     del content["env"]["task"]["throws"]["lead"]
-    file.write_text(json.dumps(content))
+    file.write_bytes(sealed_json(content))
     message = r"config\.json lacks env\.task\.throws\.lead: another version made it"
     with pytest.raises(ValueError, match=message):
         parse_config(args)

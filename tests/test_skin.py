@@ -223,8 +223,13 @@ def skin_content(*sensors: object) -> dict:
         ),
         (
             skin_content({**SENSOR, "position": [0, 0, float("nan")]}),
-            "position holds values that are not finite",
+            r"sensor 0: 'position' must be three numbers, got \[0, 0, nan\]",
         ),
+        (skin_content({**SENSOR, "normal": [0, 10**400, 0]}), "'normal' must be three"),
+        (skin_content({**SENSOR, "range": 10**400}), "'range' must be a number"),
+        (skin_content({**SENSOR, "radius": float("nan")}), "'radius' must be a number"),
+        ("1" * 5000, "limit"),
+        ("[" * 100_000, "nested too deep"),
         ({**skin_content(), "sensors": None}, "'sensors' must be a list, got None"),
         (skin_content(5), "sensor 0 must be an object, got 5"),
         (skin_content({**SENSOR, "link": 3}), "sensor 0: 'link' must be a name, got 3"),
@@ -241,6 +246,7 @@ def skin_content(*sensors: object) -> dict:
                 ({"coverage": ["ray"]}, "'coverage' must be one of field, ray"),
                 ({"grid": 5}, r"'grid' must be like \[8, 8\], got 5"),
                 ({"grid": [8.5, 8]}, "grid must be two positive integers"),
+                ({"fov_deg": 10**400}, "fov_deg must be in"),
                 ({"fov_deg": "63"}, "'fov_deg' must be like 63.0, got '63'"),
                 ({"sub_beams": 1.5}, "'sub_beams' must be like 1, got 1.5"),
             )

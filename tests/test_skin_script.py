@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import runpy
 import sys
 from collections.abc import Callable
@@ -92,6 +93,38 @@ def test_a_gentact_file_goes_in_and_comes_out(run):
     np.testing.assert_array_equal(back.radius, skin.radius)
 
 
+CRANE = """<robot name="crane"><link name="foot"/>
+<joint name="turn" type="continuous"><parent link="foot"/><child link="boom"/></joint>
+<link name="boom"><collision><geometry><box size="2 .2 .2"/></geometry></collision>
+</link><joint name="grip" type="fixed"><parent link="boom"/><child link="hook"/></joint>
+<link name="hook"><collision><geometry><cylinder radius=".1" length=".2"/></geometry>
+</collision></link></robot>"""
+
+
+def test_files_of_any_robot_make_one_skin(run):
+    Path("crane.urdf").write_text(CRANE)
+    Path("boom.csv").write_text(
+        "Index,X,Y,Z,Radius,Parent\n0,0.5,0.11,0,0.01,/r/boom\n1,9,0,0,0.01,/r/boom"
+    )
+    Path("hook.csv").write_text(
+        "Index,X,Y,Z,NormX,NormY,NormZ,Parent\n0,0.1,0,0,1,0,0,/r/claw/visuals"
+    )
+    args = (
+        *("import", "boom.csv", "hook.csv", "--robot", "crane.urdf"),
+        *("--link-map", "claw=hook", "arm=boom", "--out", "skin.json"),
+    )
+    with pytest.raises(SystemExit):
+        run(*args)
+    out = run(*args, "--skip-invalid")
+    assert "skin.json: 2 sensors on links of crane" in out
+    assert "remark: no file needs 'arm' of --link-map" in out
+    assert "left out: boom.csv:3: the sensor lies 9 m" in out
+    skin = Skin.load(Path("skin.json"))
+    assert skin.links == ("boom", "hook")
+    # The first from the box; the hook's cylinder is no primitive.
+    np.testing.assert_allclose(skin.normal, [[0, 1, 0], [1, 0, 0]], atol=1e-6)
+
+
 def test_millimetres_and_a_link_that_the_file_leaves_out(run):
     Path("gentact.csv").write_text(
         "Index,X,Y,Z,NormX,NormY,NormZ,Radius,Parent\n0,93,20,200,1,0,0,4,\n"
@@ -173,6 +206,13 @@ def test_a_picture_shows_sensors_and_normals_from_both_sides(run, mixed, capsys)
         (["import", "bad.csv", "--out", "a.csv"], "must end in .json"),
         (["import", "bad.csv", "--out", "no/a.json"], "there is no folder"),
         (["import", "bad.csv", "--link-map", "arm", "--out", "a.json"], "name=value"),
+        (["import", "--out", "a.json"], "at least one file"),
+        (["import", "pipe", "--out", "a.json"], "pipe must be a file"),
+        (["import", "bad.csv", "--robot", "h1", "--out", "a.json"], "one of h1_2, or"),
+        (["import", "bad.csv", "--robot", "bad.csv", "--out", "a.json"], "(.urdf, .x"),
+        (["show", "pipe"], "skin file pipe: pipe must be a file, and is a named pipe"),
+        (["show", "/dev/zero"], "skin file /dev/zero: /dev/zero must be a file"),
+        (["export", "deep.json", "--out", "a.csv"], "skin file deep.json: nested"),
         (["export", "bad.csv", "--out", "a.csv"], "skin file bad.csv"),
         (["show", "other.json"], "did you mean 'torso_link'"),
         (["show", "alien.json", "--picture", "a.png"], "pictures can be drawn of h1_2"),
@@ -192,6 +232,8 @@ def test_bad_input_is_one_clear_message(args, expected, run, capsys):
       {"link": "torso_lnk", "position": [0, 0, 0], "normal": [1, 0, 0]}]}"""
     Path("other.json").write_text(content.replace("ROBOT", "h1_2"))
     Path("alien.json").write_text(content.replace("ROBOT", "alien"))
+    Path("deep.json").write_text("[" * 100_000)
+    os.mkfifo("pipe")
     before = sorted(Path().iterdir())
     with pytest.raises(SystemExit) as ended:
         run(*args)

@@ -335,6 +335,55 @@ pool.step_and_maybe_reset(root)
         time.sleep(0.05)
 
 
+UNGUARDED = """
+from egoskin.make import EnvConfig, make_env
+from egoskin.robots import H1_2
+from egoskin.sensors import place_sensors
+skin = place_sensors(H1_2, 8, seed=0)
+pool = make_env(EnvConfig(), skin, num_envs=8, seed=0, num_workers=2)
+pool.reset()
+"""
+
+
+def test_a_script_without_a_guard_is_told_so_in_one_line(tmp_path):
+    script = tmp_path / "unguarded.py"
+    script.write_text(UNGUARDED)
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True)
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    assert 'called under `if __name__ == "__main__":`' in done.stderr
+
+
+def test_a_pool_that_nobody_closed_ends_with_its_script():
+    # Given as text, it is no file that workers could import.
+    command = [sys.executable, "-c", UNGUARDED + "print(pool._workers[0].pid)"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert not Path("/proc", done.stdout.strip()).exists()
+
+
+def test_a_server_killed_at_the_start_is_reported():
+    code = """
+import os, signal, time
+from multiprocessing import forkserver
+from threading import Thread
+
+def kill():
+    while not (pid := forkserver._forkserver._forkserver_pid):
+        time.sleep(0.001)
+    # It imports.
+    time.sleep(0.3)
+    os.kill(pid, signal.SIGKILL)
+
+Thread(target=kill, daemon=True).start()
+"""
+    command = [sys.executable, "-c", code + UNGUARDED]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 1
+    *_, last = done.stderr.splitlines()
+    assert "WorkerError: a worker, or the server that forks them, ended" in last
+
+
 def build_badly(parent: int, fault: str, skin) -> TransformedEnv:
     """Fail in a worker, but not where the parent reads the specs."""
     if os.getpid() != parent:

@@ -20,6 +20,7 @@ import mujoco
 import numpy as np
 
 from egoskin.chains import body_name
+from egoskin.files import check_regular
 from egoskin.robots import RobotConfig
 from egoskin.surface import (
     Patch,
@@ -35,6 +36,8 @@ if TYPE_CHECKING:
 Meshes = Mapping[str, Sequence["Trimesh"]]
 """Meshes by link, in the frames of the links [m]."""
 
+# Largest file of a mesh [bytes].
+_LARGEST = 2**30
 # Rays over the hemisphere of each point, and the share of them that must escape: 0.15
 # rejects the floor of a round pit deeper than 1.2 diameters.
 _NUM_RAYS = 48
@@ -75,7 +78,7 @@ def meshes_in_folder(folder: Path, links: Sequence[str]) -> dict[str, list[Trime
 
     Raises:
         FileNotFoundError: If there is no such folder, or no file is named after a link.
-        ValueError: If two files are named after one link.
+        ValueError: If two files are named after one link, or one cannot be read.
     """
     trimesh = _trimesh()
     formats = {f".{name}" for name in trimesh.available_formats()}
@@ -87,7 +90,13 @@ def meshes_in_folder(folder: Path, links: Sequence[str]) -> dict[str, list[Trime
                     f"{folder} holds two meshes of {path.stem}: "
                     f"{meshes[path.stem][0].metadata['name']} and {path.name}"
                 )
-            mesh = trimesh.load_mesh(path)
+            check_regular(path, _LARGEST)
+            try:
+                mesh = trimesh.load_mesh(path)
+            except Exception as error:  # of any kind, for a damaged file
+                raise ValueError(
+                    f"{path} is no mesh that trimesh can read: {error}"
+                ) from error
             mesh.metadata["name"] = path.name
             meshes[path.stem] = [mesh]
     if not meshes:
@@ -112,10 +121,12 @@ def meshes_of_mjcf(path: Path, group: int | None = None) -> dict[str, list[Trime
         ValueError: If MuJoCo cannot load the file, or no geom is a mesh.
     """
     trimesh = _trimesh()
+    check_regular(path)
     try:
         model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
-        raise ValueError(f"{path} is no MuJoCo model: {error}") from error
+        text = " ".join(str(error).split())
+        raise ValueError(f"{path} is no MuJoCo model: {text}") from error
     meshes: dict[str, list[Trimesh]] = {}
     seen = set()
     for geom in np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH):

@@ -7,6 +7,7 @@ normal pointing out, and the same arguments give the same skin.
 from __future__ import annotations
 
 import fnmatch
+import heapq
 import math
 from collections.abc import Mapping, Sequence
 from typing import Literal
@@ -23,10 +24,57 @@ _CANDIDATES = 5
 # Darts thrown at each square of the spacing. A full cover has 0.70 sensors in each, and
 # then less than 1 % of the surface is farther than the spacing from a sensor.
 _DARTS_PER_SQUARE = 40
-# As many as fit are found among this many darts at most: some minutes on meshes.
+# As many as fit are found among this many darts at most: some minutes on meshes. More
+# are thrown only for a number of sensors, so many at once.
 _MAX_DARTS = 2_000_000
+# Of more the candidates alone would fill the memory.
+_MAX_SENSORS = _MAX_DARTS // _CANDIDATES
 # Points that measure the outer area and the rejected shares.
 _AREA_POINTS = 4000
+
+
+# Points whose neighbours are looked up at once, and cells along an axis at most.
+_CHUNK = 4096
+_MOST_CELLS = 1_000_000
+
+
+class _Cells:
+    """Points sorted into cubes, to find those near a point.
+
+    Args:
+        points: Points [m], ``[n, 3]``.
+        edge: Edge of a cube [m]; all that is nearer than this is found.
+    """
+
+    def __init__(self, points: np.ndarray, edge: float) -> None:
+        edge = max(edge, float(np.ptp(points, axis=0).max()) / _MOST_CELLS)
+        cell = ((points - points.min(axis=0)) // edge).astype(np.int64) + 1
+        across = cell.max(axis=0) + 2
+        # Cubes that follow each other along z have numbers that do.
+        key = (cell[:, 0] * across[1] + cell[:, 1]) * across[2] + cell[:, 2]
+        self._order = np.argsort(key, kind="stable")
+        self._key, self._sorted = key, key[self._order]
+        x, y = np.meshgrid([-1, 0, 1], [-1, 0, 1], indexing="ij")
+        self._rows = ((x * across[1] + y) * across[2]).ravel()
+
+    def near(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return (which of some points, point in or beside its cube) for all pairs.
+
+        Args:
+            index: Indices of points, ``[m]``.
+
+        Returns:
+            Positions in ``index``, ascending, and indices of points, ``[pairs]`` each.
+        """
+        # Three cubes in a row along z, in each of nine rows.
+        middle = self._key[index][:, None] + self._rows
+        low = np.searchsorted(self._sorted, middle.ravel() - 1, "left")
+        number = np.searchsorted(self._sorted, middle.ravel() + 1, "right") - low
+        # Ranges low, low + 1, ... of so many numbers, one after the other.
+        before = np.cumsum(number) - number
+        place = np.arange(number.sum()) + np.repeat(low - before, number)
+        which = np.repeat(np.repeat(np.arange(len(index)), 9), number)
+        return which, self._order[place]
 
 
 def throw_darts(points: np.ndarray, radius: np.ndarray, most: int) -> np.ndarray:
@@ -42,22 +90,16 @@ def throw_darts(points: np.ndarray, radius: np.ndarray, most: int) -> np.ndarray
     Returns:
         Indices of the points taken, in order.
     """
-    # Along one axis, all that can meet a disc lies in one window of the sorted points.
-    line = points[:, np.ptp(points, axis=0).argmax()]
-    by_line = np.argsort(line)
-    line, points, radius = line[by_line], points[by_line], radius[by_line]
-    widest = radius.max()
+    cells = _Cells(points, 2 * radius.max())
     free = np.ones(len(points), dtype=bool)
     taken: list[int] = []
-    for i in np.argsort(by_line):  # ranks on the line, in the order given
+    for i in range(len(points)):
         if len(taken) == most:
             break
         if not free[i]:
             continue
-        taken.append(int(by_line[i]))
-        reach = radius[i] + widest
-        low, high = np.searchsorted(line, (line[i] - reach, line[i] + reach))
-        near = slice(low, high)
+        taken.append(i)
+        _, near = cells.near(np.array([i]))
         distance = np.linalg.norm(points[near] - points[i], axis=-1)
         free[near] &= distance >= radius[near] + radius[i]
     return np.array(taken)
@@ -85,16 +127,35 @@ def eliminate(
     # r_min = r_max (1 - (N / M)^gamma) beta with gamma = 1.5 and beta = 0.65.
     closest = widest * (1 - (count / len(points)) ** 1.5) * 0.65
 
-    def crowding(i: int) -> np.ndarray:
-        distance = np.linalg.norm(points - points[i], axis=-1) * 2 / (scale + scale[i])
+    total = np.zeros(len(points))
+    cells = _Cells(points, widest * scale.max())
+    neighbours: list[np.ndarray] = []
+    crowding: list[np.ndarray] = []
+    for first in range(0, len(points), _CHUNK):
+        index = np.arange(first, min(first + _CHUNK, len(points)))
+        which, near = cells.near(index)
+        point = index[which]
+        distance = np.linalg.norm(points[near] - points[point], axis=-1)
+        distance = distance * 2 / (scale[near] + scale[point])
+        close = distance < widest
+        which, near, distance = which[close], near[close], distance[close]
         # w_ij = (1 - d_ij / (2 r_max))^alpha with alpha = 8.
-        return (1 - distance.clip(closest, widest) / widest) ** 8
+        weight = (1 - distance.clip(closest, widest) / widest) ** 8
+        # One after the other: sums in another order round otherwise.
+        np.add.at(total, near, weight)
+        ends = np.searchsorted(which, np.arange(1, len(index)))
+        neighbours += np.split(near.astype(np.int32), ends)
+        crowding += np.split(weight, ends)
 
-    total = sum(crowding(i) for i in range(len(points)))
+    # Mutual neighbours tie: rounding, which differs by machine, must not decide.
+    heap = [(-value, i) for i, value in enumerate(total.round(12).tolist())]
+    heapq.heapify(heap)
     for _ in range(len(points) - count):
-        # Mutual neighbours tie: rounding, which differs by machine, must not decide.
-        worst = int(np.argmax(total.round(12)))
-        total -= crowding(worst)
+        # Totals only fall, so that one that is out of date stands too far in front.
+        while -heap[0][0] > (value := float(total[heap[0][1]].round(12))):
+            heapq.heapreplace(heap, (-value, heap[0][1]))
+        _, worst = heapq.heappop(heap)
+        total[neighbours[worst]] -= crowding[worst]
         total[worst] = -np.inf
     return np.flatnonzero(total > -np.inf)
 
@@ -163,10 +224,28 @@ def _check(
         raise ValueError("num_sensors=None needs a spacing to decide the number")
     if num_sensors is not None and num_sensors < 1:
         raise ValueError(f"the number of sensors must be positive, got {num_sensors}")
+    if num_sensors is not None and num_sensors > _MAX_SENSORS:
+        raise ValueError(
+            f"the number of sensors must be at most {_MAX_SENSORS:,}, got {num_sensors}"
+        )
     if seed < 0:
         raise ValueError(f"the seed of a placement must not be negative, got {seed}")
     if not 0 <= stand_off < math.inf:
         raise ValueError(f"stand_off must be finite and not negative, got {stand_off}")
+
+
+def _check_metres(
+    robot: RobotConfig, link: np.ndarray, position: np.ndarray, meshes: Meshes
+) -> None:
+    """Raise ValueError if a sensor would lie where none is on a robot."""
+    away = np.linalg.norm(position, axis=-1)
+    if away.max() > FARTHEST:
+        name = robot.links[link[away.argmax()]]
+        hint = f": are the meshes of {name} in metres?" if name in meshes else ""
+        raise ValueError(
+            f"a sensor would lie {away.max():.3g} m from the origin of {name}, farther "
+            f"than any on a robot ({FARTHEST:g} m){hint}"
+        )
 
 
 def place_sensors(
@@ -231,38 +310,42 @@ def place_sensors(
         number = num_sensors * (_CANDIDATES if method == "poisson_disk" else 1)
         wanted = num_sensors
 
-    points = surface.sample(number, seed, weights, stand_off)
-    # Six decimals are what the file holds: a saved skin is the same skin.
-    position = (points.position + stand_off * points.normal).round(6)
-    normal = points.normal.round(6)
-    away = np.linalg.norm(position, axis=-1)
-    if away.max() > FARTHEST:
-        link = robot.links[points.link[away.argmax()]]
-        hint = (
-            f": are the meshes of {link} in metres?" if link in (meshes or {}) else ""
+    link, position, normal = np.empty(0, int), np.empty((0, 3)), np.empty((0, 3))
+    for first in range(0, number, _MAX_DARTS):
+        if first and len(link) == wanted:
+            break
+        points = surface.sample(
+            min(_MAX_DARTS, number - first),
+            # Another stream for each lot, whatever the seed.
+            seed + (first << 64),
+            weights,
+            stand_off,
         )
+        # Six decimals are what the file holds: a saved skin is the same skin.
+        at = (points.position + stand_off * points.normal).round(6)
+        _check_metres(robot, points.link, at, meshes or {})
+        link = np.concatenate((link, points.link))
+        position = np.concatenate((position, at))
+        normal = np.concatenate((normal, points.normal.round(6)))
+        if method == "poisson_disk":
+            places = surface.points_b(link, position)
+            scale = np.array([weights[robot.links[i]] for i in link]) ** -0.5
+            if spacing is None:
+                chosen = eliminate(places, scale, wanted, area)
+            else:
+                # What was taken before comes first, and is taken again.
+                chosen = throw_darts(places, scale * spacing / 2, wanted)
+            link, position, normal = link[chosen], position[chosen], normal[chosen]
+    if num_sensors is not None and len(link) < num_sensors:
         raise ValueError(
-            f"a sensor would lie {away.max():.3g} m from the origin of {link}, farther "
-            f"than any on a robot ({FARTHEST:g} m){hint}"
-        )
-    chosen = np.arange(number)
-    if method == "poisson_disk":
-        places = surface.points_b(points.link, position)
-        scale = np.array([weights[robot.links[i]] for i in points.link]) ** -0.5
-        if spacing is None:
-            chosen = eliminate(places, scale, wanted, area)
-        else:
-            chosen = throw_darts(places, scale * spacing / 2, wanted)
-    if num_sensors is not None and len(chosen) < num_sensors:
-        raise ValueError(
-            f"only {len(chosen)} sensors fit at a spacing of {spacing:g} m, not "
+            f"only {len(link)} sensors fit at a spacing of {spacing:g} m, not "
             f"{num_sensors}: lower the spacing or num_sensors, or cover more links"
         )
     return Skin(
         robot=robot.name,
-        links=tuple(robot.links[i] for i in points.link[chosen]),
-        position=position[chosen],
-        normal=normal[chosen],
+        links=tuple(robot.links[i] for i in link),
+        position=position,
+        normal=normal,
         provenance={
             "method": method,
             "num_sensors": num_sensors,

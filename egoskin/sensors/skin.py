@@ -10,6 +10,7 @@ import difflib
 import itertools
 import json
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from egoskin.files import read_regular
 from egoskin.sensors.coverage import KINDS, Coverage, Ray
 
 _FORMAT = "egoskin-skin-1"
@@ -36,12 +38,16 @@ FARTHEST = 2.0
 """Farther from its link's origin no sensor of a file sits [m]: the unit is wrong."""
 
 
+def _is_number(value: object) -> bool:
+    """Whether a JSON value is a finite number; Python also reads NaN and 10^400."""
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return is_number and abs(value) <= sys.float_info.max
+
+
 def _is_vector(value: object) -> bool:
     """Whether a JSON value is a list of three numbers."""
     return (
-        isinstance(value, Sequence)
-        and len(value) == 3
-        and all(type(v) in (int, float) for v in value)
+        isinstance(value, Sequence) and len(value) == 3 and all(map(_is_number, value))
     )
 
 
@@ -108,7 +114,7 @@ def _check_sensor(index: int, sensor: object, types: Mapping[str, Coverage]) -> 
     for name in ("range", "roll_deg", "radius"):
         if name == "range" and sensor.get(name) == "inf":
             continue
-        if name in sensor and type(sensor[name]) not in (int, float):
+        if name in sensor and not _is_number(sensor[name]):
             raise ValueError(
                 f"{where}: {name!r} must be a number, got {sensor[name]!r}"
             )
@@ -406,6 +412,8 @@ class Skin:
             ValueError: If the file is missing, no JSON, or no skin; the text names it.
         """
         try:
-            return cls.from_dict(json.loads(Path(path).read_text()))
+            return cls.from_dict(json.loads(read_regular(path)))
+        except RecursionError:
+            raise ValueError(f"skin file {path}: nested too deep") from None
         except (OSError, ValueError) as error:
             raise ValueError(f"skin file {path}: {error}") from error

@@ -5,14 +5,22 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 from xml.parsers import expat
 
 import numpy as np
 
-from egoskin.sensors.gentact.source import Export, Links, Sensor, number, read_radius
+from egoskin.sensors.gentact.source import (
+    Export,
+    Links,
+    Problems,
+    Sensor,
+    SensorError,
+    number,
+    read_radius,
+)
 
 # A normal and the frame beside it may differ by this [deg]: files rounded by hand.
 _SAME_DIRECTION = 2.0
@@ -20,7 +28,7 @@ _SENSOR_TAGS = ("xacro:self_cap_sensor", "xacro:tof_sensor")
 # Some versions of the exporter leave out the > between a sensor's attributes and its
 # <origin>.
 _UNCLOSED_SENSOR = re.compile(r'(<xacro:\w+_sensor\s[^<>]*")(?=\s*<origin\s)')
-_SENSOR_JOINT = re.compile(r"_sensor_\d+_joint$")
+_SENSOR_JOINT = re.compile(r"(^|[_/])sensor_\d+_joint$")
 # GenTact's magnetic sensors sense no proximity.
 _MAGNETIC = "mag_sensor"
 
@@ -76,7 +84,7 @@ class Xml:
         """Three numbers of an attribute; zero if there is none."""
         parts = self.value(element, name, "0 0 0").split()
         if len(parts) != 3:
-            raise ValueError(
+            raise SensorError(
                 f"{self.where(element)}: {name} must be three numbers, got "
                 f"{' '.join(parts)!r}"
             )
@@ -96,23 +104,23 @@ class Xml:
         return z_turn @ y_turn @ x_turn, self.vector(origin, "xyz")
 
 
-def read_description(xml: Xml, names: Links) -> Export:
+def read_description(xml: Xml, names: Links, problems: Problems) -> Export:
     """Sensors of a xacro macro or of a URDF."""
     tags = Counter(element.tag for element in xml.root.iter())
     if any(tags[tag] for tag in _SENSOR_TAGS):
-        sensors, dialect = _read_xacro(xml, names), "xacro"
+        sensors, dialect = _read_xacro(xml, names, problems), "xacro"
         num_magnetic = tags[f"xacro:{_MAGNETIC}"]
     else:
         joints = [j for j in xml.root.findall("joint") if _is_sensor(j)]
-        magnetic = [j for j in joints if _MAGNETIC in j.get("name", "")]
-        kept = [j for j in joints if j not in magnetic]
-        sensors, dialect = _read_urdf(xml, names, kept), "urdf"
-        num_magnetic = len(magnetic)
-    if not sensors:
-        raise ValueError(
-            f"{xml.path}: no sensors of GenTact in it: neither <{_SENSOR_TAGS[0]}> nor "
-            "fixed joints named <namespace>_sensor_<number>_joint"
-        )
+        kept = [j for j in joints if _MAGNETIC not in j.get("name", "")]
+        if not kept:
+            raise ValueError(
+                f"{xml.path}: no sensors of GenTact in it: neither <{_SENSOR_TAGS[0]}> "
+                "nor fixed joints named <namespace>_sensor_<number>_joint or "
+                "<namespace>/sensor_<number>_joint"
+            )
+        sensors, dialect = _read_urdf(xml, names, kept, problems), "urdf"
+        num_magnetic = len(joints) - len(kept)
     skipped = {_MAGNETIC: num_magnetic} if num_magnetic else {}
     return Export(dialect=dialect, sensors=sensors, skipped=skipped)
 
@@ -123,7 +131,7 @@ def _is_sensor(joint: ElementTree.Element) -> bool:
     return joint.get("type") == "fixed" and bool(_SENSOR_JOINT.search(name))
 
 
-def _read_xacro(xml: Xml, names: Links) -> list[Sensor]:
+def _read_xacro(xml: Xml, names: Links, problems: Problems) -> list[Sensor]:
     """Sensors of the one macro of a xacro file, or of a file without macros."""
     macros = [
         macro
@@ -143,100 +151,127 @@ def _read_xacro(xml: Xml, names: Links) -> list[Sensor]:
     link = (
         names.default(xml.where(macro), macro.get("name", ""))
         if "${" in name
-        else names.of_path(name, set(), xml.where(macro))
+        else names.of_path(name, xml.where(macro))
     )
     sensors = []
     for element in (e for e in macro.iter() if e.tag in _SENSOR_TAGS):
-        where = xml.where(element)
-        if element.get("sensor_number") is None or element.find("origin") is None:
-            raise ValueError(f"{where}: a sensor needs a sensor_number and an <origin>")
-        normal = None
-        axes = [f"normal_{axis}" for axis in "xyz"]
-        if any(axis in element.attrib for axis in axes):
-            values = [number(xml.value(element, a), where, a) for a in axes]
-            normal = np.array(values)
-        sensors.append(
-            _framed(
-                xml,
-                element,
-                normal,
-                (base, offset),
-                link=link,
-                name=f"{element.tag} {element.get('sensor_number')}",
-                radius=read_radius(xml.value(element, "sensor_radius"), where),
-            )
-        )
+        with problems.collect():
+            sensors.append(_read_tag(xml, element, link, (base, offset)))
     return sensors
 
 
+def _read_tag(xml: Xml, element: ElementTree.Element, link: str, base: Frame) -> Sensor:
+    """Sensor of an element of a xacro macro, given its link and the skin's frame."""
+    where = xml.where(element)
+    if element.get("sensor_number") is None or element.find("origin") is None:
+        raise SensorError(f"{where}: a sensor needs a sensor_number and an <origin>")
+    normal = None
+    axes = [f"normal_{axis}" for axis in "xyz"]
+    if any(axis in element.attrib for axis in axes):
+        normal = np.array([number(xml.value(element, a), where, a) for a in axes])
+    return _framed(
+        xml,
+        element,
+        normal,
+        base,
+        link=link,
+        name=f"{element.tag} {element.get('sensor_number')}",
+        radius=read_radius(xml.value(element, "sensor_radius"), where),
+    )
+
+
 def _read_urdf(
-    xml: Xml, names: Links, joints: Sequence[ElementTree.Element]
+    xml: Xml, names: Links, joints: Sequence[ElementTree.Element], problems: Problems
 ) -> list[Sensor]:
     """Sensors of a URDF: fixed joints that lead to them from links of the robot."""
-    above = {_end(xml, j, "child"): j for j in xml.root.findall("joint")}
+    tree = _Tree(xml, names)
     spheres = {
         link.get("name"): link.find("visual/geometry/sphere")
         for link in xml.root.findall("link")
     }
     sensors = []
     for joint in joints:
-        link, base = _climb(xml, joint, above, names)
-        axis = joint.find("axis")
-        normal = None if axis is None else xml.vector(axis, "xyz")
-        sphere = spheres.get(_end(xml, joint, "child"))
-        radius = "" if sphere is None else xml.value(sphere, "radius")
-        sensors.append(
-            _framed(
+        with problems.collect():
+            link, base = tree.climb(joint)
+            axis = joint.find("axis")
+            sphere = spheres.get(_end(xml, joint, "child"))
+            radius = "" if sphere is None else xml.value(sphere, "radius")
+            sensor = _framed(
                 xml,
                 joint,
-                normal,
+                # A fixed joint has no axis; GenTact's holds the normal.
+                None if axis is None else xml.vector(axis, "xyz"),
                 base,
                 link=link,
                 name=joint.get("name", ""),
                 radius=read_radius(radius, xml.where(joint)),
             )
-        )
+            sensors.append(sensor)
     return sensors
 
 
-def _climb(
-    xml: Xml,
-    joint: ElementTree.Element,
-    above: Mapping[str, ElementTree.Element],
-    names: Links,
-) -> tuple[str, Frame]:
-    """Link of the robot above a joint, and the frame of the joint's parent in it.
+class _Tree:
+    """Which link of the robot a URDF's links are fixed to, and where."""
 
-    Args:
-        xml: The file.
-        joint: Where to start.
-        above: Joint that carries each link.
-        names: The robot's links.
-    """
-    rotation, position = np.eye(3), np.zeros(3)
-    under = _end(xml, joint, "parent")
-    # Taking joints out as they are used ends the walk even in a ring.
-    left = dict(above)
-    while (link := names.match(under)) is None:
-        up = left.pop(under, None)
-        if up is None or up.get("type") != "fixed":
-            raise ValueError(
-                f"{xml.where(joint)}: the sensor hangs on {under!r}, which is no link "
-                "of the robot nor fixed to one; map it with link_map (--link-map); "
-                f"{names.known()}"
+    def __init__(self, xml: Xml, names: Links) -> None:
+        self._xml, self._names = xml, names
+        self._above: dict[str, ElementTree.Element] = {}
+        for joint in xml.root.findall("joint"):
+            child = _end(xml, joint, "child")
+            if child in self._above:
+                raise ValueError(
+                    f"{xml.where(joint)}: the link {child!r} hangs on another joint "
+                    f"already ({xml.where(self._above[child])}); take one out"
+                )
+            self._above[child] = joint
+        # Frames found so far in their links of the robot; or the name of the link,
+        # fixed to none, at which the search ended.
+        self._frames: dict[str, tuple[str, Frame] | str] = {}
+
+    def climb(self, joint: ElementTree.Element) -> tuple[str, Frame]:
+        """Link of the robot above a joint, and the frame of the joint's parent in it.
+
+        Raises:
+            SensorError: If the parent is no link of the robot nor fixed to one.
+        """
+        name = _end(self._xml, joint, "parent")
+        way: dict[str, ElementTree.Element] = {}
+        while (found := self._frame(name)) is None:
+            up = self._above.get(name)
+            # Passing a link twice is a ring.
+            if up is None or up.get("type") != "fixed" or name in way:
+                found = name
+                break
+            way[name] = up
+            name = _end(self._xml, up, "parent")
+        for under, up in reversed(way.items()):
+            if not isinstance(found, str):
+                link, (rotation, position) = found
+                turn, shift = self._xml.frame(up)
+                found = (link, (rotation @ turn, position + rotation @ shift))
+            self._frames[under] = found
+        if isinstance(found, str):
+            raise SensorError(
+                f"{self._xml.where(joint)}: the sensor hangs on {found!r}, which is no "
+                "link of the robot nor fixed to one; map it with link_map "
+                "(--link-map)",
+                self._names.known(),
             )
-        turn, shift = xml.frame(up)
-        rotation, position = turn @ rotation, turn @ position + shift
-        under = _end(xml, up, "parent")
-    names.found[under] = link
-    return link, (rotation, position)
+        return found
+
+    def _frame(self, name: str) -> tuple[str, Frame] | str | None:
+        """What is known of a link without a look at what it hangs on."""
+        if name not in self._frames and (link := self._names.match(name)) is not None:
+            self._names.found[name] = link
+            self._frames[name] = (link, (np.eye(3), np.zeros(3)))
+        return self._frames.get(name)
 
 
 def _end(xml: Xml, joint: ElementTree.Element, which: str) -> str:
     """Name of a joint's parent or child link."""
     end = joint.find(which)
     if end is None or not end.get("link"):
-        raise ValueError(f"{xml.where(joint)}: the joint has no <{which} link=...>")
+        raise SensorError(f"{xml.where(joint)}: the joint has no <{which} link=...>")
     return end.get("link", "")
 
 
@@ -265,7 +300,7 @@ def _framed(
     angle = math.degrees(math.acos(min(max(cosine, -1.0), 1.0)))
     if angle > _SAME_DIRECTION:
         if (own != np.eye(3)).any():
-            raise ValueError(
+            raise SensorError(
                 f"{where}: the normal {normal.tolist()} and the z axis of rpy, "
                 f"{own[:, 2].round(4).tolist()}, must be one direction, got "
                 f"{angle:.1f} deg between them; take out the wrong one (a wrong rpy: "

@@ -5,16 +5,60 @@ from __future__ import annotations
 import difflib
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 
 NO_RADIUS = 0.1
 """What GenTact writes for a sensor that has no radius [m]."""
 # Names below a link in GenTact's paths, as Isaac Sim's URDF importer gives them.
-_BELOW_LINKS = ("visuals", "collisions", "geometry")
+_BELOW_LINK = re.compile(r"(visuals|collisions|geometry)([._]?\d+)?")
+
+
+class SensorError(ValueError):
+    """One sensor cannot be read for certain.
+
+    Args:
+        what: Where in the file, what was expected and what came.
+        remedy: What to do about it, the same for all sensors of whom it is true.
+    """
+
+    def __init__(self, what: str, remedy: str = "") -> None:
+        super().__init__(f"{what}; {remedy}" if remedy else what)
+        self.what, self.remedy = what, remedy
+
+
+class Problems:
+    """The sensors that cannot be read, to name all of them at once."""
+
+    def __init__(self) -> None:
+        self.found: list[SensorError] = []
+
+    @contextmanager
+    def collect(self) -> Iterator[None]:
+        """Note that a sensor is invalid, and go on behind the block."""
+        try:
+            yield
+        except SensorError as error:
+            self.found.append(error)
+
+    def raise_all(self) -> None:
+        """Raise ValueError if a sensor was invalid."""
+        if len(self.found) == 1:
+            raise ValueError(
+                f"{self.found[0]}; or leave it out with skip_invalid (--skip-invalid)"
+            )
+        if self.found:
+            remedies = dict.fromkeys(e.remedy for e in self.found if e.remedy)
+            lines = [
+                f"{len(self.found)} sensors cannot be read; mend them, or leave them "
+                "out with skip_invalid (--skip-invalid):",
+                *(f"  {error.what}" for error in self.found),
+                *remedies,
+            ]
+            raise ValueError("\n".join(lines))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -38,10 +82,12 @@ class Export:
 
     dialect: str
     sensors: list[Sensor]
-    # Metres of one unit; None if the file does not tell.
+    # Metres of one unit of the positions; None if the file does not tell.
     unit: float | None = 1.0
-    # The 3-D print export scales positions but not radii.
-    scales_radius: bool = True
+    # The header itself tells that unit.
+    unit_is_told: bool = False
+    # Metres of one unit of the radii; None if it is that of the positions.
+    radius_unit: float | None = None
     # Numbers of entries that are no proximity sensors.
     skipped: dict[str, int] = field(default_factory=dict)
 
@@ -69,9 +115,9 @@ class Links:
         self.robot_name, self.links = robot_name, tuple(links)
         self.found: dict[str, str] = {}
         self._link_map, self._parent = dict(link_map), parent
-        self._unused = {f"link_map's {name!r}" for name in link_map}
-        if parent is not None:
-            self._unused.add("parent")
+        self.unused = dict.fromkeys(link_map)
+        """Names in the user's map that decided nothing so far, in their order."""
+        self._needs_parent = False
         for target in (*link_map.values(), *(() if parent is None else (parent,))):
             if target not in self.links:
                 close = difflib.get_close_matches(target, self.links, n=1)
@@ -85,12 +131,12 @@ class Links:
     def match(self, name: str) -> str | None:
         """Link that a name stands for, by the user's map or by its own; else None."""
         if name in self._link_map:
-            self._unused.discard(f"link_map's {name!r}")
+            self.unused.pop(name, None)
             return self._link_map[name]
         return name if name in self.links else None
 
-    def of_path(self, path: str, others: set[str], where: str) -> str:
-        """Link of a Parent path, given all the paths of the file."""
+    def of_path(self, path: str, where: str) -> str:
+        """Link of a Parent path."""
         if path in self._link_map:
             return self.found.setdefault(path, str(self.match(path)))
         parts = path.strip("/").split("/")
@@ -98,54 +144,55 @@ class Links:
             # Blender numbers objects of the same name: visuals.004.
             plain = re.sub(r"\.\d{3,}$", "", parts[last])
             link = self.match(parts[last]) or self.match(plain)
-            if link is not None:
-                self._check_siblings(path, last, others, where)
-                return self.found.setdefault(path, link)
+            if link is None:
+                continue
+            # GenTact puts the names of siblings with sensors into one path by mistake,
+            # and a path may go on to a link that this robot lacks.
+            rest = [p for p in parts[last + 1 :] if not _BELOW_LINK.fullmatch(p)]
+            if rest:
+                raise SensorError(
+                    f"{where}: {'/'.join(rest)!r} of the Parent {path!r} may be a part "
+                    f"of {parts[last]!r}, or a link that {self.robot_name} lacks; say "
+                    f"which link it means with link_map (--link-map {rest[-1]}=...)",
+                    self.known(),
+                )
+            return self.found.setdefault(path, link)
         held = [link for link in self.links if link in path]
         close = held or difflib.get_close_matches(parts[-1], self.links, n=2)
         hint = f" (did you mean {' or '.join(close)}?)" if close else ""
-        raise ValueError(
+        raise SensorError(
             f"{where}: no part of the Parent {path!r} names a link{hint}; map a part "
-            f"of it or all of it with link_map (--link-map); {self.known()}"
+            "of it or all of it with link_map (--link-map)",
+            self.known(),
         )
 
-    def _check_siblings(
-        self, path: str, last: int, others: set[str], where: str
-    ) -> None:
-        """Raise ValueError if what follows the link may be a sibling of the link.
+    def default(self, where: str, name: str = "") -> str:
+        """The user's link for sensors whose link the file does not tell.
 
-        GenTact puts the names of siblings with sensors into one path by mistake, so
-        that below a path that is a Parent itself there may be a child or a sibling.
+        Args:
+            where: File and line.
+            name: What the file calls the skin, which the user's map may hold.
         """
-        parts = path.strip("/").split("/")
-        owner, rest = "/" + "/".join(parts[: last + 1]), parts[last + 1 :]
-        if owner in others and not set(rest) <= set(_BELOW_LINKS):
-            raise ValueError(
-                f"{where}: {'/'.join(rest)!r} of the Parent {path!r} may be a part of "
-                f"{parts[last]!r}, or a sibling whose name GenTact appended, for "
-                f"{owner!r} is a Parent too; say which link the path means with "
-                "link_map (--link-map)"
-            )
-
-    def default(self, where: str, name: str) -> str:
-        """The user's link for sensors whose link the file, or ``name``, hides."""
+        if name in self._link_map:
+            return self.found.setdefault(name, str(self.match(name)))
         if self._parent is not None:
-            self._unused.discard("parent")
+            self._needs_parent = True
             return self._parent
         close = difflib.get_close_matches(name, self.links, n=1)
         hint = f" ({close[0]}?)" if close else ""
-        raise ValueError(
+        raise SensorError(
             f"{where}: the file does not say on which link its sensors sit; give it "
-            f"as parent (--parent){hint}; {self.known()}"
+            f"as parent (--parent){hint}",
+            self.known(),
         )
 
-    def check_used(self, path: Path) -> None:
-        """Raise ValueError for what the user gave and the file has no use for."""
-        if self._unused:
-            found = sorted(set(self.found.values()))
+    def check_parent(self) -> None:
+        """Raise ValueError if the user gave a parent and no sensor has use for it."""
+        if self._parent is not None and not self._needs_parent:
+            found = ", ".join(sorted(set(self.found.values())))
             raise ValueError(
-                f"{path}: {sorted(self._unused)[0]} decides nothing, for the file "
-                f"itself tells the links ({', '.join(found)}); leave it out"
+                "parent decides nothing, for what is read tells the links itself "
+                f"({found}); leave it out, or use link_map (--link-map)"
             )
 
 
@@ -156,7 +203,7 @@ def number(text: str, where: str, what: str) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise ValueError(f"{where}: {what} must be a finite number, got {text!r}")
+        raise SensorError(f"{where}: {what} must be a finite number, got {text!r}")
     return value
 
 
@@ -166,5 +213,5 @@ def read_radius(text: str, where: str) -> float:
         return math.nan
     value = number(text, where, "the radius")
     if value < 0:
-        raise ValueError(f"{where}: the radius must not be negative, got {text}")
+        raise SensorError(f"{where}: the radius must not be negative, got {text}")
     return math.nan if value in (0.0, NO_RADIUS) else value

@@ -15,32 +15,46 @@ from egoskin.sensors.gentact.source import (
     NO_RADIUS,
     Export,
     Links,
+    Problems,
     Sensor,
+    SensorError,
     number,
     read_radius,
 )
 from egoskin.sensors.skin import Skin
 
 _HEADER = "Index,X,Y,Z,NormX,NormY,NormZ,Radius,Parent,Object Name in Blender"
-_PRINT_HEADER = "Index,X,Y,Z,Stem X,Stem Y,Stem Z,Radius,Parent"
-_PLAIN_HEADER = "Index,X,Y,Z,Radius,Parent"
 _HEADERS = (
     _HEADER,
     "Index,X,Y,Z,NormX,NormY,NormZ,Radius,Parent",
-    _PLAIN_HEADER,
+    "Index,X,Y,Z,Radius,Parent",
     "SensorNum,RelX,RelY,RelZ,Radius,path",
-    _PRINT_HEADER,
+    "Sensor Name,X Offset,Y Offset,Z Offset,Radius,Parent Path",
+    "Index,X,Y,Z,Stem X,Stem Y,Stem Z,Radius,Parent",
 )
-_MESH_HEADER = "Index,X,Y,Z,Object Name"
-_DECIMAL_COMMA = re.compile(r"^([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)$")
-# Columns of the oldest dialect by today's names.
-_RENAMED = {
-    "sensornum": "index",
-    "relx": "x",
-    "rely": "y",
-    "relz": "z",
-    "path": "parent",
+_PLACE = ("x", "y", "z")
+_NORMAL = tuple(f"norm{axis}" for axis in _PLACE)
+_STEM = tuple(f"stem{axis}" for axis in _PLACE)
+# What the columns are called, without case, spaces and the like. A sensor's own name
+# is a number ("index") or any text ("name").
+_COLUMNS = {
+    "index": "index sensor num number id sensornum sensornumber sensorindex sensorid",
+    "name": "name sensorname",
+    **{a: f"{a} rel{a} {a}offset offset{a} pos{a} position{a} {a}pos" for a in _PLACE},
+    **{f"norm{a}": f"norm{a} {a}norm normal{a} {a}normal n{a}" for a in _PLACE},
+    **{f"stem{a}": f"stem{a} {a}stem" for a in _PLACE},
+    "radius": "radius radii sensorradius",
+    "parent": "parent parents path parentpath parentlink link linkname",
+    "object": "object objectname objectnameinblender",
 }
+_COLUMN_OF = {word: name for name, words in _COLUMNS.items() for word in words.split()}
+_UNITS = {
+    **dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 1.0),
+    **dict.fromkeys(("cm", "centimetres", "centimeters"), 1e-2),
+    **dict.fromkeys(("mm", "millimetres", "millimeters"), 1e-3),
+}
+_HEADING = re.compile(r"(?P<name>[^()\[\]]*)([(\[](?P<unit>[^()\[\]]*)[)\]])?")
+_DECIMAL_COMMA = re.compile(r"^([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)$")
 
 
 def save_gentact(skin: Skin, path: Path | str) -> tuple[str, ...]:
@@ -107,60 +121,110 @@ def _rows(text: str, path: Path) -> Iterator[tuple[str, list[str]]]:
             yield where, cells
 
 
-def read_table(text: str, path: Path, names: Links) -> Export:
+def read_table(text: str, path: Path, names: Links, problems: Problems) -> Export:
     """Sensors of a table of any dialect."""
     rows = list(_rows(text, path))
     if not rows:
         raise ValueError(f"{path}: the file is empty")
     where, header = rows.pop(0)
-    written = ",".join(header).rstrip(",")
-    if written.casefold() == _MESH_HEADER.casefold():
-        raise ValueError(
-            f"{where}: these are vertices of a mesh, not sensors; export the sensors"
-        )
-    dialect = {h.casefold(): h for h in _HEADERS}.get(written.casefold())
-    if dialect is None:
-        raise ValueError(
-            f"{where}: unknown header {written!r}; GenTact's are "
-            + "; ".join(map(repr, _HEADERS))
-        )
-    columns = [_RENAMED.get(c, c) for c in dialect.casefold().split(",")]
+    while header and not header[-1]:
+        header.pop()
+    columns, units = _read_header(header, where)
     # The 3-D print export has, besides sensors, clips and the names of objects.
     kinds = Counter(_kind(cells) for _, cells in rows)
-    is_print = dialect == _PRINT_HEADER or (
-        dialect == _PLAIN_HEADER and bool(kinds.keys() - {"sensors"})
+    plain = ["index", *_PLACE, "radius", "parent"]
+    is_print = columns[0] == "index" and (
+        _STEM[0] in columns or (columns == plain and bool(kinds.keys() - {"sensors"}))
     )
     if is_print:
         rows = [(w, cells) for w, cells in rows if _kind(cells) == "sensors"]
     if not rows:
         raise ValueError(f"{path}: there is no sensor in it")
-    records = [_record(cells, columns, w, is_print) for w, cells in rows]
-    others = {"/" + record["parent"].strip("/") for record in records}
+    # Without the column, one link holds for all.
+    link = None if "parent" in columns else names.default(where)
     sensors = []
-    for (where, _), record in zip(rows, records, strict=True):
-        number(record["index"], where, columns[0])
-        parent = record["parent"]
-        sensors.append(
-            Sensor(
-                where=where,
-                name=record["index"],
-                link=names.of_path(parent, others, where)
-                if parent
-                else names.default(where, ""),
-                position=_vector(record, ("x", "y", "z"), where),
-                normal=_vector(record, ("normx", "normy", "normz"), where)
-                if "normx" in columns
-                else None,
-                radius=read_radius(record["radius"], where),
-            )
-        )
+    for where, cells in rows:
+        with problems.collect():
+            record = _record(cells, columns, where, is_print)
+            sensors.append(_read_sensor(record, names, link, where))
+    # Before it had stems the print export came in one unit or another.
+    unit = 1.0 if not is_print else 1e-3 if _STEM[0] in columns else None
+    told = units.get("x")
+    radius_unit = units.get("radius")
+    # Since it writes headings, its positions have a unit of their own.
+    if radius_unit is None and is_print and (unit is not None or kinds["headings"]):
+        radius_unit = 1.0
     return Export(
-        dialect=dialect,
+        dialect=",".join(header),
         sensors=sensors,
-        # Before it had stems the print export came in one unit or another.
-        unit=1.0 if not is_print else 1e-3 if dialect == _PRINT_HEADER else None,
-        scales_radius=not is_print,
-        skipped={k: n for k, n in kinds.items() if k != "sensors"},
+        unit=unit if told is None else told,
+        unit_is_told=told is not None,
+        radius_unit=radius_unit,
+        skipped={k: n for k, n in kinds.items() if k != "sensors"} if is_print else {},
+    )
+
+
+def _read_header(
+    header: Sequence[str], where: str
+) -> tuple[list[str], dict[str, float]]:
+    """Names of the columns, and metres of the units that stand in brackets.
+
+    Raises:
+        ValueError: If a column is unknown, there twice or missing.
+    """
+    columns, units = [], {}
+    for cell in header:
+        heading = _HEADING.fullmatch(cell)
+        word = re.sub(r"[\s_.-]+", "", heading["name"] if heading else cell).casefold()
+        column = _COLUMN_OF.get(word)
+        if heading is None or column is None:
+            raise ValueError(
+                f"{where}: unknown header {','.join(header)!r}; GenTact's are "
+                + "; ".join(map(repr, _HEADERS))
+                + f"; rename or take out the column {cell!r}"
+            )
+        if column in columns:
+            raise ValueError(
+                f"{where}: {header[columns.index(column)]!r} and {cell!r} are both the "
+                f"sensor's {column}; take one out"
+            )
+        if heading["unit"] is not None and column in (*_PLACE, *_STEM, "radius"):
+            unit = _UNITS.get(heading["unit"].strip().casefold())
+            if unit is None:
+                raise ValueError(
+                    f"{where}: the unit of {cell!r} must be one of m, cm, mm"
+                )
+            units[column] = unit
+        columns.append(column)
+    if not {"parent", "radius", *_NORMAL} & set(columns):
+        raise ValueError(
+            f"{where}: these are vertices of a mesh, not sensors; export the sensors"
+        )
+    wanted = [_PLACE, *(v for v in (_NORMAL, _STEM) if set(v) & set(columns))]
+    for vector in wanted:
+        missing = [name for name in vector if name not in columns]
+        if missing:
+            raise ValueError(f"{where}: there is no column {', '.join(missing)}")
+    if len({units.get(axis) for axis in _PLACE}) > 1:
+        raise ValueError(f"{where}: x, y and z must have one unit")
+    return columns, units
+
+
+def _read_sensor(
+    record: Mapping[str, str], names: Links, link: str | None, where: str
+) -> Sensor:
+    """The sensor of a row; ``link`` is the one of all rows, None if each names it."""
+    if "index" in record:
+        number(record["index"], where, "index")
+    if link is None and record["parent"]:
+        link = names.of_path(record["parent"], where)
+    return Sensor(
+        where=where,
+        name=record.get("index", record.get("name", where)),
+        link=link or names.default(where),
+        position=_vector(record, _PLACE, where),
+        normal=_vector(record, _NORMAL, where) if _NORMAL[0] in record else None,
+        radius=read_radius(record.get("radius", ""), where),
     )
 
 
@@ -181,7 +245,7 @@ def _record(
     if is_print:
         cells = cells + [""] * (len(columns) - len(cells))
     if len(cells) != len(columns):
-        raise ValueError(
+        raise SensorError(
             f"{where}: expected {len(columns)} values ({', '.join(columns)}), got "
             f"{len(cells)}"
         )

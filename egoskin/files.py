@@ -1,0 +1,73 @@
+"""Reading files that others have made: regular ones alone, up to a stated size.
+
+Contract: nothing here waits for a named pipe, opens a device or fills memory.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+TEXT_LIMIT = 64 * 2**20
+"""Largest file of text that is read, of a skin, a robot, a configuration [bytes]."""
+
+_KINDS = {
+    stat.S_IFDIR: "a folder",
+    stat.S_IFIFO: "a named pipe",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+}
+
+
+def check_regular(path: Path | str, limit: int = TEXT_LIMIT) -> None:
+    """Raise unless a path, or what it links to, is a regular file of bounded size.
+
+    For files that another library opens; `read_regular` checks by itself.
+
+    Args:
+        path: The file.
+        limit: Largest size [bytes].
+
+    Raises:
+        ValueError: If it is a folder, a pipe or a device, or larger than the limit.
+        OSError: If there is no such file.
+    """
+    _check(os.stat(path), path, limit)
+
+
+def read_regular(path: Path | str, limit: int = TEXT_LIMIT) -> bytes:
+    """Return the content of a regular file.
+
+    Args:
+        path: The file.
+        limit: Largest size [bytes].
+
+    Raises:
+        ValueError: If it is a folder, a pipe or a device, or larger than the limit.
+        OSError: If there is no such file, or it cannot be read.
+    """
+    # Opening a device may do something, so look before; and a pipe may have come since.
+    check_regular(path, limit)
+    with open(path, "rb", opener=_open_without_waiting) as file:
+        status = os.fstat(file.fileno())
+        _check(status, path, limit)
+        # Of a file that grows meanwhile, what was there when it was opened.
+        return file.read(status.st_size)
+
+
+def _open_without_waiting(path: str, flags: int) -> int:
+    """Open a file; a named pipe without a writer, too, returns at once."""
+    return os.open(path, flags | os.O_NONBLOCK)
+
+
+def _check(status: os.stat_result, path: Path | str, limit: int) -> None:
+    """Raise ValueError unless it is the status of a regular file of bounded size."""
+    if not stat.S_ISREG(status.st_mode):
+        kind = _KINDS.get(stat.S_IFMT(status.st_mode), "something else")
+        raise ValueError(f"{path} must be a file, and is {kind}")
+    if status.st_size > limit:
+        raise ValueError(
+            f"{path} must have at most {limit:,} bytes, and has {status.st_size:,}"
+        )

@@ -1,0 +1,39 @@
+"""The progress line: read on a terminal, in a file, or by nobody."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+import pytest
+
+from egoskin.progress import ProgressLine
+
+METRICS = {
+    "episode/success": float("nan"),
+    "episode/survival_s": 1.0,
+    "time/steps_per_s": 1e4,
+    "reward/mean": 0.0,
+}
+
+
+def test_few_frames_of_many_are_not_none(capsys):
+    ProgressLine(0, 65_536_000).update({**METRICS, "frames": 512})
+    assert capsys.readouterr().out.startswith("       512 / 65,536,000 frames    0.0%")
+
+
+def test_a_closed_pipe_is_noted(monkeypatch):
+    read, write = os.pipe()
+    os.close(read)
+    line = ProgressLine(0, 1024)
+    with os.fdopen(write, "w") as pipe:
+        monkeypatch.setattr(sys, "stdout", pipe)
+        assert not line.is_unread
+        line.update({**METRICS, "frames": 1024})
+        assert line.is_unread
+        line.update({**METRICS, "frames": 1024})
+        line.finish()
+        monkeypatch.undo()
+        with pytest.raises(BrokenPipeError):
+            pipe.flush()
+        os.dup2(os.open(os.devnull, os.O_WRONLY), pipe.fileno())
