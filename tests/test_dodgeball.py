@@ -223,7 +223,9 @@ def test_no_ball_is_in_play_before_the_first_is_thrown_at_the_step_drawn():
     throws = replace(MISS, first_delay=(0.1, 0.5))
     env = make(64, hold=True, throws=throws)
     root, delay = env.reset(), waiting_for(env)
-    assert set(delay.tolist()) == set(range(6, 31))
+    # .1 to .5 s at 60 Hz
+    assert set(delay.tolist()) <= set(range(6, 31))
+    assert delay.unique().numel() > 15
     parked = root["object_pose"].clone()
     active = []
     for age in range(31):
