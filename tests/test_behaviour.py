@@ -166,6 +166,7 @@ def state(n: int, **values) -> TensorDict:
             "base_pose": pose.repeat(n, 1),
             "joint_pos": torch.from_numpy(H1_2.default_joint_pos).float().repeat(n, 1),
             "joint_vel": torch.zeros(n, JOINTS),
+            "base_lin_vel_w": torch.zeros(n, 3),
             "displacement_w": torch.zeros(n, 2),
             "tactile": torch.ones(n, len(H1_2.links), dtype=torch.bool),
             "power": torch.zeros(n, 1),
@@ -243,7 +244,6 @@ def test_success_is_counted_from_the_first_throw():
         ends = torch.tensor([[step == 200], [step == 201], [False]])
         after = state(
             3,
-            base_lin_vel_w=torch.zeros(3, 3),
             first_throw_step=wait,
             terminated=ends,
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -540,6 +541,39 @@ def test_the_actor_reads_its_observation_and_the_signal_alone():
     env = make_worker_env(EnvConfig(), SKIN, num_envs=2, seed=0)
     assert env.observation_spec["observation"].shape == (2, 48)
     assert env.observation_spec["signal"].shape == (2, len(SKIN))
+
+
+ACTORS = {
+    "field": SensorConfig(range=5.0),
+    "localization": SensorConfig(range=5.0, signal="localization"),
+    "ray": SensorConfig(range=5.0, coverage="ray"),
+    "corrupted": SensorConfig(range=5.0, corruption="time_of_flight"),
+    "blind": SensorConfig(coverage="none"),
+    "oracle": SensorConfig(coverage="oracle"),
+}
+
+
+@pytest.mark.parametrize("sensor", ACTORS.values(), ids=ACTORS)
+def test_nothing_tells_the_actor_when_the_first_ball_comes(sensor):
+    """Before it, all that the actor reads is the same whatever the delay."""
+    found = []
+    for delay in ((0.5, 0.8), (1.5, 2.0), (30.0, 40.0)):
+        throws = replace(TASK.throws, first_delay=delay)
+        config = EnvConfig(task=replace(TASK, throws=throws), sensor=sensor, history=2)
+        env = make_worker_env(config, SKIN, num_envs=6, seed=0, keep_raw=True)
+        states = run(env, 60)
+        waiting = [~s["object_active"].any(-1) for s in states]
+        found.append((config.actor_keys, states, torch.stack(waiting)))
+    (keys, early, still_early), (_, late, still_late), (_, never, always) = found
+    assert always.all()
+    for states, waiting in ((early, still_early), (late, still_late)):
+        # Until the first ball of each row, through falls and new starts.
+        waiting = waiting.cumprod(0).bool()
+        assert waiting.sum(0).min() >= 2 * 29
+        for state, expected, rows in zip(states, never, waiting, strict=True):
+            for key in keys:
+                assert torch.equal(state[key][rows], expected[key][rows]), key
+    assert not still_early.all()
 
 
 @pytest.mark.parametrize("signal", ["proximity", "localization", "binary"])
