@@ -222,14 +222,9 @@ def test_an_evaluation_may_mask_all_sensors_or_those_of_some_links(
 ):
     policy = egoskin.load_policy(trained)
     task = standard_task(policy.env_config)
-    for args, mask in (
-        (["--mask"], ["all"]),
-        (["--mask", "all"], ["all"]),
-        (
-            ["--mask", "torso_link", "left_elbow_link"],
-            ["torso_link", "left_elbow_link"],
-        ),
-    ):
+    links = ["torso_link", "left_elbow_link"]
+    for names, mask in (([], ["all"]), (["all"], ["all"]), (links, links)):
+        args = ["--mask", *names]
         result, text = figures_of(tmp_path, trained, *args)
         assert result["mask"] == mask
         assert f"sensors masked: {', '.join(mask)}" in text
