@@ -118,7 +118,7 @@ def render_episode(
             f"got {max_seconds:g}"
         )
     if max_seconds is None:
-        steps = config.task.episode_steps
+        steps = config.task.delay_steps + config.task.episode_steps
     else:
         steps = round(max_seconds * hz)
     sensor = config.sensor

@@ -37,6 +37,7 @@ except (AttributeError, ImportError, RuntimeError) as fault:
 
 from egoskin.cli import clear_errors
 from egoskin.draws import check_seed
+from egoskin.evaluation import throw_seed
 from egoskin.film import (
     FILM_SUFFIXES,
     check_path,
@@ -62,7 +63,7 @@ class RenderConfig:
     sheet: Path | None = None
     """Contact sheet to write, .png; None: beside the film, under the same name."""
     bank_seed: int = 0
-    """Seed of the bank of throws, as in evaluate.py."""
+    """Seed of the bank of throws, as in evaluate.py --standard run."""
     episode: int = 0
     """Which episode of the bank."""
     seconds: float | None = None
@@ -112,7 +113,7 @@ def main(args: list[str]) -> None:
         env_config,
         skin,
         policy,
-        seed=config.bank_seed,
+        seed=throw_seed(env_config, config.bank_seed),
         row=config.episode,
         max_seconds=config.seconds,
         fps=config.fps,

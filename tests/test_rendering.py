@@ -7,7 +7,9 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -16,6 +18,8 @@ from PIL import Image
 from tensordict import TensorDict, TensorDictBase
 
 from egoskin.cli import clear_errors
+from egoskin.envs.throws import Thrower
+from egoskin.evaluation import play_bank, throw_seed
 from egoskin.film import Frame
 from egoskin.make import EnvConfig, make_worker_env
 from egoskin.rendering import (
@@ -201,6 +205,17 @@ def test_a_rigid_robot_is_hit_and_the_last_frame_says_so(skin: Skin):
 
 
 @pytest.mark.usefixtures("painter")
+def test_a_whole_episode_lasts_until_long_after_the_first_throw(skin: Skin):
+    # Balls to a point 50 m up, the first after 0.3 s; the limit is 0.2 s later.
+    high = {"aim": "box", "box_height": (50.0, 50.0), "first_delay": (0.3, 0.3)}
+    throws = replace(TASK.throws, **high)
+    task = replace(TASK, throws=throws, episode_length_s=0.2)
+    frames = render(EnvConfig(task=task), skin, hold=True, fps=10)
+    assert frames[-1].ending == "time limit"
+    assert frames[-1].time == pytest.approx(0.5)
+
+
+@pytest.mark.usefixtures("painter")
 @pytest.mark.parametrize("coverage", ["none", "oracle"])
 def test_without_a_skin_there_are_no_sensors_to_draw(coverage, skin: Skin):
     config = EnvConfig(sensor=SensorConfig(coverage=coverage))
@@ -275,6 +290,35 @@ def test_the_script_writes_a_film_and_a_sheet(script: Callable, tmp_path: Path):
     assert {p.name for p in tmp_path.iterdir()} == {"a.gif", "a.png"}
 
 
+def load_script(monkeypatch) -> ModuleType:
+    spec = importlib.util.spec_from_file_location("render", SCRIPT)
+    assert spec is not None
+    assert spec.loader is not None
+    script = importlib.util.module_from_spec(spec)
+    # Dataclasses look their annotations up in the module of that name.
+    monkeypatch.setitem(sys.modules, "render", script)
+    spec.loader.exec_module(script)
+    return script
+
+
+@pytest.mark.usefixtures("painter")
+def test_a_film_is_of_the_throws_that_are_evaluated(
+    skin: Skin, tmp_path: Path, monkeypatch, capsys
+):
+    bank = {"bank_seed": 3, "episodes": 3, "num_workers": 1, "hold": True}
+    config = EnvConfig()
+    steps = int(play_bank(None, config, skin, **bank).steps[2])
+    thrower = Thrower(config.task.throws, config.robot_config, 1 / 120)
+    seed, zero = throw_seed(config, 3), torch.zeros(1, dtype=torch.int64)
+    delay = float(thrower.first_delay(seed, zero + 2, zero))
+    args = ["--out", str(tmp_path / "a.gif"), "--size", "160", "90", "--fps", "4"]
+    args += ["--bank-seed", "3", "--episode", "2", "--hold"]
+    load_script(monkeypatch).main(args)
+    length = (steps + round(60 * delay)) / 60
+    expected = f"episode 2 of bank 3: {length:.2f} s, ends with: hit"
+    assert expected in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("args", "text"),
     [
@@ -292,13 +336,7 @@ def test_bad_input_is_an_error_and_writes_nothing(
     args: list, text: str, tmp_path: Path, monkeypatch, capsys
 ):
     monkeypatch.chdir(tmp_path)
-    spec = importlib.util.spec_from_file_location("render", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    script = importlib.util.module_from_spec(spec)
-    # Dataclasses look their annotations up in the module of that name.
-    monkeypatch.setitem(sys.modules, "render", script)
-    spec.loader.exec_module(script)
+    script = load_script(monkeypatch)
     with pytest.raises(SystemExit) as status, clear_errors():
         script.main(args)
     assert status.value.code == 2
