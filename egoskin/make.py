@@ -170,7 +170,7 @@ def make_worker_env(
                 throws.gravity,
             ),
         ]
-        if mask == MASK_ALL:
+        if masks_all(mask):
             transforms.append(HideObjects())
         if not sparse:
             transforms += config.sensor.transforms(
@@ -199,7 +199,13 @@ def make_worker_env(
 
 def masked_sensors(skin: Skin, mask: Sequence[str]) -> list[int]:
     """Return the indices of the sensors on masked links, all with `MASK_ALL`."""
-    return [i for i, name in enumerate(skin.links) if mask == MASK_ALL or name in mask]
+    every = masks_all(mask)
+    return [i for i, name in enumerate(skin.links) if every or name in mask]
+
+
+def masks_all(mask: Sequence[str]) -> bool:
+    """Whether a mask is that of all sensors."""
+    return tuple(mask) == MASK_ALL
 
 
 def check_mask(config: EnvConfig, skin: Skin, mask: Sequence[str]) -> None:
@@ -208,9 +214,11 @@ def check_mask(config: EnvConfig, skin: Skin, mask: Sequence[str]) -> None:
         return
     if config.sensor.coverage == "none":
         raise ValueError("a blind robot has no sensors to mask")
-    if mask == MASK_ALL:
+    if masks_all(mask):
         return
-    links = sorted(set(skin.links)) if config.sensor.uses_skin else []
+    if not config.sensor.uses_skin:
+        raise ValueError("an oracle has no sensors on links: mask all of it")
+    links = sorted(set(skin.links))
     for name in mask:
         if name not in links:
             raise ValueError(

@@ -43,6 +43,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase, ParallelEnv, Transform, TransformedEnv
 
+from egoskin import compilation
 from egoskin.interrupts import ENDING
 
 # How long the parent sleeps between looks at its workers: first this share of the time
@@ -158,12 +159,17 @@ class _Build:
     def __init__(self, build: Callable[[], WorkerEnv | EnvBase], report: Path) -> None:
         self._build, self._report = build, report
         self._parent = os.getpid()
+        # A worker has those of the server that forks it, which may be older.
+        self._compile = os.environ.get(compilation.SETTING)
 
     def __call__(self) -> WorkerEnv:
         # TorchRL also builds one in the parent, to read its specs.
         in_worker = os.getpid() != self._parent
         if in_worker:
             keep_freed_memory()
+            os.environ.pop(compilation.SETTING, None)
+            if self._compile is not None:
+                os.environ[compilation.SETTING] = self._compile
             Thread(target=_end_with_parent, daemon=True).start()
             # It ends with its parent, not after 10,000 s without a command.
             torchrl._utils.BATCHED_PIPE_TIMEOUT = None

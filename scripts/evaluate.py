@@ -33,7 +33,7 @@ from egoskin.draws import check_seed
 from egoskin.evaluation import Estimate, Evaluation, evaluate, standard_task
 from egoskin.film import check_path
 from egoskin.make import MASK_ALL, EnvConfig, check_mask, check_num_workers
-from egoskin.operating_map import draw_map, operating_map
+from egoskin.operating_map import check_map, draw_map, operating_map
 from egoskin.policies import load_policy
 from egoskin.progress import StatusLine
 from egoskin.report import metres
@@ -192,6 +192,8 @@ def main(args: list[str]) -> None:
     if config.standard != "run":
         env_config = standard_task(env_config, config.standard)
     check_mask(env_config, policy.skin, config.masked)
+    if config.map is not None:
+        check_map(env_config)
     line = StatusLine(f"playing {counted(config.episodes, 'episode')}")
     hz = env_config.task.physics.control_hz
 

@@ -11,7 +11,7 @@ import torch
 from torchrl.envs import TransformedEnv
 
 from egoskin.behaviour import Watcher
-from egoskin.evaluation import play_bank, standard_task
+from egoskin.evaluation import play_bank, standard_task, throw_seed
 from egoskin.make import EnvConfig, make_worker_env
 from egoskin.planning import (
     Ceiling,
@@ -42,7 +42,12 @@ def task(policy: Policy) -> EnvConfig:
 
 def make(policy: Policy, config: EnvConfig, rows: int) -> TransformedEnv:
     return make_worker_env(
-        config, policy.skin, num_envs=rows, seed=0, num_threads=1, keep_raw=True
+        config,
+        policy.skin,
+        num_envs=rows,
+        seed=throw_seed(config, 0),
+        num_threads=1,
+        keep_raw=True,
     )
 
 

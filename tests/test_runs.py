@@ -23,7 +23,9 @@ from tensordict import TensorDict
 import egoskin
 from egoskin.agents.ppo import NonFiniteError
 from egoskin.checkpoint import PARTIAL, load_tensors, save_tensors
+from egoskin.envs.dodgeball import DodgeballConfig
 from egoskin.envs.rewards import TERMS
+from egoskin.envs.standards import training_task
 from egoskin.events import EventFile
 from egoskin.formats import read_sealed, sealed_json
 from egoskin.make import EnvConfig
@@ -110,6 +112,62 @@ def test_a_run_of_another_version_is_not_gone_on_with(config: TrainConfig):
     message = r"config\.json lacks env\.task\.throws\.lead: another version made it"
     with pytest.raises(ValueError, match=message):
         parse_config(args)
+
+
+STANDARDS = [([], "2"), (["--standard", "2"], "2"), (["--standard", "1"], "1")]
+STANDARDS += [(["--standard=paper"], "paper")]
+
+
+@pytest.mark.parametrize(("args", "version"), STANDARDS)
+def test_a_standard_sets_throws_and_ends(args, version):
+    config = parse_config([*args, "--seed", "3", "--sensor.range", "1"])
+    assert config.env.standard == version
+    assert config.env.task == training_task(version, DodgeballConfig())
+    # Nothing else.
+    env = replace(config.env, task=DodgeballConfig())
+    assert env == EnvConfig(sensor=SensorConfig(range=1.0))
+    assert config.seed == 3
+
+
+def test_a_throw_or_an_end_beside_a_standard_makes_it_custom():
+    lead = parse_config(["--standard", "1", "--task.throws.lead", "0.5"]).env
+    assert lead.standard == "custom"
+    throws = training_task("1", DodgeballConfig()).throws
+    assert lead.task.throws == replace(throws, lead=0.5)
+    end = parse_config(["--task.success-s", "2", "--standard", "paper"]).env
+    assert end.standard == "custom"
+    assert end.task.throws.first_delay == (0.0, 0.0)
+    # What belongs to no standard does not.
+    drive = ["--standard", "1", "--task.action-scale", "0.2"]
+    assert parse_config(drive).env.standard == "1"
+
+
+@pytest.mark.parametrize("name", ["3", "Paper", "run"])
+def test_a_standard_that_is_none_is_refused(name, capsys):
+    with pytest.raises(SystemExit) as ended:
+        parse_config(["--standard", name])
+    assert ended.value.code == 2
+    text = capsys.readouterr().err
+    assert "--standard" in text
+    assert "paper" in text
+
+
+def test_a_policy_says_what_standard_it_was_trained_on(config: TrainConfig):
+    args = ["--standard", "paper", "--run-dir", str(config.run_dir)]
+    args += ["--num-envs", "4", "--num-workers", "1", "--total-frames", "64"]
+    args += ["--sensor.coverage", "none", "--ppo.num-mini-batches", "1"]
+    run = Run.create(parse_config(args))
+    with open_trainer(run) as trainer:
+        train(trainer)
+    file = run.path / "policies" / "000000000064.safetensors"
+    assert load_tensors(file)[1]["policy"]["standard"] == "paper"
+    assert egoskin.load_policy(file).env_config.standard == "paper"
+    assert Run.open(run.path).config.env.standard == "paper"
+    # A resume has it already.
+    for version in ("paper", "2"):
+        with pytest.raises(ValueError, match="--standard cannot be changed on resume"):
+            parse_config(["--resume", str(run.path), "--standard", version])
+    assert parse_config(["--resume", str(run.path)]).env.standard == "paper"
 
 
 def test_policies_are_kept_at_the_start_in_between_and_at_the_end(config: TrainConfig):
