@@ -130,27 +130,54 @@ def record_episodes(
     ]
 
 
+def painter_of(
+    config: EnvConfig,
+    skin: Skin,
+    *,
+    size: tuple[int, int] = (960, 540),
+    camera: CameraConfig | None = None,
+) -> Painter:
+    """Return what draws the states of an environment, to be used in a ``with``.
+
+    Args:
+        config: What the environment is made of.
+        skin: The sensors.
+        size: Width and height of the pictures [px].
+        camera: Where the camera is.
+
+    Raises:
+        RenderingError: If no OpenGL context can be made.
+        ValueError: If the size is odd or below 16.
+    """
+    sensor = config.sensor
+    return Painter(
+        config.robot_config,
+        sensor.filled(skin) if sensor.uses_skin else None,
+        config.task.throws.balls,
+        size=size,
+        camera=camera,
+    )
+
+
 def render_recording(
+    painter: Painter,
     config: EnvConfig,
     skin: Skin,
     recording: Recording,
     *,
     max_seconds: float | None = None,
     fps: float = 30.0,
-    size: tuple[int, int] = (960, 540),
-    camera: CameraConfig | None = None,
     on_picture: Callable[[int, int], None] | None = None,
 ) -> list[Frame]:
     """Return the pictures of one episode.
 
     Args:
+        painter: What `painter_of` returned.
         config: What the environment was made of.
         skin: The sensors.
         recording: The episode.
         max_seconds: Stop at this age at the latest [s]; None for the whole episode.
         fps: Pictures for each second of simulated time, at most the control rate.
-        size: Width and height of the pictures [px].
-        camera: Where the camera is.
         on_picture: Called with (pictures done, pictures in all).
 
     Returns:
@@ -158,7 +185,6 @@ def render_recording(
         step that ends the episode.
 
     Raises:
-        RenderingError: If no OpenGL context can be made.
         ValueError: If a number is out of range.
     """
     hz = config.task.physics.control_hz
@@ -170,27 +196,18 @@ def render_recording(
     for step in range(1, steps + 1):
         if int(step * fps / hz) > int((step - 1) * fps / hz) or step == steps:
             due.append(step)
-    sensor = config.sensor
-    painter = Painter(
-        config.robot_config,
-        sensor.filled(skin) if sensor.uses_skin else None,
-        config.task.throws.balls,
-        size=size,
-        camera=camera,
-    )
     frames = []
-    with painter:
-        for step in due:
-            state = recording.states[step]
-            frame = painter.draw(
-                state,
-                sensor.detecting(skin, state),
-                time=step / hz,
-                ending=ending if step == steps else None,
-            )
-            frames.append(frame)
-            if on_picture is not None:
-                on_picture(len(frames), len(due))
+    for step in due:
+        state = recording.states[step]
+        frame = painter.draw(
+            state,
+            config.sensor.detecting(skin, state),
+            time=step / hz,
+            ending=ending if step == steps else None,
+        )
+        frames.append(frame)
+        if on_picture is not None:
+            on_picture(len(frames), len(due))
     return frames
 
 

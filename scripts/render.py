@@ -52,6 +52,7 @@ from egoskin.progress import StatusLine
 from egoskin.rendering import (
     CameraConfig,
     check_film,
+    painter_of,
     record_episodes,
     render_recording,
 )
@@ -127,30 +128,32 @@ def main(args: list[str]) -> None:
         env_config = standard_task(env_config, config.standard)
     hz = env_config.task.physics.control_hz
     check_film(hz, config.fps, config.seconds)
+    # Whether it can be drawn is known before anything is played.
+    painter = painter_of(env_config, skin, size=config.size, camera=config.camera)
     line = StatusLine(f"playing {counted(config.longest_of, 'episode')}")
-    recordings = record_episodes(
-        env_config,
-        skin,
-        policy,
-        bank_seed=config.bank_seed,
-        first=config.episode,
-        episodes=config.longest_of,
-        hold=config.hold,
-        on_step=lambda step, running: line.show(
-            f"{step / hz:.2f} s played, {running} still running"
-        ),
-    )
-    recording = max(recordings, key=lambda recording: len(recording.states))
-    frames = render_recording(
-        env_config,
-        skin,
-        recording,
-        max_seconds=config.seconds,
-        fps=config.fps,
-        size=config.size,
-        camera=config.camera,
-        on_picture=lambda done, total: line.show(f"{done} of {total} pictures"),
-    )
+    with painter:
+        recordings = record_episodes(
+            env_config,
+            skin,
+            policy,
+            bank_seed=config.bank_seed,
+            first=config.episode,
+            episodes=config.longest_of,
+            hold=config.hold,
+            on_step=lambda step, running: line.show(
+                f"{step / hz:.2f} s played, {running} still running"
+            ),
+        )
+        recording = max(recordings, key=lambda recording: len(recording.states))
+        frames = render_recording(
+            painter,
+            env_config,
+            skin,
+            recording,
+            max_seconds=config.seconds,
+            fps=config.fps,
+            on_picture=lambda done, total: line.show(f"{done} of {total} pictures"),
+        )
     sheet = contact_sheet(frames)
     save_film(config.out, frames, config.fps / config.slowdown)
     save_picture(config.sheet_path, sheet)

@@ -29,6 +29,7 @@ from egoskin.rendering import (
     RenderingError,
     _ending,
     closest_point,
+    painter_of,
     record_episodes,
     render_recording,
 )
@@ -167,7 +168,8 @@ def render(
     config: EnvConfig, skin: Skin, *, hold: bool = False, **options: object
 ) -> list[Frame]:
     (recording,) = record_episodes(config, skin, None, hold=hold)
-    return render_recording(config, skin, recording, **{"size": SIZE, **options})
+    with painter_of(config, skin, size=SIZE) as painter:
+        return render_recording(painter, config, skin, recording, **options)
 
 
 @pytest.mark.usefixtures("painter")
@@ -262,14 +264,20 @@ def test_recordings_are_of_the_rows_of_the_bank(skin: Skin):
     [
         ({"fps": 61.0}, "fps must be in"),
         ({"max_seconds": 0.0}, "at least one control step"),
-        ({"size": (161, 90)}, "two even numbers"),
-        ({"size": (160, 8)}, "two even numbers"),
     ],
 )
-def test_numbers_out_of_range_are_refused(skin: Skin, options: dict, text: str):
+def test_numbers_out_of_range_are_refused(
+    painter: Painter, skin: Skin, options: dict, text: str
+):
     nothing = Recording(row=0, states=[], ending=None)
     with pytest.raises(ValueError, match=text):
-        render_recording(EnvConfig(), skin, nothing, **options)
+        render_recording(painter, EnvConfig(), skin, nothing, **options)
+
+
+@pytest.mark.parametrize("size", [(161, 90), (160, 8)])
+def test_a_size_that_is_no_film_is_refused(skin: Skin, size: tuple[int, int]):
+    with pytest.raises(ValueError, match="two even numbers"):
+        painter_of(EnvConfig(), skin, size=size)
 
 
 @pytest.fixture
