@@ -102,7 +102,7 @@ class EnvConfig:
 
 def make_worker_env(
     config: EnvConfig,
-    skin: Skin,
+    skin: Skin | None = None,
     *,
     num_envs: int,
     seed: int,
@@ -118,7 +118,7 @@ def make_worker_env(
 
     Args:
         config: What the environment is made of.
-        skin: The sensors.
+        skin: The sensors; by default those that ``config.skin`` describes.
         num_envs: Number of rows.
         seed: Seed of all draws.
         row_offset: Global index of the first row.
@@ -130,8 +130,19 @@ def make_worker_env(
         sparse: Whether to give the state that the sensors read, for the agent's own
             sources, instead of the signal.
         mask: Links whose sensors detect nothing, or `MASK_ALL`.
+
+    Raises:
+        ValueError: If the skin does not fit the robot, or ``sparse`` is asked for with
+            a history, which is one of signals.
     """
+    if sparse and config.history > 1:
+        raise ValueError(
+            f"sparse gives the present state alone, history {config.history} needs "
+            "signals: leave sparse off"
+        )
     robot = config.robot_config
+    if skin is None:
+        skin = config.skin.build(robot)
     env = DodgeballEnv(
         robot,
         config.task,
@@ -215,7 +226,7 @@ def _state_keys(transform: Transform) -> list[NestedKey]:
 
 def make_env(
     config: EnvConfig,
-    skin: Skin,
+    skin: Skin | None = None,
     *,
     num_envs: int,
     seed: int,
@@ -230,7 +241,7 @@ def make_env(
 
     Args:
         config: What the environment is made of.
-        skin: The sensors.
+        skin: The sensors; by default those that ``config.skin`` describes.
         num_envs: Number of agents in all.
         seed: Seed of all draws; results do not depend on the number of workers.
         num_workers: Processes; by default the largest divisor of ``num_envs`` not
@@ -242,9 +253,12 @@ def make_env(
         mask: Links whose sensors detect nothing, or `MASK_ALL`.
 
     Raises:
-        ValueError: If the workers do not divide the agents.
+        ValueError: If the workers do not divide the agents, or as `make_worker_env`.
     """
     workers = check_num_workers(num_envs, num_workers)
+    if skin is None:
+        # Once, not in each worker.
+        skin = config.skin.build(config.robot_config)
     rows = num_envs // workers
     return WorkerPool(
         [

@@ -14,10 +14,12 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor, nn
+from torchrl.data import Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from egoskin.agents.networks import Agent, NetworkConfig, input_keys
+from egoskin.agents.networks import Agent, NetworkConfig
 from egoskin.checkpoint import load_tensors, part, prefixed, save_tensors
 from egoskin.make import EnvConfig
 from egoskin.plain import from_plain, to_plain
@@ -277,45 +279,77 @@ def save_policy(path: Path, agent: Agent, spec: PolicySpec) -> None:
     save_tensors(path, prefixed("agent", tensors), {"policy": spec.header()})
 
 
-class Policy(nn.Module):
+class Policy(TensorDictModuleBase):
     """A trained actor that writes its mean action.
 
+    A TensorDict module like any other: for ``env.rollout``, a TorchRL collector,
+    ``TensorDictSequential``, `torch.compile`, `torch.vmap`. Called with the tensors of
+    ``in_keys`` in their order, it returns the action.
+
     Args:
-        agent: Agent whose actor is used.
-        spec: What it was made for.
+        agent: Agent whose actor is used; its parameters no longer require gradients.
+        policy_spec: What it was made for.
     """
 
-    def __init__(self, agent: Agent, spec: PolicySpec) -> None:
+    def __init__(self, agent: Agent, policy_spec: PolicySpec) -> None:
         super().__init__()
-        self._agent = agent.requires_grad_(False)
-        self.spec = spec
-        self.in_keys = agent.actor_keys
-        self.out_keys = ["action"]
+        self.policy_spec = policy_spec
+        self.in_keys, self.out_keys = agent.actor_keys, ["action"]
+        self._head = agent.head.requires_grad_(False)
+        self._norms = nn.ModuleDict(
+            {key: agent.norms[key] for key in agent.actor_keys if key in agent.norms}
+        )
 
     @property
     def env_config(self) -> EnvConfig:
         """Robot, task and sensors the policy was trained with."""
-        return self.spec.env
+        return self.policy_spec.env
 
     @property
     def skin(self) -> Skin:
         """The skin it was trained with."""
-        return self.spec.skin
+        return self.policy_spec.skin
 
+    @property
+    def spec(self) -> Composite:
+        """TorchRL's spec of what it writes."""
+        weight = self._head.log_std
+        return Composite(
+            action=Unbounded(weight.shape, device=weight.device, dtype=weight.dtype)
+        )
+
+    @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``action [*B, J]`` from the keys in ``in_keys``.
+        """Write ``action [*B, J]`` from ``in_keys``, ``[*B, F]`` of any float dtype.
+
+        The batch may have any number of dimensions, or none. The action has the dtype
+        of the policy's parameters.
 
         Raises:
             KeyError: If a key is missing; the text names what is needed.
+            ValueError: If a key holds another number of features than it was trained
+                with.
         """
-        missing = [k for k in self.in_keys if k not in tensordict.keys()]
-        if missing:
-            raise KeyError(
-                f"the policy reads {', '.join(self.in_keys)}; {missing[0]!r} is missing"
-            )
-        inputs = self._agent.encode(tensordict.select(*self.in_keys))
-        loc, _ = self._agent.head(*(inputs[key] for key in input_keys(self.in_keys)))
-        return tensordict.set("action", loc)
+        return tensordict.set("action", self._mean(tensordict))
+
+    def _mean(self, tensordict: TensorDictBase) -> Tensor:
+        """Return the mean action, ``[*B, J]``."""
+        inputs = []
+        for key in self.in_keys:
+            value, size = tensordict.get(key, None), self.policy_spec.sizes[key]
+            if value is None:
+                raise KeyError(
+                    f"the policy reads {', '.join(self.in_keys)}; {key!r} is missing"
+                )
+            if value.shape[-1] != size:
+                raise ValueError(
+                    f"the policy was trained with {key!r} [*B, {size}], got "
+                    f"{list(value.shape)}: is it the environment of "
+                    "make_env(policy.env_config, policy.skin)?"
+                )
+            value = value.to(self._head.log_std.dtype)
+            inputs.append(self._norms[key](value) if key in self._norms else value)
+        return self._head(*inputs)[0]
 
 
 def shipped_policies() -> list[str]:

@@ -104,7 +104,7 @@ class Add:
         if not policies:
             raise ValueError(f"{self.run} has not been trained: nothing to store")
         policy = load_policy(policies[-1])
-        frames = policy.spec.frames
+        frames = policy.policy_spec.frames
         made = record(run, frames)
         label = run.config.env.sensor.label().replace("-", "_")
         folder = self.results / (self.name or f"{label}_seed{run.config.seed}")

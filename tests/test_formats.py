@@ -97,7 +97,7 @@ def damage(content: bytes, draw: random.Random) -> bytes:
 def policy_content(path: Path) -> Any:
     policy = egoskin.load_policy(path)
     tensors = {k: v.tolist() for k, v in policy.state_dict().items()}
-    return policy.spec.header(), tensors
+    return policy.policy_spec.header(), tensors
 
 
 def checkpoint_content(path: Path) -> Any:

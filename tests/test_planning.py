@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -131,7 +132,8 @@ def test_plans_start_where_the_reach_says_whatever_the_sensors_own_range(
 ):
     config = task(policy)
     skin = replace(policy.skin, range=np.full(len(policy.skin), 0.3))
-    other = Policy(policy._agent, replace(policy.spec, skin=skin))
+    other = copy.deepcopy(policy)
+    other.policy_spec = replace(policy.policy_spec, skin=skin)
     steps = [
         _until_in_reach(make(policy, config, 4), who, config, 2.0).simulation["step"]
         for who in (policy, other)

@@ -119,7 +119,7 @@ def test_policies_are_kept_at_the_start_in_between_and_at_the_end(config: TrainC
         train(trainer)
     found = sorted((run.path / "policies").iterdir())
     assert [int(path.stem) for path in found] == [0, 128, 192]
-    assert egoskin.load_policy(found[-1]).spec.frames == 192
+    assert egoskin.load_policy(found[-1]).policy_spec.frames == 192
 
 
 def test_a_commit_is_recorded_only_of_a_repository_that_holds_the_source(tmp_path):
@@ -172,7 +172,7 @@ def test_nothing_is_written_through_a_link(config: TrainConfig, tmp_path: Path):
     assert victim.read_text() == "mine"
     assert len((run.path / "metrics.csv").read_text().splitlines()) == 5
     assert not (run.path / "metrics.csv").is_symlink()
-    assert egoskin.load_policy(run.path).spec.frames == 256
+    assert egoskin.load_policy(run.path).policy_spec.frames == 256
 
 
 @pytest.mark.parametrize("name", ["lock", "policies"])

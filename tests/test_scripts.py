@@ -328,7 +328,7 @@ def test_every_sensor_trains(sensor: list[str], tmp_path: Path, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["ppo.py", *args])
     # As a user calls it, but in this process: importing takes most of a call.
     runpy.run_path(str(ROOT / "scripts" / "ppo.py"), run_name="__main__")
-    assert egoskin.load_policy(tmp_path / "run").spec.frames == 2 * BATCH
+    assert egoskin.load_policy(tmp_path / "run").policy_spec.frames == 2 * BATCH
 
 
 BAD_SKIN = """{"format": "egoskin-skin-1", "robot": "h1_2", "sensors": [

@@ -119,7 +119,7 @@ class ProximitySensor(RowTransform):
     Args:
         skin: The sensors, filled; all of the coverage that the subclass computes.
         chain: Kinematic chain of the robot, rooted at the base.
-        objects: Shape of each object, ``O`` of them.
+        objects: Shape of each object, ``O`` of them, or of the only one.
         num_readings: Readings of each sensor: ``()`` or ``(K,)``.
         body: Shapes of the robot that hide what lies behind them; empty for a robot
             that is transparent to its sensors.
@@ -141,7 +141,7 @@ class ProximitySensor(RowTransform):
         self,
         skin: Skin,
         chain: pk.Chain,
-        objects: Sequence[Shape],
+        objects: Shape | Sequence[Shape],
         num_readings: tuple[int, ...],
         body: Sequence[Primitive],
         per_object: bool,
@@ -150,9 +150,10 @@ class ProximitySensor(RowTransform):
     ) -> None:
         super().__init__(in_keys, out_keys)
         skin.check_links(chain.get_link_names())
-        if not objects:
+        self.num_sensors = len(skin)
+        self.objects = (objects,) if isinstance(objects, Shape) else tuple(objects)
+        if not self.objects:
             raise ValueError("a proximity sensor needs at least one object to sense")
-        self.num_sensors, self.objects = len(skin), tuple(objects)
         self.per_object = per_object
         self.readings = torch.Size((len(skin), *num_readings))
         links = list(dict.fromkeys(skin.links))
@@ -176,7 +177,7 @@ class ProximitySensor(RowTransform):
         reach = np.array(self._kinematics.reach())[self._link.numpy()]
         reach += np.linalg.norm(skin.position, axis=-1)
         farthest = float((reach + skin.reach()).max()) + _SLACK
-        self._farthest = [farthest + shape.bounding_radius for shape in objects]
+        self._farthest = [farthest + shape.bounding_radius for shape in self.objects]
         self._kernels: Kernels | None = None
 
     def _use_kernels(self, kind: Literal["field", "ray"], **constants: Any) -> None:
@@ -216,6 +217,11 @@ class ProximitySensor(RowTransform):
     def num_joints(self) -> int:
         """Number of joint positions it reads, ``J``."""
         return self._kinematics.num_joints
+
+    @property
+    def ranges(self) -> Tensor:
+        """Range of each sensor [m], ``[S]`` float64."""
+        return self._range[:, 0].clone()
 
     def scene(
         self, base_pose: Tensor, joint_pos: Tensor, object_pose: Tensor, active: Tensor
