@@ -230,7 +230,7 @@ def test_nothing_is_written_through_a_link(config: TrainConfig, tmp_path: Path):
     assert victim.read_text() == "mine"
     assert len((run.path / "metrics.csv").read_text().splitlines()) == 5
     assert not (run.path / "metrics.csv").is_symlink()
-    assert egoskin.load_policy(run.path).spec.frames == 256
+    assert egoskin.load_policy(run.path).policy_spec.frames == 256
 
 
 @pytest.mark.parametrize("name", ["lock", "policies"])
