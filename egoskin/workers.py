@@ -68,6 +68,8 @@ _GUARD = (
     "error: workers import the script that starts them, and this one would start them "
     'again: put what it does into a function, called under `if __name__ == "__main__":`'
 )
+# When multiprocessing removes its folder at the end: later is lower.
+_REMOVES_FOLDER = -100
 # What to end when this process ends.
 _processes: weakref.WeakSet[BaseProcess] = weakref.WeakSet()
 
@@ -199,7 +201,7 @@ def start_server() -> None:
     """
     _check_guarded()
     _temporary_folder()
-    set_forkserver_preload(["egoskin.make"])
+    set_forkserver_preload(["egoskin.preload"])
     # Ctrl-C, a batch system's SIGTERM and a closed terminal reach the whole group, but
     # when to end is the parent's decision. All others inherit the signal mask. The
     # tracker comes first: its own start unblocks what it ignores.
@@ -225,7 +227,7 @@ def _temporary_folder() -> str:
 
     It is multiprocessing's own, with the socket of the server that forks the workers.
     A process that is killed removes nothing, so a shell waits for its end: for a line
-    if multiprocessing will remove the folder, for the end of file if nobody does. Then
+    if multiprocessing has removed the folder, for the end of file if nobody has. Then
     it removes the semaphores, too, unless multiprocessing's tracker still has.
     """
     folder = util.get_temp_dir()
@@ -242,7 +244,9 @@ def _temporary_folder() -> str:
         # A SIGKILL may go to the whole group.
         start_new_session=True,
     )
-    atexit.register(shell.communicate, b"\n")
+    # After multiprocessing has removed the folder.
+    after = _REMOVES_FOLDER - 1
+    util.Finalize(None, shell.communicate, [b"\n"], exitpriority=after)
     # Before multiprocessing waits for them.
     atexit.register(_kill, _processes)
     return folder

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from functools import partial
@@ -362,6 +363,32 @@ def test_a_pool_that_nobody_closed_ends_with_its_script():
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stderr) == (0, "")
     assert not Path("/proc", done.stdout.strip()).exists()
+
+
+def test_ctrl_c_while_the_server_imports_is_one_line():
+    body = UNGUARDED.replace("\n", "\n    ")
+    code = f"from egoskin.cli import clear_errors\nwith clear_errors():{body}"
+    # A socket's path must be short.
+    with (
+        tempfile.TemporaryDirectory(prefix="ego-") as folder,
+        subprocess.Popen(
+            [sys.executable, "-c", code],
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+            env={**os.environ, "TMPDIR": folder},
+        ) as script,
+    ):
+        assert script.stderr is not None
+        while not list(Path(folder).glob("*/listener-*")):
+            assert script.poll() is None
+            time.sleep(0.01)
+        # It waits for the server to fork the first worker.
+        time.sleep(0.5)
+        os.killpg(script.pid, signal.SIGINT)
+        # All that it started has ended when nobody can write there any more.
+        assert script.stderr.read() == "stopped\n"
+    assert script.returncode == 130
 
 
 def test_a_server_killed_at_the_start_is_reported():
