@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
+from egoskin.envs.dodgeball import PASSED_DISTANCE
 from egoskin.envs.throws import ThrowConfig
 from egoskin.evaluation import Estimate, play_bank, summarize
 from egoskin.make import EnvConfig
@@ -132,8 +133,9 @@ def check_map(config: EnvConfig) -> None:
 
 
 def _with_enough_balls(throws: ThrowConfig) -> ThrowConfig:
-    """Return throws none of whose balls is thrown again before it can arrive."""
-    way = math.hypot(throws.distance[1], throws.height[1])
+    """Return throws none of whose balls is thrown again before it has passed."""
+    # To the base, and on until the environment says that it has passed.
+    way = math.hypot(throws.distance[1], throws.height[1]) + PASSED_DISTANCE
     number = math.ceil(way / throws.speed[0] / throws.interval[0])
     return dataclasses.replace(throws, num_balls=max(throws.num_balls, number))
 

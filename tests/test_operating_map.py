@@ -82,17 +82,18 @@ def test_the_sectors_are_all_directions():
 @pytest.mark.parametrize(
     ("changes", "number"),
     [
-        # From at most 6 m away and 3 m up, sqrt(45) = 6.71 m: 1.68 s at 4 m/s.
+        # From at most 6 m away and 3 m up, sqrt(45) = 6.71 m, to a metre past the
+        # base: 7.71 m, which take 1.93 s at 4 m/s.
         ({}, 2),
         ({"interval": (0.5, 0.5)}, 4),
-        # 3.35 s at 2 m/s.
+        # 3.85 s at 2 m/s.
         ({"speed": (2.0, 2.0)}, 4),
         ({"speed": (12.0, 12.0)}, 2),
-        ({"speed": (3.0, 3.0), "interval": (0.5, 0.5)}, 5),
+        ({"speed": (3.0, 3.0), "interval": (0.5, 0.5)}, 6),
         ({"num_balls": 6}, 6),
     ],
 )
-def test_no_ball_is_thrown_again_before_it_can_arrive(changes, number):
+def test_no_ball_is_thrown_again_before_it_has_passed(changes, number):
     throws = maps._with_enough_balls(replace(CONFIG.task.throws, **changes))
     assert throws.num_balls == number
     assert replace(throws, num_balls=2) == replace(
