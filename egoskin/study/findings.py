@@ -12,12 +12,11 @@ stands another one, of our budget, which is called a stand-in.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import product
 from typing import Literal
-
-import numpy as np
 
 from egoskin.study.shipped import RANGES
 from egoskin.study.statistics import (
@@ -27,6 +26,7 @@ from egoskin.study.statistics import (
     Table,
     contrast,
     holm,
+    seed_sd,
     seeds_needed,
 )
 
@@ -270,10 +270,12 @@ def judge_findings(tables: Mapping[str, Table]) -> list[Judged]:
 def _test(finding: Finding, table: Table) -> list[Tested]:
     result = []
     # As if the whole family were to be decided at once.
-    alpha = ALPHA / len(FINDINGS)
+    alpha, one = ALPHA / len(FINDINGS), seed_sd(table)
     for claim in finding.claims:
         effect = contrast(claim.weights, table)
         known = effect is not None
+        # As if cells with one seed had the others' spread, and pairing did nothing.
+        sd = one * math.sqrt(sum(w**2 for w in claim.weights.values()))
         result.append(
             Tested(
                 claim=claim,
@@ -281,7 +283,7 @@ def _test(finding: Finding, table: Table) -> list[Tested]:
                 p_confirm=claim.region.p_inside(effect) if known else 1.0,
                 p_refute=claim.region.p_outside(effect) if known else 1.0,
                 seeds_needed=(
-                    seeds_needed(effect, claim.region, alpha) if known else None
+                    seeds_needed(effect, claim.region, alpha, sd) if known else None
                 ),
             )
         )
@@ -302,4 +304,4 @@ def _needed(claims: list[Tested]) -> int | None:
         return min(against)
     needed = [t.seeds_needed for t in claims]
     known = [n for n in needed if n is not None]
-    return int(np.max(known)) if len(known) == len(needed) else None
+    return max(known) if len(known) == len(needed) else None

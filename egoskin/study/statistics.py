@@ -163,7 +163,9 @@ def holm(p_values: Sequence[float]) -> list[float]:
     return result
 
 
-def seeds_needed(effect: Effect, region: Region, alpha: float = ALPHA) -> int | None:
+def seeds_needed(
+    effect: Effect, region: Region, alpha: float = ALPHA, sd: float = math.nan
+) -> int | None:
     """Return how many seeds decide a claim, if effect and spread are as observed.
 
     They decide for the side on which the effect lies, with a power of `POWER`; the
@@ -173,13 +175,15 @@ def seeds_needed(effect: Effect, region: Region, alpha: float = ALPHA) -> int | 
         effect: The effect observed so far.
         region: The claim.
         alpha: Level of the test.
+        sd: Standard deviation between seeds, if one seed of the effect tells none.
 
     Returns:
         Number of seeds in all; None if the spread is unknown or no number is enough.
     """
-    if not effect.error > 0:
+    if effect.error > 0:
+        sd = effect.error * math.sqrt(effect.seeds)
+    if not sd > 0:
         return None
-    sd = effect.error * math.sqrt(effect.seeds)
     bounds = [b for b in (region.low, region.high) if math.isfinite(b)]
     inside = effect.mean in region
     if not inside:
@@ -214,12 +218,21 @@ def separation(table: Table) -> float:
     there are fewer than two cells.
     """
     groups = [np.array(list(x.values())) for x in table.values() if len(x)]
-    pooled = [g for g in groups if len(g) > 1]
-    if len(groups) < 2 or not pooled:
+    within = seed_sd(table) ** 2
+    if len(groups) < 2 or not within > 0:
         return math.nan
-    df = sum(len(g) - 1 for g in pooled)
-    within = sum(float(((g - g.mean()) ** 2).sum()) for g in pooled) / df
     means = np.array([g.mean() for g in groups])
     noise = within * float(np.mean([1 / len(g) for g in groups]))
     between = max(float(means.var(ddof=1)) - noise, 0.0)
-    return math.sqrt(between / within) if within > 0 else math.nan
+    return math.sqrt(between / within)
+
+
+def seed_sd(table: Table) -> float:
+    """Return the standard deviation between seeds of a cell, pooled over the cells.
+
+    NaN if no cell has two seeds.
+    """
+    groups = [np.array(list(x.values())) for x in table.values() if len(x) > 1]
+    df = sum(len(g) - 1 for g in groups)
+    squares = sum(float(((g - g.mean()) ** 2).sum()) for g in groups)
+    return math.sqrt(squares / df) if df else math.nan

@@ -421,7 +421,8 @@ def judge_run(
 def _policy_hash(path: Path) -> str:
     """Return the hash of what a policy computes with, whoever wrote its file."""
     tensors, header = load_tensors(path)
-    kept = {k: header[k] for k in ("skin", "sizes", "num_actions", "frames")}
+    spec = header["policy"]
+    kept = {k: spec[k] for k in ("skin", "sizes", "num_actions", "frames")}
     return content_hash(kept, tensors)
 
 
