@@ -89,11 +89,11 @@ class Plan:
         """Raise ValueError for a speed that is none."""
         if self.steps_per_s is not None and not self.steps_per_s > 0:
             raise ValueError(f"steps_per_s must be positive, got {self.steps_per_s}")
-        if self.dir is not None:
-            check_parent(self.dir)
 
     def execute(self) -> None:
         """Tell, and write the manifest."""
+        if self.dir is not None:
+            check_parent(self.dir)
         manifest = find_study(self.name)
         if self.dir is not None:
             manifest = StudyFolder(self.dir).plan(manifest)
@@ -192,14 +192,14 @@ class Run:
     """Niceness of the runs."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for counts that are none, or a folder that cannot be."""
+        """Raise ValueError for counts that are none."""
         check_counts(self, "parallel", "tries")
         if not 0 <= self.nice < 20:
             raise ValueError(f"nice must be from 0 to 19, got {self.nice}")
-        check_parent(self.dir)
 
     def execute(self) -> None:
         """Run what is left to be run."""
+        check_parent(self.dir)
         folder = StudyFolder(self.dir)
         if self.name is not None:
             folder.plan(find_study(self.name))

@@ -15,7 +15,7 @@ import dataclasses
 import difflib
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -39,8 +39,9 @@ from egoskin.sensors import Skin
 Overrides = Mapping[str, Any]
 """Values by the dotted names of fields, as on the command line: ``sensor.range``."""
 
-# What a study decides by itself.
-_NOT_OF_A_CELL = MACHINE_FIELDS | {"seed", "total_frames", "device"}
+# What a study decides by itself, and what all its cells share.
+_NOT_OF_A_STUDY = MACHINE_FIELDS | {"seed", "total_frames", "device"}
+_OF_ALL_CELLS = {"snapshot_frames", "checkpoint_interval"}
 # What names a cell already.
 _LABEL = ("env.sensor.coverage", "env.sensor.signal", "env.sensor.range")
 
@@ -299,12 +300,13 @@ def resolve(study: Study) -> Manifest:
     """
     task = training_task(study.standard, TrainConfig().env.task)
     default = TrainConfig(env=EnvConfig(task=task), total_frames=study.frames)
-    base = override(default, study.base, f"study {study.name}")
+    what = f"study {study.name}, base"
+    base = override(default, study.base, what, _NOT_OF_A_STUDY - _OF_ALL_CELLS)
     skins: dict[Any, tuple[Skin, str]] = {}
     cells: dict[str, Cell] = {}
     for number, overrides in enumerate(study.cells, 1):
         what = f"study {study.name}, cell {number}"
-        config = override(base, overrides, what)
+        config = override(base, overrides, what, _NOT_OF_A_STUDY)
         key = (config.env.robot, config.env.skin)
         try:
             if key not in skins:
@@ -329,13 +331,16 @@ def resolve(study: Study) -> Manifest:
     )
 
 
-def override(config: TrainConfig, overrides: Overrides, what: str) -> TrainConfig:
+def override(
+    config: TrainConfig, overrides: Overrides, what: str, fixed: Collection[str] = ()
+) -> TrainConfig:
     """Return a configuration with other values of some fields.
 
     Args:
         config: The configuration.
         overrides: The values.
         what: What they belong to, for the error text.
+        fixed: Fields that must not be given.
 
     Raises:
         ValueError: If there is no such field, or the value is none of it.
@@ -343,8 +348,8 @@ def override(config: TrainConfig, overrides: Overrides, what: str) -> TrainConfi
     plain = to_plain(config)
     for name, value in overrides.items():
         full = _full_name(name)
-        if full.split(".")[0] in _NOT_OF_A_CELL:
-            raise ValueError(f"{what}: {name} is no field of a cell")
+        if full.split(".")[0] in fixed:
+            raise ValueError(f"{what}: {name} cannot be chosen here")
         try:
             _set(plain, full, to_plain(value), known=True)
         except KeyError as error:
@@ -408,6 +413,6 @@ def _full_name(name: str) -> str:
     return f"env.{name}" if name.split(".")[0] in parts else name
 
 
-def _closest(name: str, valid: Sequence[str] | Mapping[str, Any]) -> str:
+def _closest(name: str, valid: Collection[str]) -> str:
     found = difflib.get_close_matches(name, list(valid), n=1)
     return f"; do you mean {found[0]!r}?" if found else ""

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import base64
 import html
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -310,7 +309,7 @@ def _cell_rows(manifest: Manifest, values: dict[str, Table]) -> Rows:
             row.append(_spread(own))
         effect = mean_effect(list(success.values()))
         low, high = effect.interval()
-        if math.isfinite(effect.error):
+        if effect.error > 0:
             row[2] += f" [{effect.mean:.1f}, {low:.1f} to {high:.1f}]"
         rows.append(row)
     return Rows(("cell", "seeds", *(f"{m.label} [{m.unit}]" for m in shown)), rows)

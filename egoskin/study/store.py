@@ -220,7 +220,11 @@ class StudyFolder:
         """
         source, end = self.run_path(planned.name), planned.end
         run, folder = Run.open(source), self.result_path(planned.name)
-        policy = run.policy_path(end)
+        policy, made = run.policy_path(end), record(run, end)
+        if made.command.split()[1].endswith("/job.py"):
+            # It was begun by a study; where its folder was is of no interest.
+            command = f"python -m egoskin.study.job FOLDER {planned.name}"
+            made = dataclasses.replace(made, command=command)
         (folder / "policies").mkdir(parents=True, exist_ok=True)
         every = max(planned.end // _LINES, 1)
         contents = {
@@ -228,7 +232,7 @@ class StudyFolder:
             "metrics.csv": thin(run.metrics(), every).encode(),
             "config.json": (source / "config.json").read_bytes(),
             "skin.json": run.skin_path.read_bytes(),
-            "run.json": to_json(record(run, end)).encode(),
+            "run.json": to_json(made).encode(),
             # Last: it marks the run as finished.
             f"evaluation_{end:012d}.json": sealed_json(
                 {
