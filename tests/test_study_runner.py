@@ -1,4 +1,4 @@
-"""Studies that are run for real: what is kept, shared and repeated, whatever happens."""
+"""Studies run for real: what is kept, shared and repeated, whatever happens."""
 
 from __future__ import annotations
 
