@@ -3,9 +3,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 ARGS ?=
-# The policy of `make demo`, and an episode of its bank to film.
+# The policy of `make demo`.
 POLICY ?= field_proximity
-EPISODE ?= 28
 
 .PHONY: train demo test test-slow test-memory verify check bench clean
 
@@ -14,8 +13,8 @@ train: $(VENV)/run
 
 demo: $(VENV)/run
 	$(BIN)/python scripts/evaluate.py $(POLICY) --episodes 256
-	$(BIN)/python scripts/render.py $(POLICY) --episode $(EPISODE) --out demo.mp4 \
-		--fps 20 --size 640 360
+	$(BIN)/python scripts/render.py $(POLICY) --standard run --longest-of 16 \
+		--out demo.mp4 --fps 20 --size 640 360
 
 test: $(VENV)/dev
 	$(BIN)/python -m pytest -m "not slow" -n 2 --dist worksteal $(ARGS)

@@ -56,6 +56,8 @@ if TYPE_CHECKING:
     from egoskin.make import EnvConfig, make_env, make_worker_env
     from egoskin.policies import Policy, load_policy
 
+__version__ = "0.1.0"
+
 _EXPORTS = {
     "EnvConfig": "egoskin.make",
     "make_env": "egoskin.make",
@@ -74,3 +76,8 @@ def __getattr__(name: str) -> Any:
     from importlib import import_module
 
     return getattr(import_module(_EXPORTS[name]), name)
+
+
+def __dir__() -> list[str]:
+    """Return the names of the module, those not imported yet included."""
+    return sorted({*globals(), *_EXPORTS})

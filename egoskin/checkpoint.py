@@ -45,24 +45,26 @@ def save_tensors(
 def write_file(path: Path, content: bytes) -> None:
     """Write a file; it is complete, on disk, or as it was before.
 
-    A process that is killed while it writes leaves a file that `PARTIAL` matches.
+    A process that is killed while it writes leaves a file that `PARTIAL` matches. A
+    link that stands there is replaced, and never followed.
 
     Raises:
         OSError: If it cannot be written; the text names the file.
     """
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
-        with open(partial, "wb") as file:
+        # One that was left over, or put there for us to follow.
+        partial.unlink(missing_ok=True)
+        with open(partial, "xb") as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
         os.replace(partial, path)
-        sync(path.parent)
+        _sync_folder(path.parent)
     except OSError as error:
         with suppress(OSError):
             partial.unlink(missing_ok=True)
-        # The system's own text of a full disk names no file.
-        raise OSError(error.errno, error.strerror, str(path)) from error
+        raise named(error, path) from error
 
 
 def append(path: Path, content: bytes) -> None:
@@ -75,7 +77,7 @@ def append(path: Path, content: bytes) -> None:
         with open(path, "ab", opener=_open_to_append) as file:
             file.write(content)
     except OSError as error:
-        raise OSError(error.errno, error.strerror, str(path)) from error
+        raise named(error, path) from error
 
 
 def _open_to_append(path: str, flags: int) -> int:
@@ -83,9 +85,14 @@ def _open_to_append(path: str, flags: int) -> int:
     return os.open(path, kept | os.O_NOFOLLOW | os.O_NONBLOCK)
 
 
-def sync(path: Path) -> None:
-    """Wait until a file or folder is on disk."""
-    descriptor = os.open(path, os.O_RDONLY)
+def named(error: OSError, path: Path) -> OSError:
+    """Return an error that names a file; the system's own of a full disk names none."""
+    return OSError(error.errno, error.strerror, str(path))
+
+
+def _sync_folder(path: Path) -> None:
+    """Wait until the entries of a folder are on disk."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)
     finally:

@@ -139,6 +139,7 @@ def play_bank(
     *,
     bank_seed: int,
     episodes: int,
+    first: int = 0,
     num_workers: int | None = None,
     hold: bool = False,
     mask: Sequence[str] = (),
@@ -153,6 +154,7 @@ def play_bank(
         skin: The skin.
         bank_seed: Seed of the bank.
         episodes: Number of episodes, all played side by side.
+        first: Row of the first of them; with ``watch`` alone.
         num_workers: Processes; the result does not depend on it.
         hold: Whether the robot is held rigid in its default pose.
         mask: Links whose sensors detect nothing, or `egoskin.make.MASK_ALL`.
@@ -160,6 +162,7 @@ def play_bank(
         watch: Sees every step; the bank is then played in this process, with threads
             instead of workers, and comes to the same.
     """
+    assert first == 0 or watch is not None
     seed = throw_seed(config, bank_seed)
     check_mask(config, skin, mask)
     shared: dict[str, Any] = {
@@ -173,7 +176,12 @@ def play_bank(
     else:
         threads = check_num_workers(episodes, num_workers)
         env = make_worker_env(
-            config, skin, num_threads=threads, keep_raw=True, **shared
+            config,
+            skin,
+            num_threads=threads,
+            row_offset=first,
+            keep_raw=True,
+            **shared,
         )
     steps = torch.zeros(episodes, dtype=torch.int64)
     running = torch.ones(episodes, dtype=torch.bool)
@@ -190,6 +198,12 @@ def play_bank(
                 action = torch.zeros(episodes, env.action_spec.shape[-1])
             else:
                 action = policy(flat)["action"]
+                # MuJoCo would take NaN for zero, and the figures would look ordinary.
+                if not action.isfinite().all():
+                    raise ValueError(
+                        f"the policy's action is not finite at step {step}: its "
+                        "weights, or what it was given, are not those of training"
+                    )
             root["action"] = action.reshape(*root.batch_size, -1)
             data, root = env.step_and_maybe_reset(root)
             following = data["next"]

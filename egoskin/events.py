@@ -16,6 +16,8 @@ from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.summary.writer.record_writer import RecordWriter
 
+_PREFIX = "events.out.tfevents."
+
 
 class EventFile:
     """A new file of scalars in a run folder.
@@ -27,14 +29,22 @@ class EventFile:
     """
 
     def __init__(self, folder: Path, frames: int) -> None:
-        stamp = f"{time.time_ns()}.{socket.gethostname()}.{os.getpid()}"
+        # TensorBoard reads files in the order of their names: this must be the last,
+        # though the clock was set back.
+        times = [_time_of(path.name) for path in folder.glob(f"{_PREFIX}*")]
+        now = max([time.time_ns(), *(ns + 1 for ns in times)])
+        name = f"{_PREFIX}{now:019d}.{socket.gethostname()}.{os.getpid()}"
+        self._path = folder / name
         # Unbuffered: nothing is left that closing could fail to write.
-        file = open(folder / f"events.out.tfevents.{stamp}", "xb", buffering=0)  # noqa: SIM115
+        file = open(self._path, "xb", buffering=0)  # noqa: SIM115
         self._writer = RecordWriter(file)
-        self._write(Event(file_version="brain.Event:2"))
-        if frames:
-            start = SessionLog(status=SessionLog.START)
+        start = SessionLog(status=SessionLog.START)
+        try:
+            self._write(Event(file_version="brain.Event:2"))
             self._write(Event(step=frames + 1, session_log=start))
+        except OSError:
+            self.close()
+            raise
 
     def log(self, metrics: Mapping[str, float]) -> None:
         """Append the metrics of a rollout; "frames" is the x axis."""
@@ -47,8 +57,18 @@ class EventFile:
 
     def _write(self, event: Event) -> None:
         event.wall_time = time.time()
-        self._writer.write(event.SerializeToString())
+        try:
+            self._writer.write(event.SerializeToString())
+        except OSError as error:
+            # The system's own text of a full disk names no file.
+            raise OSError(error.errno, error.strerror, str(self._path)) from error
 
     def close(self) -> None:
         """Close the file."""
         self._writer.close()
+
+
+def _time_of(name: str) -> int:
+    """Return the time in the name of a file of events [ns], 0 if there is none."""
+    time_ns = name.removeprefix(_PREFIX).partition(".")[0]
+    return int(time_ns) if time_ns.isdecimal() and len(time_ns) == 19 else 0

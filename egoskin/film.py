@@ -40,6 +40,8 @@ class Frame:
     """Number of sensors that detect something."""
     num_sensors: int
     """Number of sensors (0 for a blind robot)."""
+    num_avoided: int
+    """Balls avoided so far."""
     ending: str | None
     """Why the episode ends here ("hit", "fall", ...); None while it goes on."""
 
@@ -63,6 +65,7 @@ def annotate(frame: Frame, size: tuple[int, int] | None = None) -> np.ndarray:
         parts.append(f"ball at {max(frame.gap, 0.0):.2f} m")
     if frame.num_sensors:
         parts.append(f"{frame.num_detecting} of {frame.num_sensors} sensors")
+    parts.append(f"avoided {frame.num_avoided}")
     pen = ImageDraw.Draw(picture)
     unit = picture.height / 24
     _write(pen, (0.7 * unit, 0.5 * unit), "    ".join(parts), unit, (20, 24, 32))

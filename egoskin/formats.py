@@ -62,8 +62,8 @@ _MIGRATIONS = {
             "told_next_first": False,
             "drift_start": _ANY,
             "slow_start": _ANY,
-            "env.sensor.numb": False,
             "compile_kernels": _ANY,
+            "env.sensor.numb": False,
         },
     ),
 }

@@ -102,7 +102,7 @@ class EnvConfig:
 
 def make_worker_env(
     config: EnvConfig,
-    skin: Skin,
+    skin: Skin | None = None,
     *,
     num_envs: int,
     seed: int,
@@ -118,7 +118,7 @@ def make_worker_env(
 
     Args:
         config: What the environment is made of.
-        skin: The sensors.
+        skin: The sensors; by default those that ``config.skin`` describes.
         num_envs: Number of rows.
         seed: Seed of all draws.
         row_offset: Global index of the first row.
@@ -130,8 +130,19 @@ def make_worker_env(
         sparse: Whether to give the state that the sensors read, for the agent's own
             sources, instead of the signal.
         mask: Links whose sensors detect nothing, or `MASK_ALL`.
+
+    Raises:
+        ValueError: If the skin does not fit the robot, or ``sparse`` is asked for with
+            a history, which is one of signals.
     """
+    if sparse and config.history > 1:
+        raise ValueError(
+            f"sparse gives the present state alone, history {config.history} needs "
+            "signals: leave sparse off"
+        )
     robot = config.robot_config
+    if skin is None:
+        skin = config.skin.build(robot)
     env = DodgeballEnv(
         robot,
         config.task,
@@ -159,7 +170,7 @@ def make_worker_env(
                 throws.gravity,
             ),
         ]
-        if mask == MASK_ALL:
+        if masks_all(mask):
             transforms.append(HideObjects())
         if not sparse:
             transforms += config.sensor.transforms(
@@ -188,7 +199,13 @@ def make_worker_env(
 
 def masked_sensors(skin: Skin, mask: Sequence[str]) -> list[int]:
     """Return the indices of the sensors on masked links, all with `MASK_ALL`."""
-    return [i for i, name in enumerate(skin.links) if mask == MASK_ALL or name in mask]
+    every = masks_all(mask)
+    return [i for i, name in enumerate(skin.links) if every or name in mask]
+
+
+def masks_all(mask: Sequence[str]) -> bool:
+    """Whether a mask is that of all sensors."""
+    return tuple(mask) == MASK_ALL
 
 
 def check_mask(config: EnvConfig, skin: Skin, mask: Sequence[str]) -> None:
@@ -197,9 +214,11 @@ def check_mask(config: EnvConfig, skin: Skin, mask: Sequence[str]) -> None:
         return
     if config.sensor.coverage == "none":
         raise ValueError("a blind robot has no sensors to mask")
-    if mask == MASK_ALL:
+    if masks_all(mask):
         return
-    links = sorted(set(skin.links)) if config.sensor.uses_skin else []
+    if not config.sensor.uses_skin:
+        raise ValueError("an oracle has no sensors on links: mask all of it")
+    links = sorted(set(skin.links))
     for name in mask:
         if name not in links:
             raise ValueError(
@@ -215,7 +234,7 @@ def _state_keys(transform: Transform) -> list[NestedKey]:
 
 def make_env(
     config: EnvConfig,
-    skin: Skin,
+    skin: Skin | None = None,
     *,
     num_envs: int,
     seed: int,
@@ -230,7 +249,7 @@ def make_env(
 
     Args:
         config: What the environment is made of.
-        skin: The sensors.
+        skin: The sensors; by default those that ``config.skin`` describes.
         num_envs: Number of agents in all.
         seed: Seed of all draws; results do not depend on the number of workers.
         num_workers: Processes; by default the largest divisor of ``num_envs`` not
@@ -242,9 +261,12 @@ def make_env(
         mask: Links whose sensors detect nothing, or `MASK_ALL`.
 
     Raises:
-        ValueError: If the workers do not divide the agents.
+        ValueError: If the workers do not divide the agents, or as `make_worker_env`.
     """
     workers = check_num_workers(num_envs, num_workers)
+    if skin is None:
+        # Once, not in each worker.
+        skin = config.skin.build(config.robot_config)
     rows = num_envs // workers
     return WorkerPool(
         [

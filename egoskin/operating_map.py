@@ -7,6 +7,7 @@ task's.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
+from egoskin.envs.dodgeball import PASSED_DISTANCE
 from egoskin.envs.throws import ThrowConfig
 from egoskin.evaluation import Estimate, play_bank, summarize
 from egoskin.make import EnvConfig
@@ -119,6 +121,25 @@ _MAPS = (
 )
 
 
+def check_map(config: EnvConfig) -> None:
+    """Raise ValueError if the actor tells balls apart: a map takes more of them."""
+    sensor = config.sensor
+    if sensor.coverage == "oracle" or sensor.per_object:
+        what = "an oracle" if sensor.coverage == "oracle" else "per_object"
+        raise ValueError(
+            f"a map takes more balls than the {config.task.throws.num_balls} that the "
+            f"policy's observation tells apart ({what}): no map can be made of it"
+        )
+
+
+def _with_enough_balls(throws: ThrowConfig) -> ThrowConfig:
+    """Return throws none of whose balls is thrown again before it has passed."""
+    # To the base, and on until the environment says that it has passed.
+    way = math.hypot(throws.distance[1], throws.height[1]) + PASSED_DISTANCE
+    number = math.ceil(way / throws.speed[0] / throws.interval[0])
+    return dataclasses.replace(throws, num_balls=max(throws.num_balls, number))
+
+
 def operating_map(
     policy: nn.Module | TensorDictModuleBase | None,
     config: EnvConfig,
@@ -144,7 +165,11 @@ def operating_map(
 
     Returns:
         Success against speed, tempo, height and direction, and against speed and tempo.
+
+    Raises:
+        ValueError: If the policy's observation depends on the number of balls.
     """
+    check_map(config)
     grids = [_grid(properties) for properties in _MAPS]
     total, done = sum(map(len, grids)), 0
     lines = []
@@ -154,6 +179,7 @@ def operating_map(
             throws = config.task.throws
             for what, value in zip(properties, values, strict=True):
                 throws = what.vary(throws, value)
+            throws = _with_enough_balls(throws)
             task = dataclasses.replace(config.task, throws=throws)
             played = play_bank(
                 policy,

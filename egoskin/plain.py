@@ -72,11 +72,21 @@ def from_plain(kind: type[T], content: Any, what: str) -> T:
     if not isinstance(content, dict):
         raise ValueError(f"{what}: expected an object, got {type(content).__name__}")
     hooks = {float: _float, Path: _path}
-    config = dacite.Config(type_hooks=hooks, cast=[tuple], strict=True)
+    config = dacite.Config(type_hooks=hooks, strict=True)
     try:
-        return dacite.from_dict(kind, content, config)
-    except dacite.DaciteError as error:
+        return dacite.from_dict(kind, _with_tuples(content), config)
+    # The last is what a configuration itself refuses.
+    except (dacite.DaciteError, ValueError) as error:
         raise ValueError(f"{what}: {error}") from error
+
+
+def _with_tuples(content: Any) -> Any:
+    """Return plain values with tuples for lists, as configurations have them."""
+    if isinstance(content, dict):
+        return {key: _with_tuples(value) for key, value in content.items()}
+    if isinstance(content, list):
+        return tuple(map(_with_tuples, content))
+    return content
 
 
 def _float(value: Any) -> Any:

@@ -6,6 +6,7 @@ holds the same and more, and is read alike. Some policies come with the package.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,10 +14,12 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor, nn
+from torchrl.data import Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from egoskin.agents.networks import Agent, NetworkConfig, input_keys
+from egoskin.agents.networks import Agent, NetworkConfig
 from egoskin.checkpoint import load_tensors, part, prefixed, save_tensors
 from egoskin.make import EnvConfig
 from egoskin.plain import from_plain, to_plain
@@ -27,6 +30,8 @@ CHECKPOINT_NAME = "checkpoint.safetensors"
 """Name of the latest checkpoint in a run folder."""
 # Names of what a policy file leaves out start with it.
 _CRITIC = "critic."
+# Signals that are not normalised are metres, or shares of their range.
+_LARGEST_SIGNAL = 1e6
 _SHIPPED = Path(__file__).parent / "assets" / "policies"
 
 
@@ -92,6 +97,27 @@ class PolicySpec:
             sources,
         )
 
+    def check_claims(self, tensors: Mapping[str, Tensor], what: str) -> None:
+        """Raise ValueError unless tensors are those of an agent of these sizes.
+
+        It takes no memory for the agent, however large it claims to be.
+
+        Args:
+            tensors: Those of the file that the specification is from.
+            what: Name of the file.
+        """
+        hidden = self.network.hidden
+        claims = [*self.sizes.values(), self.num_actions, *hidden, len(hidden)]
+        held = sum(value.numel() for value in tensors.values())
+        for claim in claims:
+            if not 0 < claim <= held:
+                raise ValueError(
+                    f"{what} is damaged: its header claims a size of {claim}, and it "
+                    f"holds {held} numbers"
+                )
+        with torch.device("meta"):
+            check_agent_tensors(agent_tensors(self.build_agent()), tensors, what)
+
     def header(self) -> dict[str, Any]:
         """Return the specification as JSON values."""
         return {
@@ -111,6 +137,8 @@ class PolicySpec:
         Raises:
             ValueError: If it is no such description.
         """
+        if not isinstance(header, Mapping):
+            raise ValueError(f"{what} holds no policy: it must be an object")
         missing = [f.name for f in dataclasses.fields(cls) if f.name not in header]
         if missing:
             raise ValueError(f"{what} holds no policy: {missing[0]!r} is missing")
@@ -124,9 +152,13 @@ class PolicySpec:
         env = from_plain(EnvConfig, header["env"], what)
         if lacking := set(env.critic_keys) - sizes.keys():
             raise ValueError(f"{what} holds no policy: no size of {min(lacking)!r}")
+        try:
+            skin = Skin.from_dict(header["skin"])
+        except ValueError as error:
+            raise ValueError(f"{what} holds no policy: {error}") from error
         return cls(
             env=env,
-            skin=Skin.from_dict(header["skin"]),
+            skin=skin,
             network=from_plain(NetworkConfig, header["network"], what),
             sizes=sizes,
             num_actions=header["num_actions"],
@@ -154,30 +186,87 @@ def agent_tensors(agent: Agent) -> dict[str, Tensor]:
     return {**dict(agent.named_parameters()), **dict(agent.named_buffers())}
 
 
-@torch.no_grad()
-def load_agent_tensors(agent: Agent, tensors: Mapping[str, Tensor], what: str) -> None:
-    """Copy tensors into an agent; without any of its critic, that stays as it is.
+def check_agent_tensors(
+    own: Mapping[str, Tensor], tensors: Mapping[str, Tensor], what: str
+) -> None:
+    """Raise ValueError unless tensors are those of an agent, or of one without critic.
 
-    Raises:
-        ValueError: If a name or shape does not fit, or a tensor is missing.
+    Args:
+        own: What `agent_tensors` returned for the agent.
+        tensors: What is to be loaded.
+        what: Where it came from, for the error text, which names the tensor.
     """
-    own = agent_tensors(agent)
     missing = own.keys() - tensors.keys()
     if not any(name.startswith(_CRITIC) for name in tensors):
         missing = {name for name in missing if not name.startswith(_CRITIC)}
     if missing:
         raise ValueError(f"{what}: tensor {min(missing)!r} of the networks is missing")
+    check_like(own, tensors, what)
+
+
+def check_like(
+    own: Mapping[str, Tensor], tensors: Mapping[str, Tensor], what: str
+) -> None:
+    """Raise ValueError if a tensor is unknown or of another shape or type than ours."""
     for name, value in tensors.items():
-        if name not in own or own[name].shape != value.shape:
-            raise ValueError(f"{what}: tensor {name!r} does not fit the networks")
+        if name not in own:
+            raise ValueError(f"{what}: tensor {name!r} is none that is known here")
+        if (own[name].shape, own[name].dtype) != (value.shape, value.dtype):
+            raise ValueError(
+                f"{what}: tensor {name!r} does not fit: expected {_kind(own[name])}, "
+                f"got {_kind(value)}"
+            )
+
+
+def _kind(value: Tensor) -> str:
+    return f"{list(value.shape)} of {str(value.dtype).removeprefix('torch.')}"
+
+
+@torch.no_grad()
+def load_agent_tensors(agent: Agent, tensors: Mapping[str, Tensor], what: str) -> None:
+    """Copy tensors into an agent; without any of its critic, that stays as it is.
+
+    Raises:
+        ValueError: If a name, shape or type does not fit, or a tensor is missing; the
+            agent is then as it was.
+    """
+    own = agent_tensors(agent)
+    check_agent_tensors(own, tensors, what)
+    for name, value in tensors.items():
         own[name].copy_(value)
 
 
-def check_finite(tensors: Mapping[str, Tensor], what: str) -> None:
-    """Raise ValueError if a tensor holds NaN or infinity; the text names it."""
-    for name, value in tensors.items():
-        if not value.isfinite().all():
+@torch.no_grad()
+def check_finite(agent: Agent, what: str) -> None:
+    """Raise ValueError if an agent can give an action that is not finite.
+
+    Args:
+        agent: The agent, loaded.
+        what: Where it came from, for the error text.
+    """
+    for name, value in agent_tensors(agent).items():
+        # All is computed in float32, however it is kept.
+        if not value.float().isfinite().all():
             raise ValueError(f"{what} is damaged: tensor {name!r} is not finite")
+        if name.endswith(".var") and (value < 0).any():
+            raise ValueError(f"{what} is damaged: tensor {name!r} is negative")
+    # No sum is larger than that of the magnitudes, with all inputs at their largest.
+    body = copy.deepcopy(agent.head.body)
+    for weight in body.parameters():
+        weight.abs_()
+    largest = []
+    for key, layer in zip(agent.actor_keys, body.inputs, strict=True):
+        assert isinstance(layer, nn.Linear)
+        x = layer.weight.new_full((1, layer.in_features), _LARGEST_SIGNAL)
+        if key in agent.norms:
+            x = agent.norms[key](x.fill_(torch.finfo(x.dtype).max))
+        largest.append(x)
+    scale = agent.head.log_std.exp()
+    if not (body(*largest).isfinite().all() and scale.isfinite().all()):
+        raise ValueError(
+            f"{what} is damaged: with weights as large as its own, actions need not be "
+            "finite"
+        )
 
 
 def save_policy(path: Path, agent: Agent, spec: PolicySpec) -> None:
@@ -190,45 +279,77 @@ def save_policy(path: Path, agent: Agent, spec: PolicySpec) -> None:
     save_tensors(path, prefixed("agent", tensors), {"policy": spec.header()})
 
 
-class Policy(nn.Module):
+class Policy(TensorDictModuleBase):
     """A trained actor that writes its mean action.
 
+    A TensorDict module like any other: for ``env.rollout``, a TorchRL collector,
+    ``TensorDictSequential``, `torch.compile`, `torch.vmap`. Called with the tensors of
+    ``in_keys`` in their order, it returns the action.
+
     Args:
-        agent: Agent whose actor is used.
-        spec: What it was made for.
+        agent: Agent whose actor is used; its parameters no longer require gradients.
+        policy_spec: What it was made for.
     """
 
-    def __init__(self, agent: Agent, spec: PolicySpec) -> None:
+    def __init__(self, agent: Agent, policy_spec: PolicySpec) -> None:
         super().__init__()
-        self._agent = agent.requires_grad_(False)
-        self.spec = spec
-        self.in_keys = agent.actor_keys
-        self.out_keys = ["action"]
+        self.policy_spec = policy_spec
+        self.in_keys, self.out_keys = agent.actor_keys, ["action"]
+        self._head = agent.head.requires_grad_(False)
+        self._norms = nn.ModuleDict(
+            {key: agent.norms[key] for key in agent.actor_keys if key in agent.norms}
+        )
 
     @property
     def env_config(self) -> EnvConfig:
         """Robot, task and sensors the policy was trained with."""
-        return self.spec.env
+        return self.policy_spec.env
 
     @property
     def skin(self) -> Skin:
         """The skin it was trained with."""
-        return self.spec.skin
+        return self.policy_spec.skin
 
+    @property
+    def spec(self) -> Composite:
+        """TorchRL's spec of what it writes."""
+        weight = self._head.log_std
+        return Composite(
+            action=Unbounded(weight.shape, device=weight.device, dtype=weight.dtype)
+        )
+
+    @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``action [*B, J]`` from the keys in ``in_keys``.
+        """Write ``action [*B, J]`` from ``in_keys``, ``[*B, F]`` of any float dtype.
+
+        The batch may have any number of dimensions, or none. The action has the dtype
+        of the policy's parameters.
 
         Raises:
             KeyError: If a key is missing; the text names what is needed.
+            ValueError: If a key holds another number of features than it was trained
+                with.
         """
-        missing = [k for k in self.in_keys if k not in tensordict.keys()]
-        if missing:
-            raise KeyError(
-                f"the policy reads {', '.join(self.in_keys)}; {missing[0]!r} is missing"
-            )
-        inputs = self._agent.encode(tensordict.select(*self.in_keys))
-        loc, _ = self._agent.head(*(inputs[key] for key in input_keys(self.in_keys)))
-        return tensordict.set("action", loc)
+        return tensordict.set("action", self._mean(tensordict))
+
+    def _mean(self, tensordict: TensorDictBase) -> Tensor:
+        """Return the mean action, ``[*B, J]``."""
+        keys, inputs = self.env_config.actor_keys, []
+        for key in keys:
+            value, size = tensordict.get(key, None), self.policy_spec.sizes[key]
+            if value is None:
+                raise KeyError(
+                    f"the policy reads {', '.join(keys)}; {key!r} is missing"
+                )
+            if value.shape[-1:] != (size,):
+                raise ValueError(
+                    f"the policy was trained with {key!r} [*B, {size}], got "
+                    f"{list(value.shape)}: is it the environment of "
+                    "make_env(policy.env_config, policy.skin)?"
+                )
+            value = value.to(self._head.log_std.dtype)
+            inputs.append(self._norms[key](value) if key in self._norms else value)
+        return self._head(*inputs)[0]
 
 
 def shipped_policies() -> list[str]:
@@ -265,7 +386,9 @@ def load_policy(path: str | Path) -> Policy:
         path = path / CHECKPOINT_NAME
     tensors, header = load_tensors(path)
     spec = PolicySpec.from_header(header.get("policy", {}), str(path))
-    agent, own = spec.build_agent(), part("agent", tensors)
-    check_finite(own, str(path))
+    own = part("agent", tensors)
+    spec.check_claims(own, str(path))
+    agent = spec.build_agent()
     load_agent_tensors(agent, own, str(path))
+    check_finite(agent, str(path))
     return Policy(agent, spec)

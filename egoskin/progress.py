@@ -11,6 +11,35 @@ from collections.abc import Mapping
 _FILE_INTERVAL = 10.0
 
 
+class StatusLine:
+    """One line on stderr that says how far the work is.
+
+    On a terminal it is written over; in a file a line is written now and then.
+
+    Args:
+        text: What the work is, shown at once.
+    """
+
+    def __init__(self, text: str) -> None:
+        self._live = sys.stderr.isatty()
+        self._shown = float("-inf")
+        self.show(text)
+
+    def show(self, text: str) -> None:
+        """Show how far it is, if it is time to."""
+        now = time.monotonic()
+        if self._live:
+            print(f"\r{text}\x1b[K", end="", file=sys.stderr, flush=True)
+        elif now - self._shown >= _FILE_INTERVAL:
+            print(text, file=sys.stderr, flush=True)
+            self._shown = now
+
+    def finish(self) -> None:
+        """Leave the line."""
+        if self._live:
+            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+
+
 class ProgressLine:
     """Frames, time left, speed, survival and success of a training run.
 

@@ -4,8 +4,8 @@ Headless: on Linux the OpenGL context is EGL's unless ``MUJOCO_GL`` asks for ano
 neither a display nor an environment variable is needed, whatever was imported first.
 
 Contract: the picture is drawn from the keys of the environment alone (``base_pose``,
-``joint_pos``, ``object_pose``, ``object_active``, ``distance``), never from live
-simulation; a stored tensordict with these keys can be drawn just as well.
+``joint_pos``, ``object_pose``, ``object_active``, ``distance``, ``balls_avoided``),
+never from live simulation; a stored tensordict with these keys can be drawn as well.
 """
 
 from __future__ import annotations
@@ -14,19 +14,17 @@ import math
 import os
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import closing
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import mujoco
 import numpy as np
 import torch
 from tensordict import TensorDictBase
-from torchrl.envs import step_mdp
 
+from egoskin.evaluation import play_bank
 from egoskin.film import Frame
-from egoskin.make import EnvConfig, make_worker_env
+from egoskin.make import EnvConfig
 from egoskin.robots import RobotConfig
 from egoskin.sensors import Ray, Skin
 from egoskin.shapes import Shape
@@ -42,12 +40,12 @@ _FIELD_LINE_RGB = (0.1, 0.35, 1.0)
 _RAY_LINE_RGB = (1.0, 0.8, 0.0)
 _BALL_RGBA = (0.95, 0.35, 0.08, 1.0)
 # Drawn radii [m]: a sensor at rest, one that detects, a line.
-_IDLE_RADIUS, _LIT_RADIUS, _LINE_RADIUS = 0.017, 0.022, 0.006
+_IDLE_RADIUS, _LIT_RADIUS, _LINE_RADIUS = 0.017, 0.03, 0.006
 # Lines fade with their length, from opaque at 0 to the faintest at this [m].
 _FADE_LENGTH, _FAINTEST = 2.5, 0.25
 # The camera's point of attention follows the base with this time constant [s] and
 # stays at this height [m].
-_FOLLOW_TIME, _LOOK_HEIGHT = 0.4, 1.25
+_FOLLOW_TIME, _LOOK_HEIGHT = 0.4, 1.0
 
 
 class RenderingError(ValueError):
@@ -58,7 +56,7 @@ class RenderingError(ValueError):
 class CameraConfig:
     """Where the camera is, relative to the robot that it follows."""
 
-    distance: float = 5.2
+    distance: float = 3.4
     """Distance to the robot [m]."""
     azimuth_deg: float = 30.0
     """Bearing of the camera, from the robot's heading at the start [deg]."""
@@ -66,94 +64,168 @@ class CameraConfig:
     """Angle by which the camera looks down [deg]."""
 
 
-def render_episode(
+@dataclass(frozen=True, kw_only=True)
+class Recording:
+    """The states of one episode, from its start to the step that ends it."""
+
+    row: int
+    """Row of the episode in its bank."""
+    states: list[TensorDictBase]
+    """State after each control step, the start first, raw keys kept."""
+    ending: str | None
+    """Why the episode ended ("hit", "fall", "time limit", ...)."""
+
+
+def record_episodes(
     config: EnvConfig,
     skin: Skin,
     policy: Policy | None,
     *,
-    seed: int = 0,
-    row: int = 0,
-    max_seconds: float | None = None,
-    fps: float = 30.0,
-    size: tuple[int, int] = (960, 540),
-    camera: CameraConfig | None = None,
+    bank_seed: int = 0,
+    first: int = 0,
+    episodes: int = 1,
     hold: bool = False,
-) -> list[Frame]:
-    """Return the pictures of one episode.
+    on_step: Callable[[int, int], None] | None = None,
+) -> list[Recording]:
+    """Return recordings of some episodes of a bank of throws.
 
-    Draws are functions of (seed, global row), so ``seed`` and ``row`` name an episode
-    of an evaluation bank: its start and its throws are those of that row. (The motion
-    is too, but for rounding: a network's result depends on the batch size in its last
-    bits.)
+    The starts and the throws are those of the bank's rows. (The motion is too, but for
+    rounding: a network's result depends on the batch size in its last bits.)
 
     Args:
         config: What the environment is made of.
         skin: The sensors.
-        policy: Maps the tensordict of one row to the same with ``action [1, J]``; None
-            for action 0, the default pose as position target.
-        seed: Seed of all draws, the bank's for an episode of a bank.
-        row: Global row of the episode.
-        max_seconds: Stop at this age at the latest [s]; None for the whole episode.
-        fps: Pictures for each second of simulated time, at most the control rate.
+        policy: Writes ``action``; None for action 0, the default pose as position
+            target.
+        bank_seed: Seed of the bank.
+        first: Row of the first episode.
+        episodes: Number of episodes.
+        hold: Whether the robot is held rigid in its default pose.
+        on_step: Called with (steps done, episodes still running).
+    """
+    states: list[list[TensorDictBase]] = [[] for _ in range(episodes)]
+
+    def watch(
+        before: TensorDictBase, after: TensorDictBase, running: torch.Tensor
+    ) -> None:
+        for i in running.nonzero()[:, 0].tolist():
+            if not states[i]:
+                states[i].append(before[i].clone())
+            states[i].append(after[i].clone())
+
+    play_bank(
+        policy,
+        config,
+        skin,
+        bank_seed=bank_seed,
+        first=first,
+        episodes=episodes,
+        hold=hold,
+        on_step=on_step,
+        watch=watch,
+    )
+    return [
+        Recording(row=first + i, states=seen, ending=_ending(seen[-1]))
+        for i, seen in enumerate(states)
+    ]
+
+
+def painter_of(
+    config: EnvConfig,
+    skin: Skin,
+    *,
+    size: tuple[int, int] = (960, 540),
+    camera: CameraConfig | None = None,
+) -> Painter:
+    """Return what draws the states of an environment, to be used in a ``with``.
+
+    Args:
+        config: What the environment is made of.
+        skin: The sensors.
         size: Width and height of the pictures [px].
         camera: Where the camera is.
-        hold: Whether the robot is held rigid in its default pose.
-
-    Returns:
-        Frames in order of time: the start, then ``fps`` for each second, and always the
-        step that ends the episode.
 
     Raises:
         RenderingError: If no OpenGL context can be made.
-        ValueError: If a number is out of range.
+        ValueError: If the size is odd or below 16.
     """
-    hz = config.task.physics.control_hz
-    if not 0 < fps <= hz:
-        raise ValueError(f"fps must be in (0, {hz:g}], the control rate, got {fps:g}")
-    if row < 0:
-        raise ValueError(f"the episode's row must not be negative, got {row}")
-    if max_seconds is not None and not max_seconds * hz >= 1:
-        raise ValueError(
-            f"max_seconds must be at least one control step, {1 / hz:.3g} s, "
-            f"got {max_seconds:g}"
-        )
-    if max_seconds is None:
-        steps = config.task.episode_steps
-    else:
-        steps = round(max_seconds * hz)
     sensor = config.sensor
-    painter = Painter(
+    return Painter(
         config.robot_config,
         sensor.filled(skin) if sensor.uses_skin else None,
         config.task.throws.balls,
         size=size,
         camera=camera,
     )
-    sensing = partial(sensor.detecting, skin)
-    env = make_worker_env(
-        config, skin, num_envs=1, seed=seed, row_offset=row, hold=hold, keep_raw=True
-    )
-    with painter, closing(env), torch.no_grad():
-        td = env.reset()
-        frames = [painter.draw(td[0], sensing(td[0]), time=0.0)]
-        for step in range(1, steps + 1):
-            if policy is None:
-                td["action"] = env.action_spec.zero()
-            else:
-                td = policy(td)
-            td = env.step(td)
-            state = td["next"][0]
-            ending = _ending(state) or ("cut" if step == steps else None)
-            is_due = int(step * fps / hz) > int((step - 1) * fps / hz)
-            if is_due or ending:
-                picture = painter.draw(
-                    state, sensing(state), time=step / hz, ending=ending
-                )
-                frames.append(picture)
-            if ending:
-                break
-            td = step_mdp(td)
+
+
+def render_recording(
+    painter: Painter,
+    config: EnvConfig,
+    skin: Skin,
+    recording: Recording,
+    *,
+    max_seconds: float | None = None,
+    fps: float = 30.0,
+    on_picture: Callable[[int, int], None] | None = None,
+) -> list[Frame]:
+    """Return the pictures of one episode.
+
+    Args:
+        painter: What `painter_of` returned.
+        config: What the environment was made of.
+        skin: The sensors.
+        recording: The episode.
+        max_seconds: Stop at this age at the latest [s]; None for the whole episode.
+        fps: Pictures for each second of simulated time, at most the control rate.
+        on_picture: Called with (pictures done, pictures in all).
+
+    Returns:
+        Frames in order of time: the start, then ``fps`` for each second, and always the
+        step that ends the episode.
+
+    Raises:
+        ValueError: If a number is out of range.
+    """
+    hz = config.task.physics.control_hz
+    check_film(hz, fps, max_seconds)
+    last = len(recording.states) - 1
+    steps = last if max_seconds is None else min(round(max_seconds * hz), last)
+    ending = recording.ending if steps == last else "cut"
+    due = [0]
+    for step in range(1, steps + 1):
+        if int(step * fps / hz) > int((step - 1) * fps / hz) or step == steps:
+            due.append(step)
+    frames = []
+    for step in due:
+        state = recording.states[step]
+        frame = painter.draw(
+            state,
+            config.sensor.detecting(skin, state),
+            time=step / hz,
+            ending=ending if step == steps else None,
+        )
+        frames.append(frame)
+        if on_picture is not None:
+            on_picture(len(frames), len(due))
     return frames
+
+
+def check_film(hz: float, fps: float, max_seconds: float | None) -> None:
+    """Raise ValueError for a film that cannot be made.
+
+    Args:
+        hz: Control rate [Hz].
+        fps: Pictures for each second.
+        max_seconds: Longest age shown [s]; None for all.
+    """
+    if not 0 < fps <= hz:
+        raise ValueError(f"fps must be in (0, {hz:g}], the control rate, got {fps:g}")
+    if max_seconds is not None and not max_seconds * hz >= 1:
+        raise ValueError(
+            f"max_seconds must be at least one control step, {1 / hz:.3g} s, "
+            f"got {max_seconds:g}"
+        )
 
 
 def _ending(state: TensorDictBase) -> str | None:
@@ -233,7 +305,7 @@ class Painter:
 
         Args:
             state: One row with ``base_pose [7]``, ``joint_pos [J]``,
-                ``object_pose [O, 7]`` and ``object_active [O]``.
+                ``object_pose [O, 7]``, ``object_active [O]`` and ``balls_avoided [2]``.
             detecting: Whether each sensor detects something, ``[S]`` bool.
             time: Age of the episode [s]; the camera follows the base with time and
                 starts anew when time goes back.
@@ -256,6 +328,7 @@ class Painter:
             gap=self._gap(active),
             num_detecting=int(detecting.sum()),
             num_sensors=len(detecting),
+            num_avoided=int(state["balls_avoided"].sum()),
             ending=ending,
         )
 

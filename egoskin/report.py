@@ -66,6 +66,7 @@ def curve(runs: Sequence[StoredRun]) -> Curve:
 
 
 _COLUMNS = (
+    "standard",
     "seed",
     "frames",
     "throws",
@@ -94,7 +95,11 @@ def _figures(run: StoredRun) -> list[str]:
     """Return the columns of one run."""
     e = run.evaluation
     success, survival = e["success"], e["survival_time"]
+    trained = run.config.env.standard
     return [
+        trained
+        if trained == run.judged_on
+        else f"{trained}, judged on {run.judged_on}",
         str(run.config.seed),
         f"{run.record.frames / 1e6:.1f} M",
         f"{e['episodes']:,}",
@@ -121,6 +126,7 @@ def _over_seeds(runs: Sequence[StoredRun]) -> list[str]:
     low, high = interquartile_range(success)
     survival = mean(e["survival_time"]["mean"] for e in all_of)
     return [
+        "",
         "",
         "",
         "",
@@ -172,7 +178,8 @@ _HEAD = """# Results
 Written by `python scripts/results.py write` from [results](../results/README.md); what
 is written by hand is in `results/notes.md`.
 
-Every figure is of the stored policy, mean action, on a bank of standard throws, with
+Every figure is of the stored policy, mean action, on a bank of standard throws (of the
+version of the column *standard*, see [the standard throw](standard-throw.md)), with
 95 % intervals for each seed (over throws, not over trainings); over seeds the
 interquartile mean and, for the success at 3 s, the interquartile range. *Success* is
 the share of episodes without contact or fall up to an age ("-": not measured);

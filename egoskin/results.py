@@ -21,11 +21,14 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
+from egoskin.envs.dodgeball import DodgeballConfig
+from egoskin.envs.standards import Standard, training_task
 from egoskin.formats import migrate, read_sealed
+from egoskin.make import EnvConfig
 from egoskin.plain import changed_fields, from_plain, read_json, to_plain
 from egoskin.runs import MACHINE_FIELDS, SKIN_HASH, Run, TrainConfig
 
@@ -78,6 +81,11 @@ class StoredRun:
     """Figures of the stored policy, as evaluate.py writes them."""
 
     @property
+    def judged_on(self) -> Standard:
+        """Version of the standard throw that it was evaluated on."""
+        return self.evaluation.get("standard", "1")
+
+    @property
     def cell(self) -> str:
         """What the actor is given."""
         own = [x for x in self._changes() if x.startswith("env.sensor.")]
@@ -92,13 +100,26 @@ class StoredRun:
 
     def _changes(self) -> list[str]:
         """Return "field=value" of all that differs from the default and matters."""
-        default, own = to_plain(TrainConfig()), to_plain(self.config)
+        default, own = to_plain(_default(self.config)), to_plain(self.config)
         names = changed_fields(default, own)
         return [
             f"{name}={_at(own, name)}"
             for name in names
             if name not in _NO_RECIPE | _CELL
         ]
+
+
+def _default(config: TrainConfig) -> TrainConfig:
+    """Return the default recipe on the nearest version of the standard throw."""
+
+    def on(version: Standard) -> TrainConfig:
+        task = training_task(version, DodgeballConfig())
+        return TrainConfig(env=EnvConfig(task=task))
+
+    def distance(default: TrainConfig) -> int:
+        return len(changed_fields(to_plain(default), to_plain(config)))
+
+    return min(map(on, get_args(Standard)), key=distance)
 
 
 def _words(config: TrainConfig) -> str:
@@ -208,7 +229,7 @@ def _without(args: Sequence[str], option: str) -> list[str]:
 def same_but_length(one: TrainConfig, two: TrainConfig) -> bool:
     """Return whether two configurations are those of one run, or of its longer self."""
     names = changed_fields(to_plain(one), to_plain(two))
-    return set(names) <= _NO_RECIPE - {"seed"}
+    return set(names) <= MACHINE_FIELDS | {"total_frames"}
 
 
 def load_runs(folder: Path) -> list[StoredRun]:

@@ -8,6 +8,7 @@ once, in the properties of the configuration.
 from __future__ import annotations
 
 import fnmatch
+import glob
 import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
@@ -188,7 +189,7 @@ class RobotConfig:
     def default_joint_pos(self) -> np.ndarray:
         """Joint positions of the default pose [rad], of slides [m], ``[J]``."""
         rest = {
-            name: 0.0
+            glob.escape(name): 0.0
             for name in self.joints
             if not any(fnmatch.fnmatchcase(name, p) for p in self.default_pose)
         }

@@ -21,6 +21,7 @@ from __future__ import annotations
 import argparse
 import csv
 import datetime
+import errno
 import fcntl
 import io
 import itertools
@@ -44,6 +45,7 @@ from egoskin.checkpoint import (
     PARTIAL,
     append,
     load_tensors,
+    named,
     save_tensors,
     write_file,
 )
@@ -156,22 +158,20 @@ class TrainConfig:
         return device
 
 
+# What a run's stored configuration leaves out: it says how a run was called.
+_CALL_FIELDS = ("run_dir", "resume", "standard")
 MACHINE_FIELDS = frozenset(
     (
+        *_CALL_FIELDS,
         "num_workers",
         "learner_threads",
         "snapshot_frames",
         "checkpoint_interval",
-        "run_dir",
-        "resume",
-        "standard",
     )
 )
-"""Fields that say where a run is computed and what is kept of it: they change no
-result, to the last bit, and may change at a resume. The device is none of them: sums
-on another one round otherwise."""
-# What a run's stored configuration leaves out: it says how a run was called.
-_CALL_FIELDS = ("run_dir", "resume", "standard")
+"""Fields that say how a run was called, where it is computed and what is kept of it:
+they change no result, to the last bit, and may change at a resume. The device is none
+of them: sums on another one round otherwise."""
 SKIN_HASH = "skin_sha256"
 """What config.json holds beside the configuration: the hash of the skin."""
 # Where a checkpoint keeps the metrics.
@@ -285,7 +285,10 @@ class Run:
             )
         (path / "policies").mkdir(parents=True)
         run = cls(path, config)
-        skin.save(run.skin_path)
+        try:
+            skin.save(run.skin_path)
+        except OSError as error:
+            raise named(error, run.skin_path) from error
         run._skin_hash = content_hash(read_json(run.skin_path))
         # Last: a folder with a configuration can be resumed.
         run.write_config()
@@ -427,14 +430,24 @@ class Run:
         Raises:
             ValueError: If one does already.
         """
-        with open(self.path / "lock", "w") as file:
+        path = self.path / "lock"
+        flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+        try:
+            descriptor = os.open(path, flags, 0o666)
+        except OSError as error:
+            if error.errno != errno.ELOOP:
+                raise
+            raise ValueError(f"{path} is a link, which is not followed") from error
+        try:
             try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 raise ValueError(
                     f"{self.path} is being trained by another process"
                 ) from None
             yield
+        finally:
+            os.close(descriptor)
 
     def is_new(self) -> bool:
         """Whether there is nothing to go on from, though it may have been started."""
@@ -443,7 +456,10 @@ class Run:
     def how_to_go_on(self) -> str:
         """Return what to do after a stop or a failure."""
         if not (self.path / "config.json").is_file():
-            return f"{self.path} cannot be gone on with: start a new run"
+            return (
+                f"{self.path} is gone: start a new run or, if it was only renamed, "
+                "--resume it by its new name"
+            )
         return f"go on with: python scripts/ppo.py --resume {self.path}"
 
     def save_checkpoint(
@@ -496,9 +512,13 @@ class Run:
         The folder of the policies, if somebody removed it, is made again, and so is the
         log of metrics if somebody removed, edited or damaged it.
         """
-        (self.path / "policies").mkdir(exist_ok=True)
-        for left in self.path.rglob(PARTIAL):
-            left.unlink()
+        policies = self.path / "policies"
+        if policies.is_symlink():
+            raise ValueError(f"{policies} is a link, which is not followed")
+        policies.mkdir(exist_ok=True)
+        for folder in (self.path, policies):
+            for left in folder.glob(PARTIAL):
+                left.unlink()
         path, text = self._metrics_path, self._metrics.encode()
         try:
             if not read_regular(path, sys.maxsize).startswith(text):

@@ -8,9 +8,11 @@ replaces a checkpoint.
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +26,13 @@ from egoskin.checkpoint import part, prefixed, save_tensors
 from egoskin.collection import collect
 from egoskin.envs.rewards import TERMS
 from egoskin.make import load_env_state, make_env, save_env_state
-from egoskin.plain import to_plain
+from egoskin.plain import from_plain, to_plain
 from egoskin.policies import (
     PolicySpec,
     agent_tensors,
+    check_agent_tensors,
     check_finite,
+    check_like,
     load_agent_tensors,
     save_policy,
     sparse_sources,
@@ -51,6 +55,25 @@ METRIC_KEYS = (
     "self_contact",
     "terminated",
 )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Progress:
+    """How far a training has come: what a checkpoint holds beside tensors."""
+
+    frames: int
+    """Environment steps learnt from."""
+    wall_s: float
+    """Time that took [s]."""
+    learning_rate: float
+    """Present learning rate."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for numbers that no training comes to."""
+        if self.frames < 0 or not 0 <= self.wall_s < math.inf:
+            raise ValueError(f"frames or wall_s cannot be, in {self}")
+        if not 0 < self.learning_rate < math.inf:
+            raise ValueError(f"learning_rate cannot be, in {self}")
 
 
 class Trainer:
@@ -133,17 +156,20 @@ class Trainer:
         hz = task.physics.control_hz
         ended = float(infos["terminated"].sum())
         terms = infos["reward_terms"].mean(0).mean(0).tolist()
+        # A ball that hits may throw the robot over: each end has one cause.
+        hit = infos["hit"]
+        fallen = infos["fallen"] & ~hit
 
-        def share_of_ends(key: str) -> float:
-            return float(infos[key].sum()) / ended if ended else float("nan")
+        def share_of_ends(cause: Tensor) -> float:
+            return float(cause.sum()) / ended if ended else float("nan")
 
         return {
             "episode/survival_s": self.survival.mean() / hz,
             "episode/success": self.survival.probability(
                 round(min(task.success_s, task.episode_length_s) * hz)
             ),
-            "episode/ended_by_ball": share_of_ends("hit"),
-            "episode/ended_by_fall": share_of_ends("fallen"),
+            "episode/ended_by_ball": share_of_ends(hit),
+            "episode/ended_by_fall": share_of_ends(fallen),
             "episode/diverged": float(infos["diverged"].sum()),
             "episode/self_contact": float(infos["self_contact"].float().mean()),
             "reward/mean": float(infos["reward"].mean()),
@@ -157,38 +183,41 @@ class Trainer:
 
     def save(self) -> None:
         """Write a checkpoint from which `load` continues bit for bit."""
+        progress = Progress(
+            frames=self.frames,
+            wall_s=self.wall_s,
+            learning_rate=self.ppo.learning_rate,
+        )
         self.run.save_checkpoint(
-            {
-                **self._learner_tensors(),
-                **prefixed("env", save_env_state(self.env, self.root)),
-                "survival/at_risk": self.survival.at_risk,
-                "survival/ended": self.survival.ended,
-                # Noise and minibatches are drawn on the CPU, whatever the device.
-                "random_state": torch.get_rng_state(),
-            },
-            {
-                "policy": self._spec_now().header(),
-                "frames": self.frames,
-                "wall_s": self.wall_s,
-                "learning_rate": self.ppo.learning_rate,
-            },
+            {**self._learner_tensors(), **self._other_tensors()},
+            {"policy": self._spec_now().header(), **to_plain(progress)},
         )
 
     def load(self, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:
         """Continue from a checkpoint of the run.
 
         Raises:
-            ValueError: If its agent is another one, or damaged.
+            ValueError: If it is that of another agent or environment, then nothing is
+                loaded; or if it holds numbers with which no policy acts.
         """
         what = str(self.run.checkpoint_path)
+        names = [field.name for field in dataclasses.fields(Progress)]
+        known = {name: header[name] for name in names if name in header}
+        progress = from_plain(Progress, known, what)
+        self.root = self.env.reset()
+        own = self._other_tensors()
+        if missing := own.keys() - tensors.keys():
+            raise ValueError(f"{what}: tensor {min(missing)!r} is missing")
+        check_like(own, {name: tensors[name] for name in own}, what)
         agent = part("agent", tensors)
-        check_finite(agent, what)
+        check_agent_tensors(agent_tensors(self.agent), agent, what)
+        self.ppo.load_state(part("optimizer", tensors), progress.learning_rate)
         load_agent_tensors(self.agent, agent, what)
-        self.ppo.load_state(part("optimizer", tensors), header["learning_rate"])
+        check_finite(self.agent, what)
         self.root = load_env_state(self.env, part("env", tensors))
         self.survival.at_risk.copy_(tensors["survival/at_risk"])
         self.survival.ended.copy_(tensors["survival/ended"])
-        self.frames, self.wall_s = header["frames"], header["wall_s"]
+        self.frames, self.wall_s = progress.frames, progress.wall_s
         torch.set_rng_state(tensors["random_state"])
 
     def dump(self, error: NonFiniteError) -> Path:
@@ -214,6 +243,16 @@ class Trainer:
         return {
             **prefixed("agent", agent_tensors(self.agent)),
             **prefixed("optimizer", self.ppo.state()),
+        }
+
+    def _other_tensors(self) -> dict[str, Tensor]:
+        """What else a checkpoint holds: environment, survival, random state."""
+        return {
+            **prefixed("env", save_env_state(self.env, self.root)),
+            "survival/at_risk": self.survival.at_risk,
+            "survival/ended": self.survival.ended,
+            # Noise and minibatches are drawn on the CPU, whatever the device.
+            "random_state": torch.get_rng_state(),
         }
 
     def _spec_now(self) -> PolicySpec:

@@ -43,6 +43,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase, ParallelEnv, Transform, TransformedEnv
 
+from egoskin import compilation
 from egoskin.interrupts import ENDING
 
 # How long the parent sleeps between looks at its workers: first this share of the time
@@ -67,6 +68,8 @@ _GUARD = (
     "error: workers import the script that starts them, and this one would start them "
     'again: put what it does into a function, called under `if __name__ == "__main__":`'
 )
+# When multiprocessing removes its folder at the end: later is lower.
+_REMOVES_FOLDER = -100
 # What to end when this process ends.
 _processes: weakref.WeakSet[BaseProcess] = weakref.WeakSet()
 
@@ -158,12 +161,17 @@ class _Build:
     def __init__(self, build: Callable[[], WorkerEnv | EnvBase], report: Path) -> None:
         self._build, self._report = build, report
         self._parent = os.getpid()
+        # A worker has those of the server that forks it, which may be older.
+        self._compile = os.environ.get(compilation.SETTING)
 
     def __call__(self) -> WorkerEnv:
         # TorchRL also builds one in the parent, to read its specs.
         in_worker = os.getpid() != self._parent
         if in_worker:
             keep_freed_memory()
+            os.environ.pop(compilation.SETTING, None)
+            if self._compile is not None:
+                os.environ[compilation.SETTING] = self._compile
             Thread(target=_end_with_parent, daemon=True).start()
             # It ends with its parent, not after 10,000 s without a command.
             torchrl._utils.BATCHED_PIPE_TIMEOUT = None
@@ -193,7 +201,7 @@ def start_server() -> None:
     """
     _check_guarded()
     _temporary_folder()
-    set_forkserver_preload(["egoskin.make"])
+    set_forkserver_preload(["egoskin.preload"])
     # Ctrl-C, a batch system's SIGTERM and a closed terminal reach the whole group, but
     # when to end is the parent's decision. All others inherit the signal mask. The
     # tracker comes first: its own start unblocks what it ignores.
@@ -219,7 +227,7 @@ def _temporary_folder() -> str:
 
     It is multiprocessing's own, with the socket of the server that forks the workers.
     A process that is killed removes nothing, so a shell waits for its end: for a line
-    if multiprocessing will remove the folder, for the end of file if nobody does. Then
+    if multiprocessing has removed the folder, for the end of file if nobody has. Then
     it removes the semaphores, too, unless multiprocessing's tracker still has.
     """
     folder = util.get_temp_dir()
@@ -236,7 +244,9 @@ def _temporary_folder() -> str:
         # A SIGKILL may go to the whole group.
         start_new_session=True,
     )
-    atexit.register(shell.communicate, b"\n")
+    # After multiprocessing has removed the folder.
+    after = _REMOVES_FOLDER - 1
+    util.Finalize(None, shell.communicate, [b"\n"], exitpriority=after)
     # Before multiprocessing waits for them.
     atexit.register(_kill, _processes)
     return folder

@@ -137,7 +137,7 @@ def main(args: list[str]) -> None:
         on_iteration=show,
     )
     title = (
-        f"{config.policy}: {policy.spec.frames:,} frames; "
+        f"{config.policy}: {policy.policy_spec.frames:,} frames; "
         f"{counted(len(result.height), 'throw')} (ball {config.ball} of the episodes) "
         f"of bank {config.bank_seed} that came within {config.reach:g} m of a sensor"
     )

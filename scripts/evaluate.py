@@ -20,7 +20,6 @@ import dataclasses
 import importlib.util
 import json
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,13 +33,12 @@ from egoskin.draws import check_seed
 from egoskin.evaluation import Estimate, Evaluation, evaluate, standard_task
 from egoskin.film import check_path
 from egoskin.make import MASK_ALL, EnvConfig, check_mask, check_num_workers
-from egoskin.operating_map import draw_map, operating_map
+from egoskin.operating_map import check_map, draw_map, operating_map
 from egoskin.policies import load_policy
+from egoskin.progress import StatusLine
 from egoskin.report import metres
 
 PICTURE_SUFFIXES = (".png", ".svg", ".pdf")
-# In a file a line of progress is written this often [s].
-_FILE_INTERVAL = 10.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,39 +184,6 @@ def physics_rate(config: EnvConfig) -> str:
     return f"{1 / config.task.physics.timestep:g} Hz"
 
 
-class Progress:
-    """Says on stderr how far the episodes are, in a terminal or in a file.
-
-    Args:
-        hz: Control steps in a second.
-    """
-
-    def __init__(self, hz: float) -> None:
-        self._hz, self._shown = hz, 0.0
-        self._live = sys.stderr.isatty()
-
-    def __call__(self, step: int, running: int) -> None:
-        """Show one step; the arguments are those of ``on_step``."""
-        self._show(f"{step / self._hz:5.2f} s played, {running} still running")
-
-    def points(self, done: int, total: int) -> None:
-        """Show how many points of a map are done."""
-        self._show(f"map: {done} of {total} points")
-
-    def _show(self, text: str) -> None:
-        now = time.monotonic()
-        if not self._live and now - self._shown < _FILE_INTERVAL:
-            return
-        self._shown = now
-        start, end = ("\r", "\x1b[K") if self._live else ("", "\n")
-        print(f"{start}{text}{end}", end="", file=sys.stderr, flush=True)
-
-    def finish(self) -> None:
-        """Leave the line."""
-        if self._live:
-            print("\r\x1b[K", end="", file=sys.stderr)
-
-
 def main(args: list[str]) -> None:
     """Run the command."""
     config = tyro.cli(EvaluateConfig, args=args)
@@ -227,18 +192,23 @@ def main(args: list[str]) -> None:
     if config.standard != "run":
         env_config = standard_task(env_config, config.standard)
     check_mask(env_config, policy.skin, config.masked)
-    print(
-        f"playing {counted(config.episodes, 'episode')} of {config.policy}",
-        file=sys.stderr,
-        flush=True,
-    )
-    progress = Progress(env_config.task.physics.control_hz)
+    if config.map is not None:
+        check_map(env_config)
+    line = StatusLine(f"playing {counted(config.episodes, 'episode')}")
+    hz = env_config.task.physics.control_hz
+
+    def on_step(step: int, running: int) -> None:
+        line.show(f"{step / hz:.2f} s played, {running} episodes still running")
+
+    def on_point(done: int, total: int) -> None:
+        line.show(f"map: {done} of {total} points")
+
     bank: dict[str, Any] = {
         "bank_seed": config.bank_seed,
         "episodes": config.episodes,
         "num_workers": config.num_workers,
         "mask": config.masked,
-        "on_step": progress,
+        "on_step": on_step,
     }
     behaviour = checked = None
     substeps = config.check_substeps or env_config.task.physics.substeps
@@ -249,11 +219,11 @@ def main(args: list[str]) -> None:
         result = evaluate(policy, env_config, policy.skin, **bank)
     if config.check_substeps is not None:
         checked = evaluate(policy, finer, policy.skin, **bank)
-    progress.finish()
+    line.finish()
     trained = policy.env_config.standard
     played = trained if config.standard == "run" else config.standard
     title = (
-        f"{config.policy}: {policy.spec.frames:,} frames on standard {trained}; "
+        f"{config.policy}: {policy.policy_spec.frames:,} frames on standard {trained}; "
         f"standard {played}, bank {config.bank_seed} of "
         f"{counted(config.episodes, 'episode')}"
     )
@@ -267,7 +237,7 @@ def main(args: list[str]) -> None:
         "standard": played,
         "trained_on": trained,
         "bank_seed": config.bank_seed,
-        "frames": policy.spec.frames,
+        "frames": policy.policy_spec.frames,
         "mask": config.masked,
     }
     if behaviour is not None:
@@ -287,9 +257,9 @@ def main(args: list[str]) -> None:
             bank_seed=config.bank_seed,
             episodes=max(config.episodes // 4, 1),
             mask=config.masked,
-            on_point=progress.points,
+            on_point=on_point,
         )
-        progress.finish()
+        line.finish()
         draw_map(config.map, lines, title.removesuffix(", physics at "))
         content["map"] = [dataclasses.asdict(line) for line in lines]
         print(f"\n{config.map}: success against speed, tempo, height and direction")

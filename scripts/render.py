@@ -1,6 +1,7 @@
 """Render an episode: a film, and a contact sheet of the moments that tell it best.
 
-python scripts/render.py runs/NAME --bank-seed 0 --episode 7 --out dodge.mp4
+python scripts/render.py runs/NAME --longest-of 16 --out dodge.mp4
+python scripts/render.py runs/NAME --bank-seed 0 --episode 7 --standard run
 python scripts/render.py --hold --sensor.range 1 --out rigid.gif
 """
 
@@ -17,7 +18,7 @@ import os
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -35,8 +36,9 @@ except (AttributeError, ImportError, RuntimeError) as fault:
     )
     raise SystemExit(2) from None
 
-from egoskin.cli import clear_errors
+from egoskin.cli import check_counts, clear_errors, counted
 from egoskin.draws import check_seed
+from egoskin.evaluation import standard_task
 from egoskin.film import (
     FILM_SUFFIXES,
     check_path,
@@ -46,7 +48,14 @@ from egoskin.film import (
 )
 from egoskin.make import EnvConfig
 from egoskin.policies import load_policy
-from egoskin.rendering import CameraConfig, render_episode
+from egoskin.progress import StatusLine
+from egoskin.rendering import (
+    CameraConfig,
+    check_film,
+    painter_of,
+    record_episodes,
+    render_recording,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,6 +74,10 @@ class RenderConfig:
     """Seed of the bank of throws, as in evaluate.py."""
     episode: int = 0
     """Which episode of the bank."""
+    longest_of: int = 1
+    """Of this many episodes, from --episode on, show the one that lasts longest."""
+    standard: Literal["2", "1", "paper", "run"] = "2"
+    """Version of the standard throw; run: the throws and ends of the training."""
     seconds: float | None = None
     """Stop at this age at the latest [s]; None: the whole episode."""
     fps: float = 30.0
@@ -85,6 +98,9 @@ class RenderConfig:
         check_path(self.out, FILM_SUFFIXES)
         check_path(self.sheet_path, (".png",))
         check_seed(self.bank_seed, "bank_seed")
+        check_counts(self, "longest_of")
+        if self.episode < 0:
+            raise ValueError(f"episode must not be negative, got {self.episode}")
         if not 0 < self.slowdown <= 100:
             raise ValueError(f"slowdown must be in (0, 100], got {self.slowdown}")
         if self.policy is not None and self.env != EnvConfig():
@@ -108,25 +124,45 @@ def main(args: list[str]) -> None:
     else:
         policy = load_policy(config.policy)
         env_config, skin = policy.env_config, policy.skin
-    frames = render_episode(
-        env_config,
-        skin,
-        policy,
-        seed=config.bank_seed,
-        row=config.episode,
-        max_seconds=config.seconds,
-        fps=config.fps,
-        size=config.size,
-        camera=config.camera,
-        hold=config.hold,
-    )
+    if config.standard != "run" and config.policy is not None:
+        env_config = standard_task(env_config, config.standard)
+    hz = env_config.task.physics.control_hz
+    check_film(hz, config.fps, config.seconds)
+    # Whether it can be drawn is known before anything is played.
+    painter = painter_of(env_config, skin, size=config.size, camera=config.camera)
+    line = StatusLine(f"playing {counted(config.longest_of, 'episode')}")
+    with painter:
+        recordings = record_episodes(
+            env_config,
+            skin,
+            policy,
+            bank_seed=config.bank_seed,
+            first=config.episode,
+            episodes=config.longest_of,
+            hold=config.hold,
+            on_step=lambda step, running: line.show(
+                f"{step / hz:.2f} s played, {running} still running"
+            ),
+        )
+        recording = max(recordings, key=lambda recording: len(recording.states))
+        frames = render_recording(
+            painter,
+            env_config,
+            skin,
+            recording,
+            max_seconds=config.seconds,
+            fps=config.fps,
+            on_picture=lambda done, total: line.show(f"{done} of {total} pictures"),
+        )
     sheet = contact_sheet(frames)
     save_film(config.out, frames, config.fps / config.slowdown)
     save_picture(config.sheet_path, sheet)
+    line.finish()
     last = frames[-1]
     print(
-        f"episode {config.episode} of bank {config.bank_seed}: {last.time:.2f} s, ends "
-        f"with: {last.ending}; film {config.out}, contact sheet {config.sheet_path}"
+        f"episode {recording.row} of bank {config.bank_seed}: {last.time:.2f} s, "
+        f"{counted(last.num_avoided, 'ball')} avoided, ends with: {last.ending}; film "
+        f"{config.out}, contact sheet {config.sheet_path}"
     )
 
 

@@ -43,6 +43,7 @@ from egoskin.behaviour import behave
 from egoskin.checkpoint import write_file
 from egoskin.cli import check_output, clear_errors, counted
 from egoskin.draws import check_seed
+from egoskin.envs.standards import Standard
 from egoskin.evaluation import standard_task
 from egoskin.make import check_num_workers
 from egoskin.policies import Policy, load_policy
@@ -104,7 +105,7 @@ class Add:
         if not policies:
             raise ValueError(f"{self.run} has not been trained: nothing to store")
         policy = load_policy(policies[-1])
-        frames = policy.spec.frames
+        frames = policy.policy_spec.frames
         made = record(run, frames)
         label = run.config.env.sensor.label().replace("-", "_")
         folder = self.results / (self.name or f"{label}_seed{run.config.seed}")
@@ -112,7 +113,9 @@ class Add:
             raise ValueError(
                 f"{folder} holds a run of another configuration: choose a --name"
             )
-        evaluation = figures(policy, self.bank_seed, self.episodes, self.num_workers)
+        version = "1" if run.config.env.standard == "1" else "2"
+        bank = (self.bank_seed, self.episodes, self.num_workers)
+        evaluation = figures(policy, version, *bank)
         (folder / "policies").mkdir(parents=True, exist_ok=True)
         contents = {
             f"policies/{policies[-1].name}": policies[-1].read_bytes(),
@@ -150,9 +153,11 @@ class Repeat:
             frames = f"{run.record.frames:012d}"
             policy = load_policy(folder / "policies" / f"{frames}.safetensors")
             file = folder / f"evaluation_{frames}.json"
-            stored.append((file, run.evaluation, policy))
-        for file, old, policy in stored:
-            new = figures(policy, old["bank_seed"], old["episodes"], self.num_workers)
+            stored.append((file, run, policy))
+        for file, run, policy in stored:
+            old = run.evaluation
+            bank = (old["bank_seed"], old["episodes"], self.num_workers)
+            new = figures(policy, run.judged_on, *bank)
             write_file(file, _json(new))
             now, before = (100 * x["success"]["mean"] for x in (new, old))
             print(f"{file.parent}: success {now:.1f} %, was {before:.1f} %", flush=True)
@@ -187,12 +192,16 @@ class Write:
 
 
 def figures(
-    policy: Policy, bank_seed: int, episodes: int, num_workers: int | None
+    policy: Policy,
+    version: Standard,
+    bank_seed: int,
+    episodes: int,
+    num_workers: int | None,
 ) -> dict[str, Any]:
     """Return how a policy fares on a bank of standard throws, as it is stored."""
     result, behaviour = behave(
         policy,
-        standard_task(policy.env_config),
+        standard_task(policy.env_config, version),
         policy.skin,
         bank_seed=bank_seed,
         episodes=episodes,
@@ -200,6 +209,7 @@ def figures(
     )
     return {
         **dataclasses.asdict(result),
+        "standard": version,
         "bank_seed": bank_seed,
         "behaviour": dataclasses.asdict(behaviour),
     }

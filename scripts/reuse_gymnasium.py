@@ -4,6 +4,11 @@ python scripts/reuse_gymnasium.py       (needs `pip install "gymnasium[mujoco]"`
 
 The pattern for any environment: one transform of your own that says where the base,
 the joints and the objects are, then the sensors as they come.
+
+Several at once are a vector environment whose autoreset is DISABLED, as below, or
+``GymEnv(name, num_workers=4)``. Not ``GymEnv(name, num_envs=4)``: in TorchRL 0.14.1 it
+writes zeros for the last observation of each episode (and starts the next from it), so
+that the robot has no orientation there, and sensors say NaN.
 """
 
 from __future__ import annotations
@@ -23,9 +28,10 @@ import mujoco
 import numpy as np
 import torch
 import tyro
+from gymnasium.vector import AutoresetMode
 from torch import Tensor
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
-from torchrl.envs import Compose, GymEnv, StepCounter, TransformedEnv
+from torchrl.envs import Compose, GymWrapper, StepCounter, TransformedEnv
 
 from egoskin.chains import build_chain
 from egoskin.cli import clear_errors
@@ -107,28 +113,29 @@ class HumanoidState(RowTransform):
         return (*state, Binary(shape=torch.Size((*batch, 1)), dtype=torch.bool))
 
 
-def make_env(skin: Skin) -> TransformedEnv:
-    """Return Humanoid-v5 with a skin and a ball: it adds the key ``signal``."""
+def make_env(skin: Skin, num_envs: int) -> TransformedEnv:
+    """Return Humanoids with a skin and a ball, ``[num_envs]``: they add ``signal``."""
+    envs = gymnasium.make_vec(
+        "Humanoid-v5",
+        num_envs,
+        vectorization_mode="sync",
+        vector_kwargs={"autoreset_mode": AutoresetMode.DISABLED},
+        exclude_current_positions_from_observation=False,
+    )
+    sensor = FieldSensor(skin, build_chain(MODEL, "torso"), BALL, RANGE)
     return TransformedEnv(
-        GymEnv("Humanoid-v5", exclude_current_positions_from_observation=False),
-        Compose(
-            [
-                StepCounter(),
-                HumanoidState(),
-                FieldSensor(skin, build_chain(MODEL, "torso"), [BALL], RANGE),
-                Proximity(RANGE),
-            ]
-        ),
+        GymWrapper(envs),
+        Compose([StepCounter(), HumanoidState(), sensor, Proximity(sensor)]),
     )
 
 
 def main() -> None:
     """Run an episode of random actions and print what the skin feels of the ball."""
     skin = skin_of_rings()
-    env = make_env(skin)
+    env = make_env(skin, num_envs=1)
     torch.manual_seed(0)
     env.set_seed(0)
-    rollout = env.rollout(100)
+    rollout = env.rollout(100)[0]
     print(f"Humanoid-v5 with {len(skin)} sensors, a ball flying at it")
     print("time [s]  sensors in range  closest [m]  on")
     for step in range(0, len(rollout), 2):

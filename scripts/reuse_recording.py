@@ -26,10 +26,12 @@ from torch import Tensor
 
 from egoskin.cli import check_counts, clear_errors
 from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
+from egoskin.envs.throws import ThrowConfig
 from egoskin.robots import H1_2
 from egoskin.sensors import FieldSensor, Ray, RaySensor, place_sensors
 
-TASK = DodgeballConfig()
+# The first ball at once: a recording is short.
+TASK = DodgeballConfig(throws=ThrowConfig(first_delay=(0.0, 0.0)))
 KEYS = ("base_pose", "joint_pos", "object_pose", "object_active")
 STEP = 1 / TASK.physics.control_hz
 

@@ -93,8 +93,8 @@ def sensors(skin: Skin) -> Compose:
     beams = ("beams", "beams_detected")
     return Compose(
         [
-            FieldSensor(skin, chain, [BALL], RANGE),
-            RaySensor(skin, chain, [BALL], RANGE, Ray(), out_keys=beams),
+            FieldSensor(skin, chain, BALL, RANGE),
+            RaySensor(skin, chain, BALL, RANGE, Ray(), out_keys=beams),
         ]
     )
 

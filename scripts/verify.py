@@ -1,5 +1,8 @@
 """Verify that training is exact: whatever does not matter changes no bit.
 
+That is the number of workers, of physics threads and of learner threads, compiled or
+plain sensor kernels, how often there is a checkpoint, and a resume that changes them.
+
 python scripts/verify.py --iterations 3
 python scripts/verify.py --iterations 4 --sensor.coverage ray --num-envs 512
 """
@@ -17,8 +20,11 @@ import csv
 import dataclasses
 import hashlib
 import json
+import os
 import sys
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -28,15 +34,73 @@ import tyro
 
 from egoskin.agents.ppo import PPOConfig
 from egoskin.checkpoint import load_tensors
-from egoskin.cli import check_counts, clear_errors, counted
+from egoskin.cli import clear_errors, counted
+from egoskin.compilation import SETTING, can_compile
 from egoskin.make import EnvConfig
 from egoskin.runs import Run, TrainConfig, parse_config
 from egoskin.training import open_trainer, train
 
-# Workers, and the physics threads of each: results depend on neither.
-_SPLITS = ((1, 1), (2, 2), (4, 3))
+
+@dataclass(frozen=True, kw_only=True)
+class Machine:
+    """How a training is computed and kept: no result depends on it."""
+
+    workers: int
+    """Processes."""
+    physics: int
+    """Physics threads of each."""
+    learner: int
+    """Threads of the learner."""
+    compiled: bool
+    """Whether the sensors are compiled, where they can be."""
+    every: bool
+    """Whether there is a checkpoint after every rollout, or at the end alone."""
+
+    def __str__(self) -> str:
+        compiled = self.compiled and os.environ.get(SETTING) != "0" and can_compile()
+        parts = [
+            counted(self.workers, "worker"),
+            counted(self.physics, "physics thread"),
+            counted(self.learner, "learner thread"),
+            f"{'compiled' if compiled else 'plain'} kernels",
+            "a checkpoint each rollout" if self.every else "one checkpoint",
+        ]
+        return ", ".join(parts)
+
+    @property
+    def settings(self) -> dict[str, int | float]:
+        """Fields of a training's configuration."""
+        return {
+            "num_workers": self.workers,
+            "learner_threads": self.learner,
+            "checkpoint_interval": 1e-6 if self.every else 1e9,
+        }
+
+    @contextmanager
+    def kernels(self) -> Iterator[None]:
+        """Let sensors, here and in workers, be compiled or not."""
+        before = os.environ.get(SETTING)
+        if not self.compiled:
+            os.environ[SETTING] = "0"
+        try:
+            yield
+        finally:
+            os.environ.pop(SETTING, None)
+            if before is not None:
+                os.environ[SETTING] = before
+
+
+_MACHINES = (
+    Machine(workers=1, physics=1, learner=1, compiled=True, every=False),
+    Machine(workers=2, physics=2, learner=4, compiled=False, every=True),
+    Machine(workers=4, physics=3, learner=2, compiled=True, every=False),
+)
 # Divisors of an odd number of agents: rows of a worker that fill no vector.
-_ODD_SPLITS = ((1, 1), (3, 1), (5, 2))
+_ODD_MACHINES = (
+    Machine(workers=1, physics=1, learner=2, compiled=False, every=False),
+    Machine(workers=3, physics=1, learner=1, compiled=True, every=True),
+    Machine(workers=5, physics=2, learner=4, compiled=False, every=False),
+)
 
 # What a training does from some millions of frames on, it does here from the start.
 _LATE = PPOConfig(noise_correlation_start=0)
@@ -50,8 +114,6 @@ class VerifyConfig:
     """Rollouts to train; a resume is tried after half of them."""
     num_envs: int = 4096
     """Agents, a multiple of 4; an odd number just below is tried as well."""
-    learner_threads: int | None = None
-    """Threads of the learner; None: one for each core."""
     seed: int = 0
     """Seed of the trainings."""
     env: Annotated[EnvConfig, tyro.conf.arg(name="")] = field(default_factory=EnvConfig)
@@ -65,7 +127,6 @@ class VerifyConfig:
             raise ValueError(
                 f"num_envs must be a multiple of 4 from 16 on, got {self.num_envs}"
             )
-        check_counts(self, "learner_threads")
 
     @property
     def odd_num_envs(self) -> int:
@@ -74,65 +135,74 @@ class VerifyConfig:
 
 
 def run_hash(run: Run) -> str:
-    """Return a hash of a run's checkpoint and of its metrics but for times."""
+    """Return a hash of the values of a run: its checkpoint's tensors, its metrics.
+
+    Configuration, times and the order of fields are left out, so that it may be
+    compared with that of another version.
+    """
     digest = hashlib.sha256()
     tensors, header = load_tensors(run.checkpoint_path)
-    # When and how long is no result; the metrics follow, without times.
-    del header["wall_s"], header["starts"], tensors["log/metrics"]
-    digest.update(json.dumps(header, sort_keys=True).encode())
+    numbers = {key: header[key] for key in ("frames", "learning_rate")}
+    digest.update(json.dumps(numbers).encode())
     for name in sorted(tensors):
+        # The log is what follows.
+        if name.startswith("log/"):
+            continue
         value = tensors[name].contiguous()
         digest.update(f"{name} {value.dtype} {list(value.shape)}".encode())
         digest.update(value.reshape(-1).view(torch.uint8).numpy().tobytes())
     with open(run.path / "metrics.csv", newline="") as file:
         for row in csv.DictReader(file):
-            kept = {k: v for k, v in row.items() if not k.startswith("time/")}
+            kept = sorted((k, v) for k, v in row.items() if not k.startswith("time/"))
             digest.update(json.dumps(kept).encode())
     return digest.hexdigest()
 
 
-def whole(config: TrainConfig, num_threads: int) -> str:
+def whole(config: TrainConfig, machine: Machine) -> str:
     """Return the hash of an uninterrupted run."""
-    run = Run.create(config)
-    with open_trainer(run, num_threads) as trainer:
+    run = Run.create(dataclasses.replace(config, **machine.settings))
+    with machine.kernels(), open_trainer(run, machine.physics) as trainer:
         train(trainer)
     return run_hash(run)
 
 
-def resumed(config: TrainConfig, iterations: int) -> str:
-    """Return the hash of a run that lost its last rollout and was resumed."""
-    frames = config.frames_per_batch
-    run = Run.create(dataclasses.replace(config, total_frames=iterations * frames))
-    with open_trainer(run) as trainer:
+def resumed(config: TrainConfig, half: int, first: Machine, then: Machine) -> str:
+    """Return the hash of a run that lost its last rollout and went on elsewhere."""
+    frames = half * config.frames_per_batch
+    run = Run.create(dataclasses.replace(config, total_frames=frames, **first.settings))
+    with first.kernels(), open_trainer(run, first.physics) as trainer:
         train(trainer)
         # Logged, but in no checkpoint: as if the process had been killed now.
         run.log(trainer.iterate())
-    end = ["--resume", str(run.path), "--total-frames", str(config.total_frames)]
-    run = Run(run.path, parse_config(end))
-    with open_trainer(run) as trainer:
+    args = ["--resume", str(run.path), "--total-frames", str(config.total_frames)]
+    for name, value in then.settings.items():
+        args += [f"--{name.replace('_', '-')}", str(value)]
+    run = Run(run.path, parse_config(args))
+    with then.kernels(), open_trainer(run, then.physics) as trainer:
         train(trainer)
     return run_hash(run)
 
 
 def agree(config: TrainConfig, folder: Path, title: str, half: int) -> bool:
     """Print the hash of each way to train; return whether they are equal."""
-    odd = config.num_envs % 2
+    machines = _ODD_MACHINES if config.num_envs % 2 else _MACHINES
     print(f"{title}, {counted(config.num_envs, 'agent')}", flush=True)
     hashes = []
 
-    def show(what: str, value: str) -> None:
-        rows = counted(config.num_envs // workers, "row")
-        where = f"{counted(workers, 'worker')} x {rows}"
-        print(f"  {value[:32]}  {where}, {what}", flush=True)
+    def show(value: str, where: str) -> None:
+        print(f"  {value[:32]}  {where}", flush=True)
         hashes.append(value)
 
-    for workers, threads in _ODD_SPLITS if odd else _SPLITS:
-        name = f"{title}-{config.num_envs}-{workers}".replace(" ", "-")
-        split = dataclasses.replace(config, num_workers=workers, run_dir=folder / name)
-        show(counted(threads, "physics thread"), whole(split, threads))
-        if workers == 2:
-            again = dataclasses.replace(split, run_dir=folder / f"{name}-resumed")
-            show(f"resumed after {counted(half, 'rollout')}", resumed(again, half))
+    def at(name: object) -> TrainConfig:
+        place = f"{title}-{config.num_envs}-{name}".replace(" ", "-")
+        return dataclasses.replace(config, run_dir=folder / place)
+
+    for machine in machines:
+        show(whole(at(machine.workers), machine), str(machine))
+    _, first, then = machines
+    rollouts = counted(half, "rollout")
+    value = resumed(at("resumed"), half, first, then)
+    show(value, f"the second, gone on with after {rollouts} as the third")
     return len(set(hashes)) == 1
 
 
@@ -152,7 +222,6 @@ def main(args: list[str]) -> None:
                     env=env,
                     seed=config.seed,
                     num_envs=num_envs,
-                    learner_threads=config.learner_threads,
                     ppo=_LATE,
                 )
                 frames = config.iterations * base.frames_per_batch

@@ -26,11 +26,12 @@ from egoskin.approaches import (
     trace,
     unit_vectors,
 )
-from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
+from egoskin.envs.dodgeball import DodgeballEnv
 from egoskin.envs.throws import ThrowConfig
 from egoskin.robots import H1_2
 from egoskin.sensors import Field, Ray, Skin
 from egoskin.shapes import Sphere
+from throwing import TASK
 
 ROOT = Path(__file__).parents[1]
 BALL = Sphere(radius=0.15)
@@ -88,7 +89,7 @@ def test_distances_to_the_body_are_those_of_mujoco():
 
 
 def test_throws_fly_and_hit_as_they_do_in_the_simulation():
-    config, rows, seed = DodgeballConfig(), 24, 3
+    config, rows, seed = TASK, 24, 3
     env = DodgeballEnv(H1_2, config, num_envs=rows, seed=seed, hold=True)
     root, step = env.reset(), 0
     hit_at = torch.full((rows,), -1)

@@ -9,21 +9,24 @@ import torch
 from tensordict import TensorDict
 
 from egoskin.behaviour import Group, Watcher, behave
+from egoskin.draws import held_out
 from egoskin.envs.dodgeball import DodgeballConfig
-from egoskin.envs.throws import ThrowConfig, Thrower
+from egoskin.envs.throws import Thrower
 from egoskin.evaluation import Episodes, evaluate, play_bank
 from egoskin.make import EnvConfig
 from egoskin.robots import H1_2
 from egoskin.sensors.config import SensorConfig
+from throwing import AT_ONCE
 
 JOINTS = len(H1_2.joints)
 BLIND = SensorConfig(coverage="none")
 # Half of these balls miss the robot held rigid, so that later ones come as well.
-BESIDE = ThrowConfig(aim="box", box_half_width=0.8, interval=(0.9, 1.3))
+BESIDE = replace(AT_ONCE, aim="box", box_half_width=0.8, interval=(0.9, 1.3))
 LAST = 64
 
 
 def make(**task) -> EnvConfig:
+    task = {"throws": AT_ONCE, **task}
     return EnvConfig(task=DodgeballConfig(**task), sensor=BLIND)
 
 
@@ -59,6 +62,7 @@ def test_groups_of_a_kind_share_out_all_throws(rigid):
     groups = watcher.groups()
     # No link is aimed at by throws into a box.
     assert list(groups) == [
+        "number of the ball",
         "direction",
         "height aimed at",
         "speed at arrival",
@@ -85,7 +89,7 @@ def test_later_balls_are_split_by_the_time_since_the_throw_before(rigid):
     count = arrived.shape[1]
     row = torch.arange(LAST).repeat_interleave(count)
     thrower = Thrower(config.task.throws, H1_2, config.task.physics.timestep)
-    draw = thrower.draw(0, row, row * 0, torch.arange(count).repeat(LAST))
+    draw = thrower.draw(held_out(0), row, row * 0, torch.arange(count).repeat(LAST))
     # A ball's interval is the time to the next one, in whole control steps.
     gap = (draw.interval.reshape(LAST, count) * 60).round() / 60
     short = later[0]
@@ -94,8 +98,25 @@ def test_later_balls_are_split_by_the_time_since_the_throw_before(rigid):
     assert short.later_balls == int((arrived & (gap <= 1.33)).sum()) > 10
 
 
+def test_groups_by_the_number_of_the_ball_by_hand(rigid):
+    watcher, _, _ = rigid
+    first, *later = watcher.groups()["number of the ball"]
+    assert [g.name for g in (first, *later)] == ["first", "second", "third", "later"]
+    # Every episode has a first ball, and no other group has one.
+    assert (first.episodes, first.later_balls, first.later_hits) == (LAST, 0, None)
+    assert first.first_hits == pytest.approx(watcher._hit[:, 0].float().mean().item())
+    columns = (slice(1, 2), slice(2, 3), slice(3, None))
+    for group, column in zip(later, columns, strict=True):
+        assert (group.episodes, group.success, group.first_hits) == (0, None, None)
+        arrived, hit = watcher._arrived[:, column], watcher._hit[:, column]
+        assert group.later_balls == int(arrived.sum())
+        if group.later_balls:
+            assert group.later_hits == pytest.approx(int(hit.sum()) / arrived.sum())
+    assert later[0].later_balls > 10
+
+
 def test_a_sector_of_throws_is_one_quarter():
-    throws = replace(ThrowConfig(), azimuth_deg=(50.0, 130.0))
+    throws = replace(AT_ONCE, aim="body", azimuth_deg=(50.0, 130.0))
     groups = Watcher(make(throws=throws), 0, 16).groups()
     assert [g.episodes for g in groups["direction"]] == [0, 16, 0, 0]
     front = groups["direction"][0]
@@ -118,7 +139,8 @@ def test_heights_and_speeds_are_split_at_their_bounds():
     watcher = Watcher(config, 3, 256)
     thrower = Thrower(config.task.throws, H1_2, config.task.physics.timestep)
     row = torch.arange(256)
-    height, speed = thrower.at_standing_robot(thrower.draw(3, row, row * 0, row * 0))
+    draw = thrower.draw(held_out(3), row, row * 0, row * 0)
+    height, speed = thrower.at_standing_robot(draw)
     groups = watcher.groups()
     expected = [
         int((height <= 0.9).sum()),
@@ -144,6 +166,7 @@ def state(n: int, **values) -> TensorDict:
             "base_pose": pose.repeat(n, 1),
             "joint_pos": torch.from_numpy(H1_2.default_joint_pos).float().repeat(n, 1),
             "joint_vel": torch.zeros(n, JOINTS),
+            "base_lin_vel_w": torch.zeros(n, 3),
             "displacement_w": torch.zeros(n, 2),
             "tactile": torch.ones(n, len(H1_2.links), dtype=torch.bool),
             "power": torch.zeros(n, 1),
@@ -152,6 +175,7 @@ def state(n: int, **values) -> TensorDict:
             "object_arrived": never.expand(n, 2),
             "self_contact": never,
             "terminated": never,
+            "first_throw_step": torch.zeros(n, 1, dtype=torch.int64),
             **values,
         },
         batch_size=[n],
@@ -181,6 +205,67 @@ def test_motion_by_hand():
     assert motion.foot_slip == pytest.approx(0.6, rel=1e-3)
     assert motion.airborne == 0.5
     assert motion.self_contact == 0.5
+
+
+def test_waiting_by_hand():
+    # Row 0 waits for 40 steps, row 1 for 10, and row 2 falls at its 35th of 50.
+    wait = torch.tensor([[40], [10], [50]])
+    throws = replace(AT_ONCE, first_delay=(0.0, 1.0))
+    watcher = Watcher(make(throws=throws), 0, 3)
+    for step in range(1, 61):
+        after = state(
+            3,
+            # 3, 4 and 12 m/s over the floor: 5 m/s; what goes up does not count.
+            base_lin_vel_w=torch.tensor([[3.0, 4, 12], [9, 9, 9], [0, 0, 0]]),
+            power=torch.tensor([[float(step)], [999], [7]]),
+            first_throw_step=wait,
+            terminated=torch.tensor([[False], [False], [step == 35]]),
+        )
+        watcher(state(3), after, torch.tensor([True, True, step <= 35]))
+    waiting = watcher.waiting()
+    # From 0.5 s, step 30, on: row 0 at 30 to 40, row 2 at 30 to 34; row 1 not at all.
+    assert waiting.base_speed == pytest.approx(11 * 5 / 16)
+    assert waiting.power == pytest.approx((11 * 35 + 5 * 7) / 16)
+    assert waiting.fallen == pytest.approx(1 / 3)
+    # The fall before the throw is a failure of that episode.
+    assert watcher._failed.tolist() == [False, False, True]
+
+
+def test_nobody_waits_for_a_ball_that_is_thrown_at_the_start(rigid):
+    assert rigid[0].waiting() is None
+
+
+def test_success_is_counted_from_the_first_throw():
+    # The limit is 180 steps after it: at 20 + 180 it fails, at 20 + 181 no more.
+    wait = torch.full((3, 1), 20)
+    throws = replace(AT_ONCE, first_delay=(0.0, 1.0))
+    watcher = Watcher(make(throws=throws), 0, 3)
+    for step in range(1, 206):
+        ends = torch.tensor([[step == 200], [step == 201], [False]])
+        after = state(
+            3,
+            first_throw_step=wait,
+            terminated=ends,
+        )
+        going = torch.tensor([step <= 200, step <= 201, True])
+        watcher(state(3), after, going)
+    assert watcher._failed.tolist() == [True, False, False]
+
+
+def test_balls_after_a_delay_are_those_that_the_environment_counts():
+    config = make(throws=replace(BESIDE, first_delay=(0.3, 1.1)))
+    skin = config.skin.build(H1_2)
+    watcher = Watcher(config, 1, 32)
+    bank = {"bank_seed": 1, "episodes": 32}
+    played = play_bank(None, config, skin, **bank, hold=True, watch=watcher)
+    arrived, avoided = watcher._arrived, watcher._arrived & ~watcher._hit
+    for counted, seen in ((played.arrived, arrived), (played.avoided, avoided)):
+        assert torch.equal(seen[:, 0].long(), counted[:, 0].long())
+        assert torch.equal(seen[:, 1:].sum(1), counted[:, 1].long())
+    assert int(arrived[:, 1:].sum()) > 10
+    # Held rigid it does not move; it still pays for holding on to its pose or not.
+    assert watcher.waiting().base_speed == pytest.approx(0, abs=1e-6)
+    assert watcher.waiting().fallen == 0
 
 
 def test_a_foot_that_rolls_over_its_toes_does_not_slide():

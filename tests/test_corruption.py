@@ -13,7 +13,7 @@ from tensordict import TensorDict
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
+from egoskin.envs.dodgeball import DodgeballEnv
 from egoskin.robots import H1_2
 from egoskin.sensors import FieldSensor, Proximity, place_sensors
 from egoskin.sensors.corruption import Corruption, Moment, corrupt
@@ -30,6 +30,7 @@ from egoskin.sensors.imperfections import (
     SampleAndHold,
 )
 from egoskin.sensors.presets import PRESETS
+from throwing import TASK
 
 INF, NAN = math.inf, math.nan
 DT = 0.01
@@ -366,7 +367,7 @@ def test_beams_and_sensors_are_read_alike():
 # --- the transform ------------------------------------------------------------------
 
 SKIN = place_sensors(H1_2, 12, seed=0)
-BALLS = DodgeballConfig().throws.balls
+BALLS = TASK.throws.balls
 
 
 @pytest.mark.parametrize("preset", PRESETS.values(), ids=PRESETS)
@@ -374,7 +375,7 @@ def test_presets_run_in_the_task(preset):
     sensor = FieldSensor(SKIN, H1_2.chain, BALLS, 6.0)
     corruption = Corruption(preset(), dt=1 / 60, seed=1)
     env = TransformedEnv(
-        DodgeballEnv(H1_2, DodgeballConfig(), num_envs=6, seed=0),
+        DodgeballEnv(H1_2, TASK, num_envs=6, seed=0),
         Compose([sensor, corruption, Proximity(6.0, in_keys=["reading"])]),
     )
     check_env_specs(env)

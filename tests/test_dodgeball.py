@@ -17,17 +17,21 @@ from egoskin.envs.rewards import TERMS, RewardConfig, reward_terms
 from egoskin.envs.throws import ThrowConfig
 from egoskin.robots import H1_2
 from egoskin.surface import sample_surface
+from throwing import AT_ONCE
 
 JOINTS = len(H1_2.joints)
 DEFAULT = torch.from_numpy(H1_2.default_joint_pos).float()
+# First balls at different times.
+SOON = replace(AT_ONCE, first_delay=(0.0, 0.5))
 # Balls that fly to a point 50 m up and come back never, or far away.
-MISS = ThrowConfig(aim="box", box_height=(50.0, 50.0), flight="straight")
+MISS = replace(AT_ONCE, aim="box", box_height=(50.0, 50.0))
 AWAY = (30.0, 0.0, 5.0)
 
 
 def make(num_envs: int, **options) -> DodgeballEnv:
-    """An environment; task options by name, e.g. ``throws``."""
+    """An environment; task options by name, e.g. ``throws``. A ball comes at once."""
     own = {"seed", "row_offset", "num_threads", "hold"}
+    options = {"throws": AT_ONCE, **options}
     kwargs = {k: options.pop(k) for k in own & set(options)}
     return DodgeballEnv(H1_2, DodgeballConfig(**options), num_envs=num_envs, **kwargs)
 
@@ -79,6 +83,7 @@ def names(flags: torch.Tensor) -> set[str]:
 
 def test_the_environment_keeps_its_specs():
     check_env_specs(make(6))
+    check_env_specs(make(6, throws=ThrowConfig()))
     check_env_specs(make(1, throws=ThrowConfig(num_balls=3, on_ground="bounce")))
 
 
@@ -88,7 +93,7 @@ def test_the_environment_keeps_its_specs():
 @pytest.fixture(scope="module")
 def whole_run() -> TensorDict:
     """150 steps of 32 rows in one environment."""
-    return run(make(32, seed=3), wild_actions(32))
+    return run(make(32, seed=3, throws=SOON), wild_actions(32))
 
 
 def test_rows_end_at_different_steps(whole_run):
@@ -103,26 +108,33 @@ def test_rows_end_at_different_steps(whole_run):
 def test_rows_do_not_depend_on_how_they_are_split(whole_run, split):
     actions, parts, offset = wild_actions(32), [], 0
     for rows in split:
-        env = make(rows, seed=3, row_offset=offset)
+        env = make(rows, seed=3, row_offset=offset, throws=SOON)
         parts.append(run(env, actions[:, offset : offset + rows]))
         offset += rows
     assert_same_bits(torch.cat(parts, 1), whole_run)
 
 
 def test_rows_do_not_depend_on_the_number_of_threads(whole_run):
-    again = run(make(32, seed=3, num_threads=2), wild_actions(32)[:60])
+    again = run(make(32, seed=3, num_threads=2, throws=SOON), wild_actions(32)[:60])
     assert_same_bits(again, whole_run[:60])
 
 
 def test_another_seed_gives_other_episodes(whole_run):
-    other = run(make(32, seed=4), wild_actions(32)[:2])
-    for key in ("base_pose", "object_pose"):
-        rows = (other["next", key] != whole_run[:2]["next", key]).flatten(2)
-        assert rows.any(-1).all()
+    other = run(make(32, seed=4, throws=SOON), wild_actions(32)[:31])["next"]
+    same = whole_run[:31]["next"]
+    assert (other["base_pose"] != same["base_pose"]).any(-1).all()
+    # After half a second the first ball is in the air everywhere.
+    assert other["object_active"][-1].any(-1).all()
+    assert (
+        (other["object_pose"][-1] != same["object_pose"][-1]).flatten(1).any(-1).all()
+    )
+    # One of 31 steps is that of the other seed by chance.
+    waits = other["first_throw_step"] != same["first_throw_step"]
+    assert waits.float().mean() > 0.8
 
 
 def test_set_seed_starts_the_draws_again(whole_run):
-    env = make(32, seed=99)
+    env = make(32, seed=99, throws=SOON)
     run(env, wild_actions(32)[:5])
     env.set_seed(3, static_seed=True)
     assert_same_bits(run(env, wild_actions(32)[:5]), whole_run[:5])
@@ -130,7 +142,8 @@ def test_set_seed_starts_the_draws_again(whole_run):
 
 @pytest.mark.parametrize("target_velocity", ["zero", "finite_difference"])
 def test_a_saved_state_continues_bit_for_bit(target_velocity):
-    options = {"physics": PhysicsConfig(target_velocity=target_velocity), "seed": 3}
+    physics = PhysicsConfig(target_velocity=target_velocity)
+    options = {"physics": physics, "throws": SOON, "seed": 3}
     actions = wild_actions(32)
     first = make(32, **options)
     before = run(first, actions[:40])
@@ -198,6 +211,133 @@ def test_an_episode_starts_standing_at_the_origin_with_a_ball_in_the_air():
         assert not root[key].any()
     assert (root["object_active"] == torch.tensor([True, False])).all()
     assert (root["object_pose"][:, 0, 2] >= 2).all()
+
+
+def waiting_for(env: DodgeballEnv) -> torch.Tensor:
+    """Steps that the draws of episode 0 say to wait for the first ball."""
+    row = torch.arange(env.batch_size[0])
+    return (60 * env.thrower.first_delay(env._seed, row, row * 0)).round().long()
+
+
+def test_no_ball_is_in_play_before_the_first_is_thrown_at_the_step_drawn():
+    throws = replace(MISS, first_delay=(0.1, 0.5))
+    env = make(64, hold=True, throws=throws)
+    root, delay = env.reset(), waiting_for(env)
+    # .1 to .5 s at 60 Hz
+    assert set(delay.tolist()) <= set(range(6, 31))
+    assert delay.unique().numel() > 15
+    parked = root["object_pose"].clone()
+    active = []
+    for age in range(31):
+        assert torch.equal(root["first_throw_step"][:, 0], delay)
+        thrown = delay <= age
+        assert torch.equal(root["object_active"].any(-1), thrown)
+        # The other ball waits; both do until then, out of reach and at rest.
+        assert not root["object_active"][:, 1].any()
+        assert torch.equal(root["object_pose"][~thrown], parked[~thrown])
+        assert not root["object_lin_vel_w"][~thrown].any()
+        new = delay == age
+        assert (root["object_pose"][new, 0, 2] >= 2).all()
+        assert not root["balls_arrived"].any()
+        active.append(root["object_active"][:, 0].clone())
+        _, root = advance(env, root)
+    assert torch.stack(active).sum(0).tolist() == (31 - delay).tolist()
+    assert (parked[..., 2] > 900).all()
+
+
+def test_the_throws_are_the_same_whatever_the_delay():
+    # Held robots: what is thrown at does not move.
+    throws = replace(MISS, interval=(0.2, 0.4))
+    at_once, late = (
+        make(16, hold=True, throws=replace(throws, first_delay=delay))
+        for delay in ((0.0, 0.0), (0.2, 0.6))
+    )
+    first = [run(e, torch.zeros(100, 16, JOINTS))["root"] for e in (at_once, late)]
+    delay = waiting_for(late)
+    assert delay.unique().numel() > 8
+    for row in range(16):
+        # The first action's root is of step 1.
+        wait = int(delay[row])
+        one, other = first[0][: 100 - wait, row], first[1][wait:, row]
+        for key in ("object_pose", "object_lin_vel_w", "object_active"):
+            torch.testing.assert_close(other[key], one[key], atol=1e-4, rtol=1e-5)
+
+
+def test_the_age_limit_and_the_counts_begin_with_the_first_throw(chest):
+    throws = replace(MISS, first_delay=(0.1, 0.2))
+    env = make(8, hold=True, throws=throws, episode_length_s=0.5)
+    root, delay = env.reset(), waiting_for(env)
+    assert delay.unique().numel() > 2
+    for age in range(1, 44):
+        if (root["episode_step"][:, 0] < age - 1).all():
+            break
+        step, root = advance(env, root)
+        own = step["episode_step"][:, 0] == age
+        # .5 s after the first throw.
+        assert torch.equal(step["truncated"][own, 0], (age == delay + 30)[own])
+        assert not step["terminated"].any()
+    assert age > int(delay.max()) + 30
+
+    # A ball is the first of its episode however late it comes.
+    env = make(8, hold=True, throws=throws)
+    root, delay = env.reset(), waiting_for(env)
+    for _ in range(12):
+        step, root = advance(env, root)
+        assert not step["done"].any()
+    assert (env.simulation_state()["is_first"] == torch.tensor([True, False])).all()
+    touch(env, root, chest)
+    step, _ = advance(env, root)
+    assert step["hit"].all()
+    assert (step["balls_arrived"] == torch.tensor([1.0, 0])).all()
+
+
+def test_a_robot_that_falls_before_the_first_throw_starts_again_with_a_wait():
+    env = make(8, throws=replace(AT_ONCE, first_delay=(5.0, 6.0)))
+    actions, root = wild_actions(8), env.reset()
+    delay = root["first_throw_step"].clone()
+    ended = torch.zeros(8, dtype=torch.bool)
+    for action in actions:
+        step, root = advance(env, root, 2 * action)
+        assert not step["object_active"].any()
+        done = step["done"][:, 0]
+        assert step["fallen"][done].all()
+        # The end is told with the wait it ended in.
+        assert (step["first_throw_step"][~ended] == delay[~ended]).all()
+        ended |= done
+    assert ended.all()
+    assert (root["first_throw_step"] != delay).float().mean() > 0.7
+    assert not root["balls_arrived"].any()
+
+
+def test_a_partial_reset_draws_the_wait_of_those_rows_alone():
+    env = make(6, hold=True, throws=replace(MISS, first_delay=(0.1, 0.5)))
+    root = run(env, torch.zeros(10, 6, JOINTS))[-1]["root"]
+    mask = torch.tensor([False, True, False, False, True, False])
+    after = env.reset(root.clone().set("_reset", mask[:, None]))
+    row = torch.arange(6)
+    drawn = env.thrower.first_delay(0, row, mask.long())
+    expected = (60 * drawn).round().long()[:, None]
+    assert torch.equal(after["first_throw_step"], expected)
+    assert not after["object_active"][mask].any()
+    for _ in range(30):
+        step, after = advance(env, after)
+    flown = step["object_active"][:, 0]
+    assert flown.all()
+
+
+def test_a_state_saved_during_the_wait_continues_bit_for_bit():
+    options = {"throws": replace(AT_ONCE, first_delay=(0.2, 0.6)), "seed": 3}
+    actions = wild_actions(32)
+    first = make(32, **options)
+    before = run(first, actions[:11])
+    waiting = ~before[-1]["root", "object_active"].any(-1)
+    assert waiting.all()
+    saved, root = first.simulation_state(), before[-1]["root"].clone()
+    after = run(first, actions[11:60], root.clone())
+    assert after[-1]["next", "object_active"].any(-1).float().mean() > 0.8
+    second = make(32, **options)
+    second.load_simulation_state(saved)
+    assert_same_bits(run(second, actions[11:60], root.clone()), after)
 
 
 # --- diverged rows --------------------------------------------------------------

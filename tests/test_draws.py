@@ -9,7 +9,10 @@ from hypothesis import strategies as st
 
 from egoskin.draws import (
     Stream,
+    check_seed,
     halfwords,
+    held_out,
+    offset_seed,
     philox,
     random_words,
     standard_normal,
@@ -116,12 +119,14 @@ def test_seed_stream_row_episode_and_counter_all_matter():
         draw(rows, seed=8),
         draw(rows, stream=Stream.START),
         draw(rows, stream=Stream.SENSOR),
+        draw(rows, stream=Stream.FIRST_DELAY),
+        draw(rows, seed=held_out(7)),
         draw(rows + 64),
         draw(rows, episode=1),
         draw(rows, counter=1),
     ]
     numbers = torch.stack(variants).flatten()
-    # 2240 draws of 24 bits: 0.15 pairs are expected to agree by chance.
+    # 2880 draws of 24 bits: 0.25 pairs are expected to agree by chance.
     assert len(numbers.unique()) >= len(numbers) - 2
 
 
@@ -150,10 +155,55 @@ def test_numbers_of_neighbours_are_uncorrelated():
         assert abs(12 * (a * b).mean()) < 5 / n**0.5
 
 
-@pytest.mark.parametrize("seed", [-1, 2**32])
+@pytest.mark.parametrize("seed", [-1, 2**33, 2**33 + 5, 3 * 2**32])
 def test_seed_outside_32_bits_is_refused(seed):
     with pytest.raises(ValueError, match=r"seed must be in \[0, 2\*\*32\), got"):
         draw([0], seed=seed)
+
+
+@pytest.mark.parametrize("seed", [-1, 2**32, 2**32 + 7, 2**33])
+def test_a_user_may_not_choose_a_held_out_seed(seed):
+    for check in (check_seed, held_out):
+        with pytest.raises(ValueError, match=r"seed must be in \[0, 2\*\*32\), got"):
+            check(seed)
+
+
+# --- held-out seeds -----------------------------------------------------------------
+
+
+@given(WORD, WORD, WORD, WORD, st.sampled_from(list(Stream)))
+def test_held_out_draws_have_a_key_that_no_seed_of_a_training_has(
+    seed, row, episode, counter, stream
+):
+    # Fixed for good, as above: of the key's second word, which holds the stream, bit
+    # 16 is set. Words of different keys are those of different generators.
+    names = [torch.tensor([x]) for x in (row, episode, counter, 1)]
+    got = random_words(held_out(seed), stream, *names)[:, 0]
+    counters = torch.tensor([row, episode, counter, 1])
+    assert torch.equal(got, philox(counters, (seed, stream + 2**16)))
+    assert not torch.equal(got, random_words(seed, stream, *names)[:, 0])
+    # All streams there are, and many more, stay below that bit.
+    assert max(Stream) < 2**16
+
+
+def test_held_out_draws_are_uncorrelated_with_those_of_the_same_seed():
+    n = 2**16
+    rows = torch.arange(n)
+    own, other = (draw(rows, seed=s).double() - 0.5 for s in (7, held_out(7)))
+    neighbour = draw(rows, seed=held_out(8)).double() - 0.5
+    for one, two in ((own, other), (other, neighbour)):
+        for a, b in zip(one.T, two.T, strict=True):
+            # The correlation of n independent pairs has standard deviation 1/sqrt(n).
+            assert abs(12 * (a * b).mean()) < 5 / n**0.5
+    assert other.mean().abs() < 5 * (1 / 12 / (5 * n)) ** 0.5
+
+
+@given(WORD, WORD)
+def test_another_seed_is_held_out_where_the_first_is(seed, offset):
+    expected = (seed + offset) % 2**32
+    assert offset_seed(seed, offset) == expected
+    assert offset_seed(held_out(seed), offset) == held_out(expected)
+    assert offset_seed(seed, 0) == seed
 
 
 # --- words, halves of words and normal numbers --------------------------------------

@@ -9,16 +9,21 @@ import pytest
 import torch
 
 from egoskin.envs.dodgeball import DodgeballConfig
-from egoskin.envs.throws import ThrowConfig
+from egoskin.envs.standards import training_task
+from egoskin.envs.throws import ThrowConfig, Thrower
 from egoskin.evaluation import (
     Episodes,
     mean_estimate,
     play_bank,
     standard_task,
     summarize,
+    throw_seed,
     wilson,
 )
 from egoskin.make import EnvConfig
+from egoskin.sensors import Skin
+from egoskin.sensors.config import SensorConfig
+from throwing import TASK
 
 
 def test_wilson_interval_by_hand():
@@ -66,6 +71,8 @@ def test_figures_of_six_episodes_by_hand():
     )
     result = summarize(played, rigid, DodgeballConfig())
     assert result.success.mean == pytest.approx(2 / 6)
+    # 5 s are 300 steps: only the one that lasts.
+    assert result.success_5s.mean == pytest.approx(1 / 6)
     shares = (
         result.ended_by_ball,
         result.ended_by_fall,
@@ -97,6 +104,23 @@ def test_success_is_read_at_the_age_of_the_task():
     assert early.success.mean == early.ended_by_ball == 0.5
 
 
+def test_an_end_before_the_first_throw_is_a_failure_that_survived_nothing():
+    # 30 steps before the first throw, at it, and one step after.
+    played = Episodes(
+        steps=torch.tensor([-30, 0, 1, 600]),
+        hit=flags(0, 0, 0, 0),
+        fallen=flags(1, 1, 1, 0),
+        diverged=flags(0, 0, 0, 0),
+        self_contact=flags(0, 0, 0, 0),
+        arrived=torch.zeros(4, 2),
+        avoided=torch.zeros(4, 2),
+    )
+    result = summarize(played, played, DodgeballConfig())
+    assert result.success.mean == result.success_5s.mean == 1 / 4
+    assert result.ended_by_fall == 3 / 4
+    assert result.survival_time.mean == pytest.approx((0 + 0 + 1 + 600) / 4 / 60)
+
+
 def test_nothing_arrived_is_not_a_share():
     none = torch.zeros(1, dtype=torch.bool)
     empty = Episodes(
@@ -111,7 +135,10 @@ def test_nothing_arrived_is_not_a_share():
     assert summarize(empty, empty, DodgeballConfig()).avoided.first_ball is None
 
 
-def test_the_standard_throw_replaces_the_throw_of_the_run():
+@pytest.mark.parametrize(
+    ("version", "aim"), [("2", "skin"), ("1", "body"), ("paper", "skin")]
+)
+def test_the_standard_throw_replaces_the_throw_of_the_run(version, aim):
     own = ThrowConfig(lead=0.0, flight="straight", speed=(1.0, 2.0))
     task = DodgeballConfig(
         throws=own,
@@ -120,16 +147,36 @@ def test_the_standard_throw_replaces_the_throw_of_the_run():
         success_s=1.0,
         start_joint_noise=0.5,
     )
-    standard = standard_task(EnvConfig(task=task))
+    standard = standard_task(EnvConfig(task=task), version)
     assert standard.task.success_s == 3.0
     assert standard.task.start_joint_noise == DodgeballConfig().start_joint_noise
     assert not standard.task.self_contact_ends
-    assert standard.task.throws == ThrowConfig()
+    # The first ball comes at the start, in all of them.
+    assert standard.task.throws == ThrowConfig(first_delay=(0.0, 0.0), aim=aim)
     assert standard.task.action_scale == 0.3
+    assert standard_task(EnvConfig(task=task)) == standard_task(EnvConfig(), "2")
 
 
-def make_case() -> dict:
-    config = standard_task(EnvConfig())
+@pytest.mark.parametrize(
+    ("version", "expected"), [("2", 2**32 + 5), ("1", 5), ("paper", 2**32 + 5)]
+)
+def test_no_training_meets_the_throws_of_a_bank_but_those_of_version_1(
+    version, expected
+):
+    assert throw_seed(standard_task(EnvConfig(), version), 5) == expected
+    # Throws of a run's own are held out as well, unless they are version 1's.
+    trained = EnvConfig(task=training_task(version, DodgeballConfig()))
+    assert throw_seed(trained, 5) == expected
+    other = dataclasses.replace(trained.task, success_s=2.0)
+    assert throw_seed(EnvConfig(task=other), 5) == 2**32 + 5
+
+
+def skin_of(config: EnvConfig) -> Skin:
+    return config.skin.build(config.robot_config)
+
+
+def make_case(version="2") -> dict:
+    config = standard_task(EnvConfig(), version)
     return {
         "config": config,
         "skin": config.skin.build(config.robot_config),
@@ -158,13 +205,80 @@ def test_a_bank_goes_the_same_way_with_1_2_and_4_workers():
             one, two = getattr(first, field.name), getattr(other, field.name)
             assert torch.equal(one, two), field.name
     assert len(first.steps) == 64
-    # Every standard throw meets a robot that does not move.
+
+
+@pytest.mark.parametrize("version", ["2", "1"])
+def test_every_standard_throw_meets_a_robot_that_does_not_move(version):
+    case = make_case(version)
     rigid = play_bank(None, **case, bank_seed=3, num_workers=1, hold=True)
-    assert summarize(first, rigid, DodgeballConfig()).rigid_success <= 0.01
+    assert summarize(rigid, rigid, DodgeballConfig()).rigid_success <= 0.01
+
+
+def delayed(delay: tuple[float, float], **throws) -> EnvConfig:
+    throws = ThrowConfig(first_delay=delay, **throws)
+    sensor = SensorConfig(coverage="none")
+    return EnvConfig(task=DodgeballConfig(throws=throws), sensor=sensor)
+
+
+@pytest.mark.parametrize("num_workers", [1, 2])
+def test_episodes_count_from_the_first_throw_whatever_the_delay(num_workers):
+    # The rigid robot stands where it stands, and meets the same throws.
+    bank = {"bank_seed": 3, "episodes": 64, "hold": True, "num_workers": num_workers}
+    at_once, late = (
+        play_bank(None, config, skin_of(config), **bank)
+        for config in (delayed((0.0, 0.0)), delayed((0.5, 1.5)))
+    )
+    for field in dataclasses.fields(Episodes):
+        one, other = getattr(at_once, field.name), getattr(late, field.name)
+        assert torch.equal(one, other), field.name
+    assert at_once.hit.all()
+
+
+def test_an_episode_lasts_its_whole_length_after_the_latest_first_throw():
+    # Balls to a point 50 m up.
+    config = delayed((0.1, 0.4), aim="box", box_height=(50.0, 50.0))
+    task = dataclasses.replace(config.task, episode_length_s=0.5)
+    config = dataclasses.replace(config, task=task)
+    bank = {"bank_seed": 0, "episodes": 16, "hold": True, "num_workers": 1}
+    played = play_bank(None, config, skin_of(config), **bank)
+    assert (played.steps == 30).all()
+    assert not (played.hit | played.fallen | played.diverged).any()
+
+
+class Still(torch.nn.Module):
+    """The same action at every step."""
+
+    def __init__(self, action: torch.Tensor) -> None:
+        super().__init__()
+        self.action = action
+
+    def forward(self, td):
+        return td.set("action", self.action.expand(len(td), -1))
+
+
+def test_a_fall_before_the_first_throw_is_a_failure():
+    config = delayed((4.0, 6.0))
+    # Hips and knees drive the robot to the ground.
+    action = torch.tensor(
+        [-2.0 * ("hip_pitch" in name) for name in config.robot_config.joints]
+    )
+    bank = {"bank_seed": 0, "episodes": 8, "num_workers": 1}
+    played = play_bank(Still(action), config, skin_of(config), **bank)
+    assert played.fallen.all()
+    assert not played.arrived.any()
+    row = torch.arange(8)
+    thrower = Thrower(config.task.throws, config.robot_config, 1 / 120)
+    delay = thrower.first_delay(throw_seed(config, 0), row, row * 0)
+    fell_at = played.steps / 60 + delay
+    assert (played.steps < 0).all()
+    assert ((fell_at > 0.2) & (fell_at < 2.5)).all()
+    result = summarize(played, played, config.task)
+    assert result.success.mean == 0
+    assert result.survival_time.mean == 0
 
 
 def test_ends_by_self_contact_are_told_apart():
-    config = EnvConfig(task=DodgeballConfig(self_contact_ends=True))
+    config = EnvConfig(task=dataclasses.replace(TASK, self_contact_ends=True))
     skin = config.skin.build(config.robot_config)
     inwards = torch.zeros(32, 21)
     inwards[:16, config.robot_config.joints.index("left_shoulder_roll_joint")] = -1.0

@@ -33,6 +33,7 @@ def frame(
         gap=gap,
         num_detecting=0,
         num_sensors=num_sensors,
+        num_avoided=2,
         ending=ending,
     )
 

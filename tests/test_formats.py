@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 import torch
+from safetensors.torch import save
 
 import egoskin
 from egoskin.checkpoint import load_tensors, save_tensors
@@ -96,7 +97,7 @@ def damage(content: bytes, draw: random.Random) -> bytes:
 def policy_content(path: Path) -> Any:
     policy = egoskin.load_policy(path)
     tensors = {k: v.tolist() for k, v in policy.state_dict().items()}
-    return policy.spec.header(), tensors
+    return policy.policy_spec.header(), tensors
 
 
 def checkpoint_content(path: Path) -> Any:
@@ -204,10 +205,15 @@ def unsealed(run: Path) -> None:
     throws = config["env"]["task"]["throws"]
     throws.update(aim="body")
     del throws["first_delay"]
+    config["env"]["sensor"]["numb"] = False
     config.update(core_frames=[0, 0], slow_start=0.4, compile_kernels=True)
     (run / "config.json").write_text(json.dumps(config))
     starts = Run(run, TrainConfig()).starts()
     (run / "versions.json").write_text(json.dumps(starts))
+    tensors, header = load_tensors(run / "checkpoint.safetensors")
+    del tensors["log/metrics"], header["config"], header["starts"]
+    content = save(tensors, metadata={"egoskin": json.dumps(header)})
+    (run / "checkpoint.safetensors").write_bytes(content)
 
 
 def test_a_configuration_of_format_1_throws_as_it_did_and_is_noted_once(
@@ -225,6 +231,23 @@ def test_a_configuration_of_format_1_throws_as_it_did_and_is_noted_once(
         assert line.startswith(f"note: {run / name} is of an egoskin without")
 
 
+def test_a_run_of_format_1_goes_on_and_is_sealed(run: Path, capsys):
+    metrics = (run / "metrics.csv").read_bytes()
+    unsealed(run)
+    # After the checkpoint, and cut short.
+    with open(run / "metrics.csv", "ab") as file:
+        file.write(metrics.splitlines(keepends=True)[-1].replace(b"128", b"192", 1))
+        file.write(b"256,1.")
+    resume(run)
+    notes = capsys.readouterr().err.splitlines()
+    assert len(notes) == 3
+    assert all("without checksums" in note for note in notes)
+    assert (run / "metrics.csv").read_bytes() == metrics
+    resume(run)
+    assert len(Run.open(run).starts()) == 3
+    assert capsys.readouterr().err == ""
+
+
 def test_an_option_that_is_no_more_is_refused_where_it_had_an_effect(run: Path):
     unsealed(run)
     config = json.loads((run / "config.json").read_text())
@@ -240,7 +263,7 @@ def test_a_migration_leaves_alone_what_is_there_and_makes_no_parts():
     assert migrate({"ppo": {"gamma": 0.9}}, 1) == ({"ppo": {"gamma": 0.9}}, {})
     bare, _ = migrate({"env": {}}, 1)
     assert bare["env"]["task"]["throws"] == {"aim": "body", "first_delay": [0.0, 0.0]}
-    now = {"env": {}, "compile_kernels": True}
+    now = {"env": {}, "core_frames": [0, 0]}
     assert migrate(now, FORMAT) == (now, {})
 
 

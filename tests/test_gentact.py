@@ -256,6 +256,17 @@ def test_all_bad_rows_are_told_at_once_or_left_out(skip, load):
         assert sum(f"export:{line}: " in text for text in told) == 1
 
 
+@pytest.mark.parametrize(
+    ("number", "expected"),
+    [(150, "150 sensors cannot(.|\n)*and 50 more"), (5000, "more than 1,000 sensors")],
+)
+def test_of_very_many_bad_rows_some_are_told(number, expected, load):
+    with pytest.raises(ValueError, match=expected) as error:
+        load(current(GOOD, *["1,2"] * number))
+    assert "export:3: expected 10 values" in str(error.value)
+    assert len(str(error.value).splitlines()) < 110
+
+
 def test_bad_sensors_of_descriptions_are_left_out_too(load):
     tags = [sensor_tag(i, (0, 0, 1), UPRIGHT) for i in range(3)]
     tags[1] = tags[1].replace('normal_x="0.0"', 'normal_x="2"')
@@ -334,6 +345,14 @@ GOOD = f"0,0.093,0.02,0.2,1,0,0,0.01,{TORSO},v"
         (current(GOOD, f"1,nan,0,0,1,0,0,0.01,{TORSO},v"), "export:3: x must be a "),
         (current(GOOD, "", f"1,0,inf,0,1,0,0,0,{TORSO},v"), "export:4: y must be a "),
         (current(GOOD, f"1,0,0,zero,1,0,0,0,{TORSO},v"), "number, got 'zero'"),
+        (
+            current(GOOD, f"1,1e308,1e308,0,1,0,0,0,{TORSO},v"),
+            "export:3: .* lies 1.41e.308 m",
+        ),
+        (
+            current(GOOD, f"1,0,0,0,1e308,1e308,0,0,{TORSO},v"),
+            "length 1, got 1.414e.308",
+        ),
         (current(GOOD, f"1,0,0,0,1,0,0,-1,{TORSO},v"), "export:3: the radius must no"),
         (current(GOOD, f"1,0,0,0,1,0,0,big,{TORSO},v"), "export:3: the radius must be"),
         (current(GOOD, f"1,0,0,0,0,0,0,0.01,{TORSO},v"), "length 1, got 0"),

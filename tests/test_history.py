@@ -9,10 +9,11 @@ from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
+from egoskin.envs.dodgeball import DodgeballEnv
 from egoskin.robots import H1_2
 from egoskin.sensors import FieldSensor, Localization, place_sensors
 from egoskin.sensors.history import History, HoldLast
+from throwing import TASK
 
 
 def stored(done: list[int], **entries: torch.Tensor) -> TensorDict:
@@ -115,9 +116,9 @@ def test_what_makes_no_history_is_refused(arguments, text):
 
 def test_the_last_position_and_its_history_in_the_task():
     skin = place_sensors(H1_2, 12, seed=0)
-    balls = DodgeballConfig().throws.balls
+    balls = TASK.throws.balls
     env = TransformedEnv(
-        DodgeballEnv(H1_2, DodgeballConfig(), num_envs=6, seed=0),
+        DodgeballEnv(H1_2, TASK, num_envs=6, seed=0),
         Compose(
             [
                 FieldSensor(skin, H1_2.chain, balls, 1.5),

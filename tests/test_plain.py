@@ -35,6 +35,29 @@ def test_a_value_of_the_wrong_type_is_named(value: Any):
         from_plain(TrainConfig, [], "my.json")
 
 
+@pytest.mark.parametrize("value", [None, 3, "ab", [1.0], [1.0, "x"], [[1.0, 2.0]], {}])
+def test_a_range_that_is_none_is_named(value: Any):
+    plain = to_plain(TrainConfig())
+    plain["env"]["task"]["throws"]["interval"] = value
+    with pytest.raises(ValueError, match=r"my\.json: .*env\.task\.throws\.interval"):
+        from_plain(TrainConfig, plain, "my.json")
+
+
+def test_a_range_of_whole_numbers_is_one_of_numbers():
+    plain = to_plain(TrainConfig())
+    plain["env"]["task"]["throws"]["interval"] = [1, 2]
+    interval = from_plain(TrainConfig, plain, "here").env.task.throws.interval
+    assert interval == (1.0, 2.0)
+    assert all(isinstance(bound, float) for bound in interval)
+
+
+def test_what_a_configuration_refuses_is_told_with_the_file():
+    plain = to_plain(TrainConfig())
+    plain["env"]["task"]["throws"]["interval"] = [2.0, 1.0]
+    with pytest.raises(ValueError, match=r"my\.json: interval must be"):
+        from_plain(TrainConfig, plain, "my.json")
+
+
 def test_what_is_no_number_is_refused_wherever_it_stands():
     for field in ("env.task.reward.survival", "ppo.entropy_coeff"):
         plain = to_plain(TrainConfig())

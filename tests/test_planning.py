@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ import torch
 from torchrl.envs import TransformedEnv
 
 from egoskin.behaviour import Watcher
-from egoskin.evaluation import play_bank, standard_task
+from egoskin.evaluation import play_bank, standard_task, throw_seed
 from egoskin.make import EnvConfig, make_worker_env
 from egoskin.planning import (
     Ceiling,
@@ -41,7 +42,12 @@ def task(policy: Policy) -> EnvConfig:
 
 def make(policy: Policy, config: EnvConfig, rows: int) -> TransformedEnv:
     return make_worker_env(
-        config, policy.skin, num_envs=rows, seed=0, num_threads=1, keep_raw=True
+        config,
+        policy.skin,
+        num_envs=rows,
+        seed=throw_seed(config, 0),
+        num_threads=1,
+        keep_raw=True,
     )
 
 
@@ -131,7 +137,8 @@ def test_plans_start_where_the_reach_says_whatever_the_sensors_own_range(
 ):
     config = task(policy)
     skin = replace(policy.skin, range=np.full(len(policy.skin), 0.3))
-    other = Policy(policy._agent, replace(policy.spec, skin=skin))
+    other = copy.deepcopy(policy)
+    other.policy_spec = replace(policy.policy_spec, skin=skin)
     steps = [
         _until_in_reach(make(policy, config, 4), who, config, 2.0).simulation["step"]
         for who in (policy, other)

@@ -7,29 +7,37 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 
 from egoskin.cli import clear_errors
+from egoskin.envs.throws import Thrower
+from egoskin.evaluation import play_bank, throw_seed
 from egoskin.film import Frame
 from egoskin.make import EnvConfig, make_worker_env
 from egoskin.rendering import (
     CameraConfig,
     Painter,
+    Recording,
     RenderingError,
     _ending,
     closest_point,
-    render_episode,
+    painter_of,
+    record_episodes,
+    render_recording,
 )
 from egoskin.robots import RobotConfig
 from egoskin.sensors import Skin
 from egoskin.sensors.config import SensorConfig
 from egoskin.shapes import Sphere
+from throwing import TASK
 
 SIZE = (160, 90)
 SCRIPT = Path(__file__).parents[1] / "scripts" / "render.py"
@@ -59,6 +67,7 @@ def standing(robot: RobotConfig) -> TensorDict:
         joint_pos=torch.from_numpy(robot.default_joint_pos).float(),
         object_pose=torch.tensor([0, 0, 1000.0, 1, 0, 0, 0]).repeat(2, 1),
         object_active=torch.zeros(2, dtype=torch.bool),
+        balls_avoided=torch.zeros(2),
     )
 
 
@@ -155,8 +164,12 @@ def test_the_closest_point_lies_on_the_surface():
     assert closest_point(ball, pose, points) == pytest.approx(np.array(expected))
 
 
-def render(config: EnvConfig, skin: Skin, **options: object) -> list[Frame]:
-    return render_episode(config, skin, None, **{"size": SIZE, **options})
+def render(
+    config: EnvConfig, skin: Skin, *, hold: bool = False, **options: object
+) -> list[Frame]:
+    (recording,) = record_episodes(config, skin, None, hold=hold)
+    with painter_of(config, skin, size=SIZE) as painter:
+        return render_recording(painter, config, skin, recording, **options)
 
 
 @pytest.mark.usefixtures("painter")
@@ -164,7 +177,7 @@ def render(config: EnvConfig, skin: Skin, **options: object) -> list[Frame]:
 def test_an_episode_shows_lines_only_in_range(
     skin: Skin, sensor_range: float, shows: bool
 ):
-    config = EnvConfig(sensor=SensorConfig(range=sensor_range))
+    config = EnvConfig(task=TASK, sensor=SensorConfig(range=sensor_range))
     frames = render(config, skin, max_seconds=0.2)
     # 0.2 s at 30 pictures a second, and the start.
     assert [f.time for f in frames] == pytest.approx([i / 30 for i in range(7)])
@@ -193,54 +206,78 @@ def test_the_end_of_an_episode_is_named(flags, expected):
 
 @pytest.mark.usefixtures("painter")
 def test_a_rigid_robot_is_hit_and_the_last_frame_says_so(skin: Skin):
-    frames = render(EnvConfig(), skin, hold=True, fps=5)
+    frames = render(EnvConfig(task=TASK), skin, hold=True, fps=5)
     assert frames[-1].ending == "hit"
     assert frames[-1].gap < 0.05
     assert all(f.ending is None for f in frames[:-1])
 
 
 @pytest.mark.usefixtures("painter")
+def test_a_whole_episode_lasts_until_long_after_the_first_throw(skin: Skin):
+    # Balls to a point 50 m up, the first after 0.3 s; the limit is 0.2 s later.
+    high = {"aim": "box", "box_height": (50.0, 50.0), "first_delay": (0.3, 0.3)}
+    throws = replace(TASK.throws, **high)
+    task = replace(TASK, throws=throws, episode_length_s=0.2)
+    frames = render(EnvConfig(task=task), skin, hold=True, fps=10)
+    assert frames[-1].ending == "time limit"
+    assert frames[-1].time == pytest.approx(0.5)
+
+
+@pytest.mark.usefixtures("painter")
 @pytest.mark.parametrize("coverage", ["none", "oracle"])
 def test_without_a_skin_there_are_no_sensors_to_draw(coverage, skin: Skin):
-    config = EnvConfig(sensor=SensorConfig(coverage=coverage))
+    config = EnvConfig(task=TASK, sensor=SensorConfig(coverage=coverage))
     frame = render(config, skin, max_seconds=0.02)[0]
     assert (frame.num_sensors, frame.num_detecting) == (0, 0)
 
 
-@pytest.mark.usefixtures("painter")
-def test_an_episode_is_the_row_of_the_bank(skin: Skin):
-    config, row, steps = EnvConfig(), 5, 6
-    seen = []
-
-    def still(td: TensorDictBase) -> TensorDictBase:
-        seen.append(td["object_pose"][0].clone())
-        return td.set("action", torch.zeros(1, 21))
-
-    render_episode(
-        config, skin, still, seed=3, row=row, max_seconds=steps / 60, size=SIZE
+def test_recordings_are_of_the_rows_of_the_bank(skin: Skin):
+    config = EnvConfig(task=TASK)
+    recordings = record_episodes(
+        config, skin, None, bank_seed=3, first=5, episodes=2, hold=True
     )
-    bank = make_worker_env(config, skin, num_envs=8, seed=3, keep_raw=True)
-    td = bank.reset()
-    for pose in seen:
-        assert torch.equal(pose, td["object_pose"][row])
+    assert [r.row for r in recordings] == [5, 6]
+    bank = {"bank_seed": 3, "episodes": 8, "num_workers": 1, "hold": True}
+    steps = play_bank(None, config, skin, **bank).steps
+    # The start, and a state after each step up to the end.
+    assert [len(r.states) - 1 for r in recordings] == steps[5:7].tolist()
+    env = make_worker_env(
+        config,
+        skin,
+        num_envs=8,
+        seed=throw_seed(config, 3),
+        hold=True,
+        keep_raw=True,
+    )
+    td = env.reset()
+    for step in range(30):
+        for recording in recordings:
+            state = recording.states[step]
+            for key in ("object_pose", "base_pose", "joint_pos", "signal"):
+                assert torch.equal(state[key], td[key][recording.row]), key
         td["action"] = torch.zeros(8, 21)
-        td = bank.step(td)["next"]
-    assert len(seen) == steps
+        td = env.step(td)["next"]
 
 
 @pytest.mark.parametrize(
     ("options", "text"),
     [
         ({"fps": 61.0}, "fps must be in"),
-        ({"row": -1}, "row must not be negative"),
         ({"max_seconds": 0.0}, "at least one control step"),
-        ({"size": (161, 90)}, "two even numbers"),
-        ({"size": (160, 8)}, "two even numbers"),
     ],
 )
-def test_numbers_out_of_range_are_refused(skin: Skin, options: dict, text: str):
+def test_numbers_out_of_range_are_refused(
+    painter: Painter, skin: Skin, options: dict, text: str
+):
+    nothing = Recording(row=0, states=[], ending=None)
     with pytest.raises(ValueError, match=text):
-        render(EnvConfig(), skin, **options)
+        render_recording(painter, EnvConfig(), skin, nothing, **options)
+
+
+@pytest.mark.parametrize("size", [(161, 90), (160, 8)])
+def test_a_size_that_is_no_film_is_refused(skin: Skin, size: tuple[int, int]):
+    with pytest.raises(ValueError, match="two even numbers"):
+        painter_of(EnvConfig(), skin, size=size)
 
 
 @pytest.fixture
@@ -274,6 +311,36 @@ def test_the_script_writes_a_film_and_a_sheet(script: Callable, tmp_path: Path):
     assert {p.name for p in tmp_path.iterdir()} == {"a.gif", "a.png"}
 
 
+def load_script(monkeypatch) -> ModuleType:
+    spec = importlib.util.spec_from_file_location("render", SCRIPT)
+    assert spec is not None
+    assert spec.loader is not None
+    script = importlib.util.module_from_spec(spec)
+    # Dataclasses look their annotations up in the module of that name.
+    monkeypatch.setitem(sys.modules, "render", script)
+    spec.loader.exec_module(script)
+    return script
+
+
+@pytest.mark.usefixtures("painter")
+def test_a_film_is_of_the_longest_of_the_episodes_that_are_evaluated(
+    skin: Skin, tmp_path: Path, monkeypatch, capsys
+):
+    bank = {"bank_seed": 3, "episodes": 6, "num_workers": 1, "hold": True}
+    config = EnvConfig()
+    thrower = Thrower(config.task.throws, config.robot_config, 1 / 120)
+    row = torch.arange(6)
+    delay = thrower.first_delay(throw_seed(config, 3), row, row * 0)
+    ages = play_bank(None, config, skin, **bank).steps + (60 * delay).round().long()
+    longest = 2 + int(ages[2:].argmax())
+    args = ["--out", str(tmp_path / "a.gif"), "--size", "160", "90", "--fps", "4"]
+    args += ["--bank-seed", "3", "--episode", "2", "--longest-of", "4", "--hold"]
+    load_script(monkeypatch).main(args)
+    length = int(ages[longest]) / 60
+    expected = f"episode {longest} of bank 3: {length:.2f} s, 0 balls avoided, ends "
+    assert expected + "with: hit" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("args", "text"),
     [
@@ -283,6 +350,10 @@ def test_the_script_writes_a_film_and_a_sheet(script: Callable, tmp_path: Path):
         (["--slowdown", "0"], "slowdown must be in (0, 100]"),
         (["--slowdown", "inf"], "slowdown must be in (0, 100]"),
         (["--bank-seed", "-1"], "bank_seed must be in"),
+        (["--episode", "-1"], "episode must not be negative"),
+        (["--longest-of", "0"], "longest_of must be at least 1"),
+        (["--fps", "61"], "fps must be in"),
+        (["--standard", "3"], "--standard"),
         (["nothing.safetensors"], "nothing.safetensors"),
         (["nothing", "--sensor.range", "1"], "a policy brings its own"),
     ],
@@ -291,13 +362,7 @@ def test_bad_input_is_an_error_and_writes_nothing(
     args: list, text: str, tmp_path: Path, monkeypatch, capsys
 ):
     monkeypatch.chdir(tmp_path)
-    spec = importlib.util.spec_from_file_location("render", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    script = importlib.util.module_from_spec(spec)
-    # Dataclasses look their annotations up in the module of that name.
-    monkeypatch.setitem(sys.modules, "render", script)
-    spec.loader.exec_module(script)
+    script = load_script(monkeypatch)
     with pytest.raises(SystemExit) as status, clear_errors():
         script.main(args)
     assert status.value.code == 2

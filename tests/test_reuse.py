@@ -6,11 +6,13 @@ import runpy
 from pathlib import Path
 from types import SimpleNamespace
 
+import gymnasium
 import mujoco
 import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.envs import GymEnv
 from torchrl.envs.utils import check_env_specs
 
 SCRIPTS = Path(__file__).parents[1] / "scripts"
@@ -60,12 +62,12 @@ def humanoid() -> SimpleNamespace:
 
 @pytest.fixture(scope="module")
 def episode(humanoid) -> TensorDict:
-    env = humanoid.make_env(humanoid.skin_of_rings())
+    env = humanoid.make_env(humanoid.skin_of_rings(), num_envs=1)
     torch.manual_seed(0)
     env.set_seed(0)
     rollout = env.rollout(100)
     env.close()
-    return rollout
+    return rollout[0]
 
 
 def test_sensors_on_gymnasiums_humanoid_equal_mujoco(humanoid, episode):
@@ -92,9 +94,59 @@ def test_the_ball_flies_straight_at_its_speed(humanoid, episode):
 
 
 def test_gymnasiums_humanoid_keeps_its_specs(humanoid):
-    env = humanoid.make_env(humanoid.skin_of_rings())
+    env = humanoid.make_env(humanoid.skin_of_rings(), num_envs=2)
     check_env_specs(env)
     env.close()
+
+
+def test_several_humanoids_end_their_episodes_in_a_state_that_was_one(humanoid):
+    env = humanoid.make_env(humanoid.skin_of_rings(), num_envs=3)
+    torch.manual_seed(0)
+    env.set_seed(0)
+    rollout = env.rollout(60, break_when_any_done=False)
+    env.close()
+    last = rollout["next"]
+    done = last["done"][..., 0]
+    assert done.sum() >= 3
+    # Upright enough to be one, low enough to have ended there.
+    norm = last["observation"][..., 3:7].norm(dim=-1)
+    torch.testing.assert_close(norm, torch.ones_like(norm), atol=0.05, rtol=0)
+    assert (last["observation"][done][:, 2] < 1.0).all()
+    assert last["signal"].isfinite().all()
+    # The next step starts anew.
+    after = rollout[:, 1:][done[:, :-1]]
+    assert (after["observation"][:, 2] > 1.3).all()
+    assert (after["step_count"] == 0).all()
+    # Each is what it would be alone.
+    sensors = humanoid.Compose(humanoid.HumanoidState(), *env.transform[-2:])
+    alone = sensors(last.select("observation", "step_count")[1, 7].unsqueeze(0))
+    torch.testing.assert_close(alone["signal"][0], last["signal"][1, 7])
+
+
+class InStep(GymEnv):
+    """``GymEnv(num_envs=..)`` without its processes, with Gymnasium's own autoreset."""
+
+    def _async_env(self, *args, **kwargs):
+        return gymnasium.vector.SyncVectorEnv(*args, **kwargs)
+
+
+def test_a_signal_is_nan_only_where_torchrl_gives_no_orientation(humanoid):
+    # TorchRL 0.14.1 writes zeros for the last observation of each episode.
+    base = InStep(
+        "Humanoid-v5",
+        num_envs=2,
+        exclude_current_positions_from_observation=False,
+    )
+    sensors = humanoid.make_env(humanoid.skin_of_rings(), num_envs=1).transform
+    env = base.append_transform(sensors.clone())
+    torch.manual_seed(0)
+    env.set_seed(0)
+    last = env.rollout(40, break_when_any_done=False)["next"]
+    env.close()
+    assert last["done"].any()
+    zero = (last["observation"][..., 3:7] == 0).all(-1)
+    assert torch.equal(last["signal"].isnan().any(-1), zero)
+    assert not zero[~last["done"][..., 0]].any()
 
 
 def test_the_gymnasium_script_prints_an_approach(humanoid, capsys):

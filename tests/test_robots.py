@@ -162,6 +162,17 @@ def test_other_collision_shapes_are_refused_with_the_remedy(small_robot, kind):
     assert [shape.link for shape in robot.primitives_on(["base"])] == ["base"]
 
 
+def test_names_may_look_like_patterns(small_robot):
+    robot = small_robot(
+        "<geom size='.1'/><body name='arm[1]' pos='1 0 0'><joint name='j*'/>"
+        "<geom size='.1'/><body name='arm?' pos='1 0 0'><joint name='j[2]'/>"
+        "<geom size='.1'/></body></body>"
+    )
+    np.testing.assert_array_equal(robot.default_joint_pos, [0, 0])
+    links = ("base", "arm[1]", "arm?")
+    assert set(place_sensors(robot, 30, links=links).links) == set(links)
+
+
 # --- robots of files ------------------------------------------------------------
 
 URDF = """<?xml version="1.0"?><!-- <mujoco> -->

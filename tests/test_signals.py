@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from egoskin.sensors import Binary, Localization, Proximity
+from egoskin.sensors import Binary, FieldSensor, Localization, Proximity, RaySensor
 from egoskin.sensors.signals import SkinOrder
+from egoskin.shapes import Sphere
 
 INF = math.inf
 HALF = 0.5**0.5
@@ -47,6 +50,25 @@ def test_proximity_takes_one_range_for_each_sensor_or_for_all():
     assert signal.tolist() == [[0.5, 1, 0.25, 1]]
     with pytest.raises(ValueError, match="2 ranges do not fit the 4 sensors of 'dis"):
         Proximity([2.0, 4.0]).compute(torch.ones(1, 4))
+
+
+@pytest.mark.parametrize("kind", [FieldSensor, RaySensor])
+def test_the_range_of_a_signal_is_that_of_its_sensor(kind, robot, skin, random_state):
+    own = np.where(np.arange(64) % 2, 0.5, np.nan)
+    sensor = kind(replace(skin, range=own), robot.chain, Sphere(radius=0.1), 2.0)
+    state = sensor(random_state(500, objects=1))
+    distance = state["distance"].flatten(2) if kind is RaySensor else state["distance"]
+    distance = distance.reshape(500, 64, -1)
+    limit = torch.tensor([2.0, 0.5] * 32)[:, None]
+    seen = distance.isfinite()
+    assert (distance > 1.0)[seen].any()
+    expected = torch.where(seen, distance / limit, 1.0).flatten(1)
+    signal = Proximity(sensor)(state)["signal"]
+    torch.testing.assert_close(signal, expected)
+    # A number is a cut: nothing beyond 1 m, whatever the sensor sees.
+    cut = Proximity(1.0, validity=True)(state)["signal"].unflatten(1, (2, -1))[:, 1]
+    assert torch.equal(cut.bool(), (distance <= 1.0).flatten(1))
+    assert torch.equal(Binary(sensor)(state)["signal"].bool(), seen.flatten(1))
 
 
 def test_binary_is_one_for_any_distance_in_range():

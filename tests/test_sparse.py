@@ -27,6 +27,7 @@ from egoskin.sensors import Ray, RaySensor, place_sensors
 from egoskin.sensors.config import SensorConfig
 from egoskin.shapes import Sphere
 from egoskin.sparse import SparseRows
+from throwing import TASK
 
 SKIN = place_sensors(H1_2, 16, seed=0)
 RAYS = SensorConfig(coverage="ray")
@@ -183,7 +184,7 @@ def rollout_of(
     sparse: bool, network: NetworkConfig
 ) -> tuple[Agent, TensorDict, PolicySpec]:
     """An untrained agent and what it collects while the first balls arrive."""
-    config = EnvConfig(sensor=RAYS)
+    config = EnvConfig(task=TASK, sensor=RAYS)
     sources = sparse_sources(config, SKIN) if sparse else {}
     env = make_env(
         config, SKIN, num_envs=32, num_workers=1, seed=0, sparse=bool(sources)

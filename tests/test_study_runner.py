@@ -149,6 +149,14 @@ def test_a_run_that_somebody_works_on_is_left_alone(folder: StudyFolder):
     assert not folder.is_finished(NAME)
 
 
+def test_a_run_that_ppo_trains_is_left_to_it(folder: StudyFolder):
+    shutil.rmtree(folder.result_path(NAME))
+    with Run.open(folder.run_path(NAME)).locked():
+        assert [s.state for s in folder.status(folder.manifest())] == ["running"]
+        assert work(folder, NAME, Never()) == CLAIMED
+    assert work(folder, NAME, Never()) == 0
+
+
 def test_a_run_made_before_is_adopted(folder: StudyFolder, tmp_path: Path):
     expected = table(folder)
     made = tmp_path / "made"

@@ -48,3 +48,47 @@ def test_the_past_fades():
     curve.update(ages, torch.zeros(4, dtype=torch.bool))
     # 2 of weight ended, of 2 + 4 at risk.
     assert curve.probability(1) == pytest.approx(1 - 2 / 6)
+
+
+def test_what_ends_before_age_zero_makes_it_less_than_certain_by_hand():
+    curve = SurvivalCurve(max_steps=2)
+
+    def step(age: int, ended: list[int]) -> None:
+        curve.update(torch.full((len(ended),), age), torch.tensor(ended) > 0)
+
+    # Ten agents two steps before age 0: one ends there; nine are one step before: one
+    # ends; eight reach age 0: two end at it; six reach 1: three end; three reach 2.
+    step(-2, [1, *[0] * 9])
+    step(-1, [1, *[0] * 8])
+    step(0, [1, 1, *[0] * 6])
+    step(1, [1, 1, 1, 0, 0, 0])
+    step(2, [0, 0, 0])
+    # Of ten, four do not live at age 0, seven not at age 1.
+    expected = torch.tensor([6 / 10, 3 / 10, 3 / 10], dtype=torch.float64)
+    torch.testing.assert_close(curve.curve(), expected)
+    assert curve.probability(0) == pytest.approx(6 / 10)
+    # Six live from age 0 to 1, three from 1 to 2.
+    assert curve.mean() == pytest.approx(6 / 10 + 3 / 10)
+
+
+def test_steps_on_the_way_to_age_zero_count_once():
+    # However long the way, one that gets there is one at risk.
+    curve = SurvivalCurve(max_steps=1)
+    for age in (-3, -2, -1, 0, 1):
+        curve.update(torch.tensor([age]), torch.tensor([False]))
+    curve.update(torch.tensor([-3]), torch.tensor([True]))
+    assert curve.probability(0) == pytest.approx(1 / 2)
+    assert curve.probability(1) == pytest.approx(1 / 2)
+
+
+def test_age_zero_is_certain_where_episodes_begin_with_it():
+    curve = SurvivalCurve(max_steps=1)
+    curve.update(torch.tensor([1, 1]), torch.tensor([True, False]))
+    assert curve.probability(0) == 1.0
+    assert curve.probability(1) == 0.5
+
+
+def test_an_age_nobody_has_reached_is_unknown_though_some_wait_for_age_zero():
+    curve = SurvivalCurve(max_steps=3)
+    curve.update(torch.tensor([-5, -4]), torch.tensor([False, False]))
+    assert math.isnan(curve.probability(1))

@@ -15,7 +15,7 @@ from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import Compose, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
+from egoskin.envs.dodgeball import DodgeballEnv
 from egoskin.robots import H1_2
 from egoskin.sensors.tactile import (
     ContactFree,
@@ -25,6 +25,7 @@ from egoskin.sensors.tactile import (
     contact_free,
     split_by_contact,
 )
+from throwing import TASK
 
 LINKS = ("base", "left_arm", "right_arm", "foot")
 BODY = [name for name in H1_2.links if name not in H1_2.feet]
@@ -181,9 +182,7 @@ TRANSFORMS = {
 
 
 def base(rows: int, offset: int = 0) -> DodgeballEnv:
-    return DodgeballEnv(
-        H1_2, DodgeballConfig(), num_envs=rows, seed=3, row_offset=offset
-    )
+    return DodgeballEnv(H1_2, TASK, num_envs=rows, seed=3, row_offset=offset)
 
 
 @pytest.mark.parametrize("build", TRANSFORMS.values(), ids=TRANSFORMS)

@@ -95,7 +95,7 @@ def closest(path: torch.Tensor, target: torch.Tensor, velocity: torch.Tensor):
 
 
 @pytest.mark.parametrize("flight", FLIGHTS)
-@pytest.mark.parametrize("aim", ["body", "box"])
+@pytest.mark.parametrize("aim", ["skin", "body", "box"])
 @pytest.mark.parametrize("lead", [0.0, 0.5, 1.0])
 def test_the_ball_passes_through_the_point_led_by_the_base(flight, aim, lead):
     config = ThrowConfig(flight=flight, aim=aim, lead=lead)
@@ -111,9 +111,10 @@ def test_the_ball_passes_through_the_point_led_by_the_base(flight, aim, lead):
 
 
 @pytest.mark.parametrize("flight", FLIGHTS)
-def test_the_point_aimed_at_lies_on_the_link_that_is_named(flight):
+@pytest.mark.parametrize("aim", ["skin", "body"])
+def test_the_point_aimed_at_lies_on_the_link_that_is_named(flight, aim):
     # An independent view: the path meets the surface of that link's own shapes.
-    config = ThrowConfig(flight=flight)
+    config = ThrowConfig(flight=flight, aim=aim)
     thrower = make(config)
     drawn, (base_pose, joint_pos) = draw(thrower, 48), poses(48)
     release = thrower.release(drawn, base_pose, torch.zeros(48, 3), joint_pos)
@@ -139,11 +140,32 @@ def test_the_point_aimed_at_lies_on_the_link_that_is_named(flight):
         assert distance.min() < 0.01
 
 
-def test_links_are_aimed_at_by_area_without_shins_and_feet():
-    thrower = make(ThrowConfig())
+def test_the_body_is_aimed_at_without_shins_and_feet_and_the_skin_without_legs():
+    body, skin = (
+        set(make(config).aim_link(draw(make(config), 8192)))
+        for config in (ThrowConfig(aim="body"), ThrowConfig(aim="skin"))
+    )
+    assert not any("knee" in name or "ankle" in name for name in body)
+    assert any("hip" in name for name in body)
+    # The torso, which bears the head, and the arms: all links that a skin can be on
+    # and that have a shape.
+    solid = {shape.link for shape in H1_2.primitives}
+    assert skin == set(H1_2.skin_links) & solid
+    assert skin < body
+    assert "torso_link" in skin
+    assert not any("hip" in name or "pelvis" in name for name in skin)
+
+
+@pytest.mark.parametrize("aim", ["skin", "body"])
+def test_links_are_aimed_at_by_area(aim):
+    thrower = make(ThrowConfig(aim=aim))
     aimed = thrower.aim_link(draw(thrower, 8192))
-    targeted = [n for n in H1_2.links if n not in H1_2.untargeted_links]
-    assert not any("knee" in name or "ankle" in name for name in aimed)
+    targeted = [
+        name
+        for name in H1_2.links
+        if (name in H1_2.skin_links)
+        or (aim == "body" and name not in H1_2.untargeted_links)
+    ]
     # Independent sample of the same surface; the aim itself is 4096 fixed points.
     points = sample_surface(H1_2, targeted, 50_000, seed=77)
     for name in targeted:
@@ -183,7 +205,65 @@ def test_box_targets_fill_the_box_across_the_flight():
         assert value.mean() == pytest.approx(middle, abs=5 * (high - low) / 78)
 
 
+def test_points_of_the_skin_are_spread_over_the_shapes_of_its_links():
+    # In each slice of the torso lie as many points as its surface has area there.
+    thrower = make(ThrowConfig(aim="skin"))
+    drawn, n = draw(thrower, 8192), 8192
+    torso = torch.tensor([name == "torso_link" for name in thrower.aim_link(drawn)])
+    base_pose = torch.tensor([[0.0, 0, 0, 1, 0, 0, 0]]).expand(n, 7)
+    joint_pos = torch.zeros(n, len(DEFAULT))
+    points = aim_points(thrower, drawn, base_pose, joint_pos)[torso]
+    position, _ = LinkKinematics(H1_2.chain, H1_2.links).poses_b(joint_pos[:1])
+    local = points - position[0, H1_2.links.index("torso_link")]
+    other = sample_surface(H1_2, ["torso_link"], 50_000, seed=77).position
+    for axis in range(3):
+        low, high = other[:, axis].min(), other[:, axis].max()
+        for bound in np.linspace(low, high, 7)[1:-1]:
+            share = (other[:, axis] < bound).mean()
+            found = (local[:, axis] < bound).float().mean().item()
+            # The aim itself is some 2,400 fixed points of the torso.
+            error = math.sqrt(share * (1 - share) * (1 / 2400 + 1 / len(local)))
+            assert found == pytest.approx(share, abs=5 * error)
+
+
 # --- draws ----------------------------------------------------------------------
+
+
+def delays(config: ThrowConfig, n: int = 4096, *, seed=0, episode=0) -> torch.Tensor:
+    row = torch.arange(n)
+    return make(config).first_delay(seed, row, torch.full_like(row, episode))
+
+
+def test_the_first_delay_is_uniform_over_its_range():
+    value = delays(ThrowConfig(first_delay=(0.5, 1.7)))
+    assert 0.5 <= value.min() < 0.5 + 0.012
+    assert 1.7 - 0.012 < value.max() <= 1.7
+    # Mean 1.1 and variance 1.2^2 / 12 of a uniform number.
+    assert value.mean() == pytest.approx(1.1, abs=5 * 1.2 / math.sqrt(12 * 4096))
+    assert value.var() == pytest.approx(1.2**2 / 12, rel=0.1)
+    assert not delays(ThrowConfig(first_delay=(0.0, 0.0))).any()
+    # By default 0 to 2 s.
+    assert torch.allclose(delays(ThrowConfig()), (value - 0.5) * 2 / 1.2, atol=1e-5)
+
+
+def test_the_first_delay_is_drawn_from_a_stream_of_its_own():
+    config = ThrowConfig()
+    value = delays(config)
+    # Fixed for good, like the throws: one number of this seed, row and episode.
+    row = torch.arange(4096)
+    u = uniform(0, Stream.FIRST_DELAY, row, row * 0, row * 0, 1)[:, 0]
+    assert torch.equal(value, 2 * u)
+    assert int(Stream.FIRST_DELAY) == 3
+    for other in (delays(config, seed=1), delays(config, episode=1)):
+        assert np.corrcoef(value, other)[0, 1] == pytest.approx(0, abs=5 / 64)
+    drawn = draw(make(config), 4096)
+    values = [drawn.azimuth, drawn.distance, drawn.height, drawn.speed, drawn.interval]
+    for other in (*values, *drawn.target.T):
+        assert np.corrcoef(value, other)[0, 1] == pytest.approx(0, abs=5 / 64)
+    # And what is thrown does not depend on it.
+    at_once = draw(make(ThrowConfig(first_delay=(0.0, 0.0))), 4096)
+    for name in ("azimuth", "distance", "height", "speed", "interval", "target"):
+        assert torch.equal(getattr(drawn, name), getattr(at_once, name)), name
 
 
 def test_draws_fill_the_ranges_of_the_configuration():
@@ -282,7 +362,7 @@ def at_standing(thrower: Thrower, drawn) -> tuple[torch.Tensor, Release]:
     return aim_points(thrower, drawn, base_pose, joint_pos), release
 
 
-@pytest.mark.parametrize("aim", ["body", "box"])
+@pytest.mark.parametrize("aim", ["skin", "body", "box"])
 def test_a_total_speed_is_that_of_the_lower_arc_to_a_standing_robot(aim):
     config = ThrowConfig(flight="ballistic", aim=aim, speed_is="total")
     thrower = make(config)
@@ -305,10 +385,13 @@ def test_a_total_speed_is_that_of_the_lower_arc_to_a_standing_robot(aim):
     assert (time.square() < 2 * gap.norm(dim=-1) / 9.81).all()
 
 
-def test_draws_of_a_total_speed_that_cannot_arrive_are_drawn_again():
+@pytest.mark.parametrize(
+    ("aim", "least", "most"), [("body", 0.45, 0.52), ("skin", 0.42, 0.49)]
+)
+def test_draws_of_a_total_speed_that_cannot_arrive_are_drawn_again(aim, least, most):
     n = 4096
-    plain = make(ThrowConfig(flight="ballistic"))
-    total = make(ThrowConfig(flight="ballistic", speed_is="total"))
+    plain = make(ThrowConfig(flight="ballistic", aim=aim))
+    total = make(ThrowConfig(flight="ballistic", aim=aim, speed_is="total"))
     once, again = draw(plain, n), draw(total, n)
     target, release = at_standing(plain, once)
     gap = target - release.position
@@ -317,7 +400,8 @@ def test_draws_of_a_total_speed_that_cannot_arrive_are_drawn_again():
     # s^2 / 2 g - g r^2 / 2 s^2 (the parabola that envelops all throws).
     s2 = once.speed.square()
     arrives = rise < s2 / 19.62 - 9.81 * across.square() / (2 * s2)
-    assert 0.45 < arrives.float().mean() < 0.52
+    # A higher target is reached by fewer.
+    assert least < arrives.float().mean() < most
     for name in ("azimuth", "distance", "height", "interval"):
         kept = getattr(once, name) == getattr(again, name)
         assert torch.equal(kept, arrives), name
@@ -392,16 +476,18 @@ def test_a_padded_subset_is_thrown_to_the_same_bits(flight, speed_is):
 # --- the rigid robot ------------------------------------------------------------
 
 
+@pytest.mark.parametrize("aim", ["skin", "body"])
 @pytest.mark.parametrize(
     "throws",
     [
-        ThrowConfig(flight="ballistic"),
-        ThrowConfig(flight="ballistic", speed_is="total"),
-        ThrowConfig(flight="straight"),
+        {"flight": "ballistic"},
+        {"flight": "ballistic", "speed_is": "total"},
+        {"flight": "straight"},
     ],
     ids=["ballistic", "ballistic, total speed", "straight"],
 )
-def test_every_throw_hits_a_rigid_robot(throws, request, capsys):
+def test_every_throw_hits_a_rigid_robot(throws, aim, request, capsys):
+    throws = ThrowConfig(**throws, aim=aim, first_delay=(0.0, 0.0))
     config = DodgeballConfig(throws=throws)
     env = DodgeballEnv(H1_2, config, num_envs=256, seed=0, hold=True)
     td = env.reset()
@@ -433,6 +519,13 @@ def test_every_throw_hits_a_rigid_robot(throws, request, capsys):
         ({"interval": (2.0, 1.0)}, r"interval must be \(low, high\), got \(2.0, 1.0\)"),
         ({"azimuth_deg": (10.0, -10.0)}, r"azimuth_deg must be \(low, high\)"),
         ({"height": (0.0, 1.0)}, "height must be positive"),
+        ({"first_delay": (2.0, 1.0)}, r"first_delay must be \(low, high\), got"),
+        (
+            {"first_delay": (-0.5, 1.0)},
+            r"first_delay must be finite and not negative, got \(-0.5, 1.0\)",
+        ),
+        ({"first_delay": (math.nan, math.nan)}, r"first_delay must be \(low, high\)"),
+        ({"first_delay": (0.0, math.inf)}, "first_delay must be finite"),
         ({"distance": (-1.0, 1.0)}, "distance must be positive"),
         ({"speed": (0.0, 0.0)}, "speed must be positive"),
         ({"box_height": (math.nan, 1.0)}, "box_height must be"),

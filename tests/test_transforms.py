@@ -16,9 +16,9 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs import Compose, ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
+from egoskin.envs.dodgeball import DodgeballEnv
 from egoskin.envs.throws import GRAVITY
-from egoskin.make import EnvConfig, make_worker_env
+from egoskin.make import MASK_ALL, EnvConfig, make_worker_env
 from egoskin.observations import Oracle, Privileged, Proprioception, approaches_b
 from egoskin.robots import H1_2
 from egoskin.sensors import (
@@ -31,9 +31,10 @@ from egoskin.sensors import (
     place_sensors,
 )
 from egoskin.sensors.config import LocalizationConfig, SensorConfig
+from throwing import TASK
 
 SKIN = place_sensors(H1_2, 12, seed=0)
-BALLS = DodgeballConfig().throws.balls
+BALLS = TASK.throws.balls
 DEFAULT = torch.from_numpy(H1_2.default_joint_pos)
 JOINTS = len(H1_2.joints)
 
@@ -397,7 +398,7 @@ def run(env, steps: int) -> list[TensorDict]:
 
 @pytest.mark.parametrize("sensor", SENSORS.values(), ids=SENSORS)
 def test_environment_keeps_its_specs(sensor):
-    config = EnvConfig(sensor=sensor)
+    config = EnvConfig(task=TASK, sensor=sensor)
     env = make_worker_env(config, SKIN, num_envs=6, seed=0)
     check_env_specs(env)
     env = make_worker_env(config, SKIN, num_envs=6, seed=0, keep_raw=True)
@@ -406,19 +407,20 @@ def test_environment_keeps_its_specs(sensor):
 
 @pytest.mark.parametrize("sparse", [False, True])
 @pytest.mark.parametrize("keep_raw", [False, True])
-def test_numb_sensors_feel_no_ball_and_the_critic_is_still_told(sparse, keep_raw):
+def test_masked_sensors_feel_no_ball_and_the_critic_is_still_told(sparse, keep_raw):
     # Within 5 m of the body nearly all balls are felt.
     sensor = SensorConfig(coverage="ray", range=5.0)
     feeling, numb = (
         make_worker_env(
-            EnvConfig(sensor=replace(sensor, numb=numb)),
+            EnvConfig(task=TASK, sensor=sensor),
             SKIN,
             num_envs=6,
             seed=0,
             sparse=sparse,
             keep_raw=keep_raw,
+            mask=mask,
         )
-        for numb in (False, True)
+        for mask in ((), MASK_ALL)
     )
     felt = False
     for one, other in zip(run(feeling, 40), run(numb, 40), strict=True):
@@ -439,7 +441,8 @@ def test_numb_sensors_feel_no_ball_and_the_critic_is_still_told(sparse, keep_raw
 def test_signals_are_those_of_the_state_under_staggered_resets(signal, content):
     # Fixed actions, rows that end at different steps: what stands in the tensordict
     # must always be what the raw state beside it gives offline.
-    config = EnvConfig(sensor=SensorConfig(signal=signal), privileged=content)
+    sensor = SensorConfig(signal=signal)
+    config = EnvConfig(task=TASK, sensor=sensor, privileged=content)
     env = make_worker_env(config, SKIN, num_envs=6, seed=0, keep_raw=True)
     ended = []
     for state in run(env, 70):
@@ -455,7 +458,7 @@ def test_signals_are_those_of_the_state_under_staggered_resets(signal, content):
 def test_the_actor_observes_its_previous_action_only_if_asked():
     plain, told = (
         make_worker_env(config, SKIN, num_envs=6, seed=0, keep_raw=True)
-        for config in (EnvConfig(), EnvConfig(previous_action=True))
+        for config in (EnvConfig(task=TASK), EnvConfig(task=TASK, previous_action=True))
     )
     check_env_specs(told)
     taken = set()
@@ -487,7 +490,7 @@ def outside(config: EnvConfig, parallel, **kwargs) -> TransformedEnv:
 @pytest.fixture(scope="module")
 def inside_run() -> list[TensorDict]:
     """Transforms in the environment itself: the reference of the next tests."""
-    return run(make_worker_env(EnvConfig(), SKIN, num_envs=6, seed=5), 60)
+    return run(make_worker_env(EnvConfig(task=TASK), SKIN, num_envs=6, seed=5), 60)
 
 
 OBSERVED = ("observation", "privileged_observation", "signal")
@@ -503,7 +506,7 @@ def test_transforms_around_workers_give_what_they_give_inside(
 ):
     # The workers' imports are paid for once.
     multiprocessing.set_forkserver_preload(["egoskin.make"])
-    env = outside(EnvConfig(), parallel, **options)
+    env = outside(EnvConfig(task=TASK), parallel, **options)
     try:
         states = run(env, 60)
     finally:
@@ -515,7 +518,7 @@ def test_transforms_around_workers_give_what_they_give_inside(
 
 
 def test_a_static_seed_reaches_the_environments_of_all_workers(inside_run):
-    env = outside(EnvConfig(), SerialEnv)
+    env = outside(EnvConfig(task=TASK), SerialEnv)
     env.set_seed(99, static_seed=True)
     other = run(env, 1)
     assert not torch.equal(other[0]["observation"], inside_run[0]["observation"])
@@ -540,10 +543,43 @@ def test_the_actor_reads_its_observation_and_the_signal_alone():
     assert env.observation_spec["signal"].shape == (2, len(SKIN))
 
 
+ACTORS = {
+    "field": SensorConfig(range=5.0),
+    "localization": SensorConfig(range=5.0, signal="localization"),
+    "ray": SensorConfig(range=5.0, coverage="ray"),
+    "corrupted": SensorConfig(range=5.0, corruption="time_of_flight"),
+    "blind": SensorConfig(coverage="none"),
+    "oracle": SensorConfig(coverage="oracle"),
+}
+
+
+@pytest.mark.parametrize("sensor", ACTORS.values(), ids=ACTORS)
+def test_nothing_tells_the_actor_when_the_first_ball_comes(sensor):
+    """Before it, all that the actor reads is the same whatever the delay."""
+    found = []
+    for delay in ((0.5, 0.8), (1.5, 2.0), (30.0, 40.0)):
+        throws = replace(TASK.throws, first_delay=delay)
+        config = EnvConfig(task=replace(TASK, throws=throws), sensor=sensor, history=2)
+        env = make_worker_env(config, SKIN, num_envs=6, seed=0, keep_raw=True)
+        states = run(env, 60)
+        waiting = [~s["object_active"].any(-1) for s in states]
+        found.append((config.actor_keys, states, torch.stack(waiting)))
+    (keys, early, still_early), (_, late, still_late), (_, never, always) = found
+    assert always.all()
+    for states, waiting in ((early, still_early), (late, still_late)):
+        # Until the first ball of each row, through falls and new starts.
+        waiting = waiting.cumprod(0).bool()
+        assert waiting.sum(0).min() >= 2 * 29
+        for state, expected, rows in zip(states, never, waiting, strict=True):
+            for key in keys:
+                assert torch.equal(state[key][rows], expected[key][rows]), key
+    assert not still_early.all()
+
+
 @pytest.mark.parametrize("signal", ["proximity", "localization", "binary"])
 def test_the_actor_sees_nothing_that_it_may_not(random_state, signal):
     """Allowed: angular velocity, joints, gravity, and where the ball is in range."""
-    config = EnvConfig(sensor=SensorConfig(signal=signal))
+    config = EnvConfig(task=TASK, sensor=SensorConfig(signal=signal))
     env = make_worker_env(config, SKIN, num_envs=32, seed=0, keep_raw=True)
     env.reset()
     state = env.rollout(3)[:, -1].select(*random_state(1).keys())

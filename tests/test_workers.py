@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from functools import partial
@@ -14,10 +15,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from torchrl.envs import Transform, TransformedEnv
+from torchrl.envs import Compose, Transform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from egoskin import workers
+from egoskin.compilation import SETTING
+from egoskin.envs.dodgeball import DodgeballEnv
 from egoskin.make import (
     EnvConfig,
     load_env_state,
@@ -33,8 +36,10 @@ from egoskin.workers import (
     default_num_workers,
     in_halves,
 )
+from throwing import TASK
 
 NUM_ENVS = 32
+CONFIG = EnvConfig(task=TASK)
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +48,7 @@ def skin():
 
 
 def make_pool(skin, number: int, num_envs: int = NUM_ENVS) -> WorkerPool:
-    return make_env(EnvConfig(), skin, num_envs=num_envs, seed=5, num_workers=number)
+    return make_env(CONFIG, skin, num_envs=num_envs, seed=5, num_workers=number)
 
 
 def steps(pool: WorkerPool, root, count: int, seed: int):
@@ -360,6 +365,32 @@ def test_a_pool_that_nobody_closed_ends_with_its_script():
     assert not Path("/proc", done.stdout.strip()).exists()
 
 
+def test_ctrl_c_while_the_server_imports_is_one_line():
+    body = UNGUARDED.replace("\n", "\n    ")
+    code = f"from egoskin.cli import clear_errors\nwith clear_errors():{body}"
+    # A socket's path must be short.
+    with (
+        tempfile.TemporaryDirectory(prefix="ego-") as folder,
+        subprocess.Popen(
+            [sys.executable, "-c", code],
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+            env={**os.environ, "TMPDIR": folder},
+        ) as script,
+    ):
+        assert script.stderr is not None
+        while not list(Path(folder).glob("*/listener-*")):
+            assert script.poll() is None
+            time.sleep(0.01)
+        # It waits for the server to fork the first worker.
+        time.sleep(0.5)
+        os.killpg(script.pid, signal.SIGINT)
+        # All that it started has ended when nobody can write there any more.
+        assert script.stderr.read() == "stopped\n"
+    assert script.returncode == 130
+
+
 def test_a_server_killed_at_the_start_is_reported():
     code = """
 import os, signal, time
@@ -380,6 +411,31 @@ Thread(target=kill, daemon=True).start()
     assert done.returncode == 1
     *_, last = done.stderr.splitlines()
     assert "WorkerError: a worker, or the server that forks them, ended" in last
+
+
+class AskedEnv(DodgeballEnv):
+    """Says what a worker's environment variable is."""
+
+    def variable(self, name: str) -> str | None:
+        return os.environ.get(name)
+
+
+def build_asked() -> TransformedEnv:
+    return TransformedEnv(AskedEnv(H1_2, TASK, num_envs=2), Compose())
+
+
+def test_workers_compile_or_not_as_their_parent_does_now(monkeypatch):
+    # The server that forks them was started with one of these settings.
+    for value in ("0", None, "1"):
+        if value is None:
+            monkeypatch.delenv(SETTING)
+        else:
+            monkeypatch.setenv(SETTING, value)
+        pool = WorkerPool([build_asked])
+        try:
+            assert pool._ask("variable", SETTING) == [value]
+        finally:
+            pool.close()
 
 
 def build_badly(parent: int, fault: str, skin) -> TransformedEnv:

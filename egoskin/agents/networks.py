@@ -210,7 +210,7 @@ class GaussianHead(nn.Module):
         super().__init__()
         self.body = body
         self.log_std = nn.Parameter(torch.full((size,), init_std).log())
-        self._bounds = tuple(torch.tensor(std_bounds).log().tolist())
+        self._bounds = tuple(torch.tensor(std_bounds, device="cpu").log().tolist())
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Return (loc, scale), ``[*B, J]`` each."""

@@ -228,18 +228,25 @@ class PPO:
         """Put the optimiser into a state that `state` returned.
 
         Raises:
-            ValueError: If it is that of other networks.
+            ValueError: If it is that of other networks; nothing is loaded then.
         """
         content = self.optimizer.state_dict()
+        expected, found = {}, {}
+        for i, vector in enumerate((self._actor, self._critic)):
+            expected[f"{i}/step"] = (torch.Size(), torch.float32)
+            for moment in ("exp_avg", "exp_avg_sq"):
+                expected[f"{i}/{moment}"] = (vector.shape, vector.dtype)
         for name, value in tensors.items():
-            index, key = name.split("/")
-            content["state"].setdefault(int(index), {})[key] = value
-        moments = [state["exp_avg"].shape for state in content["state"].values()]
-        if moments and moments != [self._actor.shape, self._critic.shape]:
+            found[name] = (value.shape, value.dtype)
+        # Before the first step there is none.
+        if found and found != expected:
             raise ValueError(
                 "the state of the optimiser is one of other networks, or of an older "
                 "egoskin"
             )
+        for name, value in tensors.items():
+            index, key = name.split("/")
+            content["state"].setdefault(int(index), {})[key] = value
         self.optimizer.load_state_dict(content)
         self.learning_rate = learning_rate
 

@@ -18,8 +18,8 @@ from egoskin.envs.throws import ThrowConfig, Thrower
 from egoskin.kinematics import pad_rows, rotate_inverse
 from egoskin.robots import RobotConfig
 
-# A ball has passed once it flies away from the base and is farther than this [m].
-_PASSED_DISTANCE = 1.0
+PASSED_DISTANCE = 1.0
+"""A ball has passed once it flies away from the base and is farther than this [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -419,7 +419,7 @@ class DodgeballEnv(EnvBase):
         counters = self._counters
         gap = state.object_pose[..., :2] - state.base_pose[:, None, :2]
         closing = state.object_lin_vel_w[..., :2] - state.base_lin_vel_w[:, None, :2]
-        far = gap.square().sum(-1) > _PASSED_DISTANCE**2
+        far = gap.square().sum(-1) > PASSED_DISTANCE**2
         landed = state.object_pose[..., 2] <= self.config.throws.radius
         leaving = ((gap * closing).sum(-1) > 0) & far
         fresh = counters["active"] & ~counters["passed"] & sound

@@ -90,9 +90,9 @@ class ThrowConfig:
                 raise ValueError(f"{name} must be (low, high), got ({low}, {high})")
             if name in positive and low <= 0:
                 raise ValueError(f"{name} must be positive, got ({low}, {high})")
-        if not self.first_delay[0] >= 0:
+        if not 0 <= self.first_delay[0] <= self.first_delay[1] < math.inf:
             raise ValueError(
-                f"first_delay must not be negative, got {self.first_delay}"
+                f"first_delay must be finite and not negative, got {self.first_delay}"
             )
         if self.num_balls < 1:
             raise ValueError(f"num_balls must be at least 1, got {self.num_balls}")

@@ -41,7 +41,7 @@ class FieldSensor(ProximitySensor):
     Args:
         skin: The sensors. Their own coverage and range come first.
         chain: Kinematic chain of the robot, rooted at the base.
-        objects: Shape of each object, ``O`` of them.
+        objects: Shape of each object, ``O`` of them, or of the only one.
         max_range: A distance is detected if it is at most this [m]; may be infinite.
         coverage: What a sensor sees.
         body: The robot's shapes, to hide what lies behind them: an object is seen if
@@ -64,7 +64,7 @@ class FieldSensor(ProximitySensor):
         self,
         skin: Skin,
         chain: pk.Chain,
-        objects: Sequence[Shape],
+        objects: Shape | Sequence[Shape],
         max_range: float,
         coverage: Field | None = None,
         *,

@@ -12,7 +12,7 @@ a reading of NaN, never one of nothing.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -119,7 +119,7 @@ class ProximitySensor(RowTransform):
     Args:
         skin: The sensors, filled; all of the coverage that the subclass computes.
         chain: Kinematic chain of the robot, rooted at the base.
-        objects: Shape of each object, ``O`` of them.
+        objects: Shape of each object, ``O`` of them, or of the only one.
         num_readings: Readings of each sensor: ``()`` or ``(K,)``.
         body: Shapes of the robot that hide what lies behind them; empty for a robot
             that is transparent to its sensors.
@@ -129,7 +129,8 @@ class ProximitySensor(RowTransform):
         out_keys: Keys of readings and detections.
 
     Raises:
-        ValueError: If the skin does not fit the chain, or there is no object.
+        ValueError: If the skin does not fit the chain, there is no object, or one that
+            is no shape.
     """
 
     _link: Tensor
@@ -141,7 +142,7 @@ class ProximitySensor(RowTransform):
         self,
         skin: Skin,
         chain: pk.Chain,
-        objects: Sequence[Shape],
+        objects: Shape | Sequence[Shape],
         num_readings: tuple[int, ...],
         body: Sequence[Primitive],
         per_object: bool,
@@ -150,9 +151,17 @@ class ProximitySensor(RowTransform):
     ) -> None:
         super().__init__(in_keys, out_keys)
         skin.check_links(chain.get_link_names())
-        if not objects:
+        self.num_sensors = len(skin)
+        several = isinstance(objects, Iterable)
+        self.objects = tuple(objects) if several else (objects,)
+        if not self.objects:
             raise ValueError("a proximity sensor needs at least one object to sense")
-        self.num_sensors, self.objects = len(skin), tuple(objects)
+        for shape in self.objects:
+            if not isinstance(shape, Shape):
+                raise ValueError(
+                    "objects must be shapes (egoskin.shapes: Sphere, Box, ..), got "
+                    f"{shape!r}"
+                )
         self.per_object = per_object
         self.readings = torch.Size((len(skin), *num_readings))
         links = list(dict.fromkeys(skin.links))
@@ -176,7 +185,7 @@ class ProximitySensor(RowTransform):
         reach = np.array(self._kinematics.reach())[self._link.numpy()]
         reach += np.linalg.norm(skin.position, axis=-1)
         farthest = float((reach + skin.reach()).max()) + _SLACK
-        self._farthest = [farthest + shape.bounding_radius for shape in objects]
+        self._farthest = [farthest + shape.bounding_radius for shape in self.objects]
         self._kernels: Kernels | None = None
 
     def _use_kernels(self, kind: Literal["field", "ray"], **constants: Any) -> None:
@@ -216,6 +225,11 @@ class ProximitySensor(RowTransform):
     def num_joints(self) -> int:
         """Number of joint positions it reads, ``J``."""
         return self._kinematics.num_joints
+
+    @property
+    def ranges(self) -> Tensor:
+        """Range of each sensor [m], ``[S]`` float64."""
+        return self._range[:, 0].clone()
 
     def scene(
         self, base_pose: Tensor, joint_pos: Tensor, object_pose: Tensor, active: Tensor

@@ -97,6 +97,8 @@ def meshes_in_folder(folder: Path, links: Sequence[str]) -> dict[str, list[Trime
                 raise ValueError(
                     f"{path} is no mesh that trimesh can read: {error}"
                 ) from error
+            if len(mesh.faces) == 0:
+                raise ValueError(f"{path} holds no triangles")
             mesh.metadata["name"] = path.name
             meshes[path.stem] = [mesh]
     if not meshes:

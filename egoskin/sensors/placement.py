@@ -7,6 +7,7 @@ normal pointing out, and the same arguments give the same skin.
 from __future__ import annotations
 
 import fnmatch
+import glob
 import heapq
 import math
 from collections.abc import Mapping, Sequence
@@ -176,7 +177,7 @@ def _link_weights(
                 f"got {weight}"
             )
     plain = {
-        link: 1.0
+        glob.escape(link): 1.0
         for link in links
         if not any(fnmatch.fnmatchcase(link, pattern) for pattern in density)
     }

@@ -50,7 +50,7 @@ class RaySensor(ProximitySensor):
         skin: The sensors. Their own coverage and range come first; all must have the
             same number of beams.
         chain: Kinematic chain of the robot, rooted at the base.
-        objects: Shape of each object, ``O`` of them.
+        objects: Shape of each object, ``O`` of them, or of the only one.
         max_range: A distance is detected if it is at most this [m]; may be infinite.
         coverage: What a sensor sees.
         reduce: "min" writes the minimum over each sensor's beams, without the grid.
@@ -77,7 +77,7 @@ class RaySensor(ProximitySensor):
         self,
         skin: Skin,
         chain: pk.Chain,
-        objects: Sequence[Shape],
+        objects: Shape | Sequence[Shape],
         max_range: float,
         coverage: Ray | None = None,
         *,
@@ -129,7 +129,7 @@ class RaySensor(ProximitySensor):
         # Temporaries should stay in the cache.
         self._chunk = max(1, _CHUNK // self._beams.shape[-1])
         if compile:
-            bounds = [_SLACK + shape.bounding_radius for shape in objects]
+            bounds = [_SLACK + shape.bounding_radius for shape in self.objects]
             self._use_kernels(
                 "ray",
                 beams=self._num_beams,

@@ -20,6 +20,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 
 from egoskin.kinematics import LinkKinematics, rotate_inverse
+from egoskin.sensors.geometry import ProximitySensor
 from egoskin.transform import RowTransform
 
 # An infinite range has no scale of its own: distance d reads d / (d + 1 m).
@@ -30,8 +31,9 @@ class _Reading(RowTransform):
     """A signal of one number for each measurement, in [0, 1].
 
     Args:
-        max_range: The range of the sensors [m], one or one for each; may be infinite.
-            A measurement beyond it finds nothing.
+        max_range: The sensor whose measurements these are, for its own ranges. Or
+            ranges [m], one or one for each sensor, that may be infinite: a measurement
+            beyond finds nothing, however far the sensor sees.
         validity: Whether the signal's second half says which measurements found
             anything, 1 or 0: a proximity of 1 may be an object at the range exactly.
         in_keys: Key of the measurements.
@@ -45,12 +47,14 @@ class _Reading(RowTransform):
 
     def __init__(
         self,
-        max_range: float | Sequence[float],
+        max_range: ProximitySensor | float | Sequence[float],
         validity: bool,
         in_keys: Sequence[NestedKey],
         out_keys: Sequence[NestedKey],
     ) -> None:
         super().__init__(in_keys, out_keys)
+        if isinstance(max_range, ProximitySensor):
+            max_range = max_range.ranges.tolist()
         limit = torch.as_tensor(max_range, dtype=torch.float64)
         if not (limit > 0).all():
             raise ValueError(f"max_range must be positive, got {max_range}")
@@ -108,8 +112,10 @@ class Proximity(_Reading):
     sensor by sensor.
 
     Args:
-        max_range: The range of the sensors [m], one or one for each. For an infinite
-            one the signal is d / (d + 1 m).
+        max_range: The sensor whose measurements these are, for its own ranges. Or
+            ranges [m], one or one for each sensor: a measurement beyond reads as
+            nothing, however far the sensor sees. For an infinite one the signal is
+            d / (d + 1 m).
         closeness: Write 1 - signal instead: 1 at the sensor, 0 at the range and for
             nothing.
         validity: Append for each measurement whether it found anything.
@@ -122,7 +128,7 @@ class Proximity(_Reading):
 
     def __init__(
         self,
-        max_range: float | Sequence[float],
+        max_range: ProximitySensor | float | Sequence[float],
         *,
         closeness: bool = False,
         validity: bool = False,
@@ -151,8 +157,9 @@ class Binary(_Reading):
     Reads ``distance [*B, S]`` or ``[*B, S, K]`` [m]; writes ``signal [*B, S K]``.
 
     Args:
-        max_range: The range of the sensors [m], one or one for each. (Measurements
-            that are infinite beyond it, those of perfect sensors, need none.)
+        max_range: The sensor whose measurements these are, for its own ranges, or
+            ranges [m], one or one for each sensor. (Measurements that are infinite
+            beyond it, those of perfect sensors, need none.)
         in_keys: Key of the measurements.
         out_keys: Key of the signal.
 
@@ -162,7 +169,7 @@ class Binary(_Reading):
 
     def __init__(
         self,
-        max_range: float | Sequence[float] = math.inf,
+        max_range: ProximitySensor | float | Sequence[float] = math.inf,
         *,
         in_keys: Sequence[NestedKey] = ("distance",),
         out_keys: Sequence[NestedKey] = ("signal",),

@@ -40,8 +40,9 @@ FARTHEST = 2.0
 
 def _is_number(value: object) -> bool:
     """Whether a JSON value is a finite number; Python also reads NaN and 10^400."""
-    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    return is_number and abs(value) <= sys.float_info.max
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return False
+    return abs(value) <= sys.float_info.max
 
 
 def _is_vector(value: object) -> bool:
@@ -127,7 +128,22 @@ def _check_sensor(index: int, sensor: object, types: Mapping[str, Coverage]) -> 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Skin:
-    """Sensors on a robot.
+    """Sensors on a robot, ``S`` of them.
+
+    Args:
+        robot: Name of the robot.
+        links: Link of each sensor, ``S`` names.
+        position: Positions in the link frames [m], ``[S, 3]``.
+        normal: Outward unit normals in the link frames, ``[S, 3]``; as rounded as they
+            come.
+        coverage: What each sensor sees, ``S`` of them; None leaves it to the
+            configuration.
+        range: Range of each sensor [m], ``[S]``; NaN leaves it to the configuration.
+        roll_deg: Turn of each sensor's frame about its normal [deg], ``[S]``; 0 by
+            default.
+        radius: Radius of each sensor itself [m], ``[S]``; NaN if unknown.
+        types: Names of coverages, for the reader of the file; others are numbered.
+        provenance: How the skin was made, for the reader of the file.
 
     Raises:
         ValueError: If the arrays disagree in length, hold values that are not finite
@@ -135,25 +151,15 @@ class Skin:
     """
 
     robot: str
-    """Name of the robot."""
     links: tuple[str, ...]
-    """Link of each sensor, ``S`` names."""
     position: np.ndarray
-    """Positions in the link frames [m], ``[S, 3]``."""
     normal: np.ndarray
-    """Outward unit normals in the link frames, ``[S, 3]``; as rounded as they come."""
     coverage: tuple[Coverage | None, ...] = ()
-    """What each sensor sees, ``S`` of them; None leaves it to the configuration."""
     range: np.ndarray = field(default_factory=lambda: np.empty(0))
-    """Range of each sensor [m], ``[S]``; NaN leaves it to the configuration."""
     roll_deg: np.ndarray = field(default_factory=lambda: np.empty(0))
-    """Turn of each sensor's frame about its normal [deg], ``[S]``; 0 by default."""
     radius: np.ndarray = field(default_factory=lambda: np.empty(0))
-    """Radius of each sensor itself [m], ``[S]``; NaN if unknown."""
     types: Mapping[str, Coverage] = field(default_factory=dict)
-    """Names of coverages, for the reader of the file; others are numbered."""
     provenance: Mapping[str, Any] = field(default_factory=dict)
-    """How the skin was made, for the reader of the file."""
 
     def __post_init__(self) -> None:
         """Fill in defaults, check shapes and values."""

@@ -51,6 +51,15 @@ def is_claimed(folder: Path, name: str, stale: float = STALE_S) -> bool:
         return _lives_elsewhere(folder, name, stale)
 
 
+def is_locked(path: Path) -> bool:
+    """Return whether another process holds the lock of a file."""
+    try:
+        with _lock(path, create=False) as free:
+            return not free
+    except FileNotFoundError:
+        return False
+
+
 @contextmanager
 def claimed(
     folder: Path,

@@ -368,7 +368,7 @@ def sample_efficiency(manifest: Manifest, results: Sequence[Result]) -> Figure |
         if found[1]:
             signal = grid[cell.name].signal if cell.name in grid else ""
             colour = _STYLES.get(signal, (_BLIND, ""))[0]
-            rows.append((cell.name, colour, *found))
+            rows.append((cell.name, colour, found[0], found[1]))
     if not rows:
         return None
     rows.sort(key=lambda row: spread(row[3]).iqm)

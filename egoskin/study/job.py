@@ -87,6 +87,8 @@ def work(folder: StudyFolder, name: str, stop: Stop) -> int:
             return 0
         print(f"{now()} {name}", flush=True)
         run = folder.open_run(planned)
+        if folder.is_trained_elsewhere(name):
+            return CLAIMED
         if not folder.is_trained(planned):
             with open_trainer(run) as trainer:
                 line = ProgressLine(trainer.frames, planned.end)

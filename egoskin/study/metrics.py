@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -147,7 +147,7 @@ def metric(name: str) -> Metric:
     return next(m for m in METRICS if m.name == name)
 
 
-def tables(results: Sequence[Result]) -> dict[str, Table]:
+def tables(results: Sequence[Result]) -> Mapping[str, Table]:
     """Return the values of each metric by cell and seed; of None there is no entry."""
     found: dict[str, dict[str, dict[int, float]]] = {m.name: {} for m in METRICS}
     for result in results:

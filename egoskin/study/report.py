@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import base64
 import html
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -139,7 +139,7 @@ def _blocks(
     folder: StudyFolder,
     manifest: Manifest,
     results: Sequence[Result],
-    values: dict[str, Table],
+    values: Mapping[str, Table],
     judged: Sequence[Judged],
     shown: dict[str, Picture],
 ) -> Iterable[Block]:
@@ -296,7 +296,7 @@ def _finding_rows(judged: Sequence[Judged], results: Sequence[Result]) -> Rows:
     return Rows(head, rows)
 
 
-def _cell_rows(manifest: Manifest, values: dict[str, Table]) -> Rows:
+def _cell_rows(manifest: Manifest, values: Mapping[str, Table]) -> Rows:
     shown = [m for m in METRICS if m.name != "share_to_90"]
     rows = []
     for cell in manifest.cells:

@@ -36,7 +36,7 @@ from egoskin.plain import read_json
 from egoskin.policies import Policy, load_policy
 from egoskin.results import StoredRun, load_run, record, thin, to_json
 from egoskin.runs import Run
-from egoskin.study.claims import is_claimed
+from egoskin.study.claims import is_claimed, is_locked
 from egoskin.study.manifest import EvaluationPlan, Manifest, PlannedRun
 
 State = Literal["done", "running", "failed", "begun", "missing"]
@@ -204,8 +204,12 @@ class StudyFolder:
         if run.checkpoint_path.is_file():
             # The policy is written before the checkpoint, too.
             _, header = load_tensors(run.checkpoint_path)
-            return header["frames"] >= planned.end
+            return header.get("frames", 0) >= planned.end
         return _last_row(path / "metrics.csv").get("frames") == planned.end
+
+    def is_trained_elsewhere(self, name: str) -> bool:
+        """Return whether somebody else trains a run, such as ppo.py an adopted one."""
+        return is_locked(self.run_path(name) / "lock")
 
     def is_finished(self, name: str) -> bool:
         """Return whether a run has been trained and judged."""
@@ -330,7 +334,7 @@ class StudyFolder:
         frames, wall = int(row.get("frames", 0)), row.get("time/wall_s", 0.0)
         failure = self.failure(run.name)
         state: State = "missing"
-        if is_claimed(self.claims, run.name):
+        if is_claimed(self.claims, run.name) or self.is_trained_elsewhere(run.name):
             state = "running"
         elif failure is not None:
             state = "failed"

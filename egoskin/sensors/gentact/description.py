@@ -296,7 +296,7 @@ def _framed(
     x_axis: np.ndarray | None = own[:, 0]
     if normal is None or not normal.any():
         normal = own[:, 2]
-    cosine = own[:, 2] @ normal / max(float(np.linalg.norm(normal)), 1e-9)
+    cosine = own[:, 2] @ normal / max(math.hypot(*normal), 1e-9)
     angle = math.degrees(math.acos(min(max(cosine, -1.0), 1.0)))
     if angle > _SAME_DIRECTION:
         if (own != np.eye(3)).any():

@@ -133,15 +133,19 @@ def _load(
     else:
         export = read_table(text, path, names, problems)
     unit = _metres_per_unit(path, export, scale)
-    position = unit * np.array([s.position for s in export.sensors]).reshape(-1, 3)
-    outward, distance = _outward(export.sensors, position, primitives)
     first: dict[str, str] = {}
-    kept, normals, radii = [], [], []
-    num_normalised = 0
-    for i, sensor in enumerate(export.sensors):
+    sensors = []
+    for sensor in export.sensors:
         with problems.collect():
             _check_new(sensor, first)
-            _check_near(sensor, position[i], unit)
+            _check_near(sensor, unit)
+            sensors.append(sensor)
+    position = unit * np.array([s.position for s in sensors]).reshape(-1, 3)
+    outward, distance = _outward(sensors, position, primitives)
+    kept, normals, radii = [], [], []
+    num_normalised = 0
+    for i, sensor in enumerate(sensors):
+        with problems.collect():
             radius = _radius(sensor, export.radius_unit or unit)
             normal, was_changed = _normal(sensor, outward[i])
             kept.append(i)
@@ -150,7 +154,7 @@ def _load(
             num_normalised += was_changed
     if not kept:
         return None
-    sensors, distance = [export.sensors[i] for i in kept], distance[kept]
+    sensors, distance = [sensors[i] for i in kept], distance[kept]
     source = "the file's"
     if any(s.normal is None for s in sensors):
         source = "those of the robot's primitives: the file has none"
@@ -204,7 +208,7 @@ def _metres_per_unit(path: Path, export: Export, scale: float | None) -> float:
             "give scale (--scale 0.001 for millimetres, --scale 1 for metres)"
         )
     if scale is None and unit != 1.0 and export.sensors:
-        length = [unit * float(np.linalg.norm(s.position)) for s in export.sensors]
+        length = [unit * math.hypot(*s.position) for s in export.sensors]
         worst = int(np.argmax(length))
         if length[worst] < _NEAREST:
             raise _wrong_unit(export.sensors[worst], length[worst], unit)
@@ -221,9 +225,9 @@ def _wrong_unit(sensor: Sensor, length: float, unit: float) -> SensorError:
     )
 
 
-def _check_near(sensor: Sensor, position: np.ndarray, unit: float) -> None:
+def _check_near(sensor: Sensor, unit: float) -> None:
     """Raise SensorError if a sensor lies where none is on a robot."""
-    length = float(np.linalg.norm(position))
+    length = unit * math.hypot(*sensor.position)
     if length > FARTHEST:
         raise _wrong_unit(sensor, length, unit)
 
@@ -282,7 +286,7 @@ def _normal(sensor: Sensor, outward: np.ndarray) -> tuple[np.ndarray, bool]:
                 "export with normals (the current CSV)",
             )
         return outward / length, False
-    length = float(np.linalg.norm(sensor.normal))
+    length = math.hypot(*sensor.normal)
     if not abs(length - 1) <= _ALMOST_UNIT:
         raise SensorError(
             f"{sensor.where}: the normal must have length 1, got {length:.4g}"

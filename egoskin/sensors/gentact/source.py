@@ -17,6 +17,10 @@ NO_RADIUS = 0.1
 _BELOW_LINK = re.compile(r"(visuals|collisions|geometry)([._]?\d+)?")
 
 
+# Of a file with more invalid sensors than this the rest is not read; so many are named.
+_MOST_INVALID, _SHOWN = 1000, 100
+
+
 class SensorError(ValueError):
     """One sensor cannot be read for certain.
 
@@ -43,6 +47,11 @@ class Problems:
             yield
         except SensorError as error:
             self.found.append(error)
+            if len(self.found) > _MOST_INVALID:
+                raise ValueError(
+                    f"more than {_MOST_INVALID:,} sensors cannot be read; the first: "
+                    f"{self.found[0]}"
+                ) from None
 
     def raise_all(self) -> None:
         """Raise ValueError if a sensor was invalid."""
@@ -52,10 +61,12 @@ class Problems:
             )
         if self.found:
             remedies = dict.fromkeys(e.remedy for e in self.found if e.remedy)
+            rest = len(self.found) - _SHOWN
             lines = [
                 f"{len(self.found)} sensors cannot be read; mend them, or leave them "
                 "out with skip_invalid (--skip-invalid):",
-                *(f"  {error.what}" for error in self.found),
+                *(f"  {error.what}" for error in self.found[:_SHOWN]),
+                *([f"  and {rest} more"] if rest > 0 else []),
                 *remedies,
             ]
             raise ValueError("\n".join(lines))

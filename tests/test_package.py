@@ -1,0 +1,130 @@
+"""What people meet first: the names of the package, its help, README's examples."""
+
+from __future__ import annotations
+
+import pydoc
+import re
+import shutil
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import gymnasium
+import pytest
+import torch
+from setuptools.config.pyprojecttoml import read_configuration
+from tensordict import TensorDict
+
+import egoskin
+from egoskin.sensors import FieldSensor, RaySensor, Skin
+from egoskin.shapes import Sphere
+
+README = Path(__file__).parents[1] / "README.md"
+
+
+def test_the_package_lists_its_names_and_its_version():
+    # In a new process: here they have been imported by other tests.
+    code = "import egoskin, sys; print(*dir(egoskin)); print('torch' in sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    names, imported = done.stdout.splitlines()
+    assert {"__version__", *egoskin.__all__} <= set(names.split())
+    assert imported == "False"
+    for name in egoskin.__all__:
+        assert getattr(egoskin, name).__module__.startswith("egoskin.")
+    # The one that setuptools writes into the package.
+    built = read_configuration(README.parent / "pyproject.toml")
+    assert built["project"]["version"] == egoskin.__version__
+
+
+def test_help_on_a_skin_says_shapes_and_units():
+    text = pydoc.plain(pydoc.render_doc(Skin))
+    for name, shape in {
+        "position": "[S, 3]",
+        "normal": "[S, 3]",
+        "range": "[S]",
+    }.items():
+        assert re.search(rf"{name}: [^:]*{re.escape(shape)}", text), name
+    assert "[m]" in text
+
+
+def test_an_environment_has_the_skin_of_its_configuration_by_default():
+    config = egoskin.EnvConfig()
+
+    def still(td: TensorDict) -> TensorDict:
+        return td.set("action", torch.zeros(*td.shape, 21))
+
+    signals = []
+    for env in (
+        egoskin.make_worker_env(
+            config, config.skin.build(config.robot_config), num_envs=2, seed=0
+        ),
+        egoskin.make_worker_env(config, num_envs=2, seed=0),
+        egoskin.make_env(config, num_envs=2, seed=0, num_workers=1),
+    ):
+        rollout = env.rollout(40, still, break_when_any_done=False)
+        signals.append(rollout["signal"].reshape(2, 40, 64))
+        env.close()
+    given, default, pooled = signals
+    assert (given < 1).any()
+    assert torch.equal(default, given)
+    assert torch.equal(pooled, given)
+
+
+def test_the_state_for_sparse_sources_has_no_history():
+    config = egoskin.EnvConfig(history=2)
+    with pytest.raises(ValueError, match="history 2 needs signals: leave sparse off"):
+        egoskin.make_worker_env(config, num_envs=1, seed=0, sparse=True)
+
+
+@pytest.mark.parametrize("kind", [FieldSensor, RaySensor])
+@pytest.mark.parametrize("compiled", [False, True])
+def test_one_shape_needs_no_list(kind, compiled, robot, skin, random_state):
+    ball, state = Sphere(radius=0.3), random_state(50, objects=1)
+    one, listed = (
+        kind(skin, robot.chain, objects, 2.0, compile=compiled)(state.clone())
+        for objects in (ball, [ball])
+    )
+    assert one["object_detected"].any()
+    assert torch.equal(one["distance"], listed["distance"])
+    with pytest.raises(ValueError, match="at least one object"):
+        kind(skin, robot.chain, [], 2.0)
+    for wrong in (0.3, [0.3]):
+        with pytest.raises(ValueError, match=r"must be shapes .* got 0\.3"):
+            kind(skin, robot.chain, wrong, 2.0)
+
+
+# --- README -----------------------------------------------------------------------
+
+
+def examples() -> list[str]:
+    """The programs in the README: indented blocks that import something."""
+    blocks = re.findall(r"(?:^(?: {4}.*)?\n)+", README.read_text(), re.MULTILINE)
+    code = [textwrap.dedent(block).strip("\n") for block in blocks]
+    return [
+        block for block in code if re.search("^(import|from) ", block, re.MULTILINE)
+    ]
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_the_readmes_examples_run_as_given(number, tmp_path):
+    # The file that an example loads lies beside it.
+    models = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
+    shutil.copy(models / "humanoid.xml", tmp_path)
+    assert len(examples()) == 2
+    script = tmp_path / "example.py"
+    script.write_text(examples()[number])
+    done = subprocess.run(
+        [sys.executable, "-W", "error::UserWarning", script],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    # What the comments say comes out.
+    said = re.findall(r"print\(.*# (.*)", examples()[number])
+    assert said
+    assert list(dict.fromkeys(done.stdout.splitlines())) == said
