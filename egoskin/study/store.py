@@ -409,7 +409,7 @@ def judge(
         "standard": plan.standard,
         "trained_on": policy.env_config.standard,
         "bank_seed": plan.throw_set,
-        "frames": policy.spec.frames,
+        "frames": policy.policy_spec.frames,
         "mask": [],
     }
 
