@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import random
 import shutil
@@ -9,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import egoskin
-from egoskin.formats import sealed_json
+from egoskin.formats import content_hash, read_sealed, sealed_json
 from egoskin.results import Record, to_json
 from egoskin.runs import Run
 from egoskin.study.manifest import Manifest, PlannedRun
@@ -32,6 +33,23 @@ def expected(run: PlannedRun) -> float:
         full = sensor.reduce == "none" and sensor.signal != "localization"
         success *= 0.25 if full else 0.85
     return success
+
+
+def as_format_1(path: Path) -> None:
+    """Make a manifest or a configuration what one of format 1 would have been."""
+    content, _ = read_sealed(path)
+    base = content.get("base", content)
+    throws = base["env"]["task"]["throws"]
+    # Then first_delay and another aim did not exist, and these options did.
+    throws.pop("first_delay")
+    throws.pop("aim")
+    base["compile_kernels"] = True
+    base["env"]["sensor"]["numb"] = False
+    if "cells" in content:
+        content["cells"][0]["overrides"]["compile_kernels"] = False
+    sealed = {"format": 1, "egoskin": "0.0.1", **content}
+    sealed["sha256"] = content_hash(sealed)
+    path.write_text(json.dumps(sealed))
 
 
 def estimate(mean: float, half: float = 0.01) -> dict[str, float]:

@@ -23,6 +23,7 @@ from egoskin.study.manifest import (
 from egoskin.study.metrics import METRICS
 from egoskin.study.shipped import PAPER, SMOKE, STUDIES
 from egoskin.study.store import StudyFolder
+from studies import as_format_1
 
 STUDY = Study(
     name="small",
@@ -190,22 +191,6 @@ def test_a_manifest_that_was_edited_is_refused(tmp_path: Path):
         folder.manifest()
     with pytest.raises(ValueError, match="is no folder of a study"):
         StudyFolder(tmp_path / "none").manifest()
-
-
-def as_format_1(path: Path) -> None:
-    """Make a manifest what one of format 1 would have been."""
-    content, _ = read_sealed(path)
-    base = content["base"]
-    throws = base["env"]["task"]["throws"]
-    # Then first_delay and another aim did not exist, and these options did.
-    throws.pop("first_delay")
-    throws.pop("aim")
-    base["compile_kernels"] = True
-    base["env"]["sensor"]["numb"] = False
-    content["cells"][0]["overrides"]["compile_kernels"] = False
-    sealed = {"format": 1, "egoskin": "0.0.1", **content}
-    sealed["sha256"] = content_hash(sealed)
-    path.write_text(json.dumps(sealed))
 
 
 def test_a_study_begun_before_options_changed_goes_on_as_it_was(tmp_path: Path):
