@@ -14,10 +14,10 @@ from egoskin.formats import content_hash, read_sealed, sealed_json
 from egoskin.results import Record, to_json
 from egoskin.runs import Run
 from egoskin.study.manifest import Manifest, PlannedRun
-from egoskin.study.store import StudyFolder, _policy_hash
+from egoskin.study.store import StudyFolder, policy_hash
 
 POLICY = Path(egoskin.__file__).parent / "assets/policies/blind.safetensors"
-_HASH = _policy_hash(POLICY)
+_HASH = policy_hash(POLICY)
 
 # Success at 3 s that a signal would reach with a range of 2 m [%].
 _BEST = {"localization": 66, "proximity": 64, "binary": 60}

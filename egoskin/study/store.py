@@ -241,7 +241,7 @@ class StudyFolder:
             f"evaluation_{end:012d}.json": sealed_json(
                 {
                     "run": planned.name,
-                    "policy_sha256": _policy_hash(policy),
+                    "policy_sha256": policy_hash(policy),
                     **evaluation,
                 }
             ),
@@ -270,7 +270,7 @@ class StudyFolder:
                 f"{file} is of a policy of {evaluation['frames']:,} frames, not of "
                 f"{planned.end:,}"
             )
-        digest = _policy_hash(folder / "policies" / f"{planned.end:012d}.safetensors")
+        digest = policy_hash(folder / "policies" / f"{planned.end:012d}.safetensors")
         if digest != evaluation["policy_sha256"]:
             raise ValueError(f"{file} is of another policy than the one beside it")
         stored = dataclasses.replace(stored, evaluation=evaluation)
@@ -426,7 +426,7 @@ def judge_run(
     folder.finish(planned, judge(policy, plan, on_step))
 
 
-def _policy_hash(path: Path) -> str:
+def policy_hash(path: Path) -> str:
     """Return the hash of what a policy computes with, whoever wrote its file."""
     tensors, header = load_tensors(path)
     spec = header["policy"]
