@@ -14,6 +14,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -26,6 +27,7 @@ from egoskin.interrupts import ENDING
 from egoskin.plain import to_plain
 from egoskin.runs import Run
 from egoskin.study.claims import claimed
+from egoskin.study.cost import cost, measure
 from egoskin.study.job import CLAIMED, STOPPED, Stop, work
 from egoskin.study.manifest import EvaluationPlan, Manifest, Study, resolve
 from egoskin.study.metrics import runs_csv
@@ -257,6 +259,23 @@ def test_status_tells_failures_and_what_is_left(folder: StudyFolder):
     assert str(progress) == "1 done, 1 failed, 1 missing; 33.3% of the frames, ETA -"
     folder.forget_failures()
     assert folder.status(manifest)[1].state == "missing"
+
+
+def test_a_study_costs_whole_runs_on_whole_cores(tiny: Manifest):
+    total = cost(tiny, per_s=1000)
+    # 4 runs of 3.072 s: on three cores the fourth has to wait.
+    assert (total.runs, total.frames) == (4, 4 * 12 * BATCH)
+    assert total.core_s == pytest.approx(12.288)
+    assert total.wall_s(3) == pytest.approx(2 * 3.072)
+    assert total.wall_s(64) == pytest.approx(3.072)
+
+
+def test_the_speed_is_measured_and_nothing_is_left(
+    tiny: Manifest, monkeypatch, tmp_path
+):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    assert 10 < measure(tiny.runs[1]) < 1e6
+    assert not list(tmp_path.glob("egoskin-*"))
 
 
 def test_durations_are_readable():
