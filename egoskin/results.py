@@ -142,20 +142,21 @@ def _at(content: Any, name: str) -> Any:
     return content
 
 
-def thin(text: str) -> str:
+def thin(text: str, every: int = _THIN_FRAMES) -> str:
     """Return a run's metrics with fewer lines and digits.
 
-    Kept are the first line at or past each multiple of 2**18 environment steps and
-    the last one.
+    Kept are the first line at or past each multiple of some environment steps and the
+    last one.
 
     Args:
         text: Content of a ``metrics.csv``.
+        every: Environment steps between the lines that are kept.
     """
     source = csv.DictReader(io.StringIO(text))
     rows = list(source)
     kept, last = [], -1
     for row in rows:
-        block = int(row["frames"]) // _THIN_FRAMES
+        block = int(row["frames"]) // every
         if block > last or row is rows[-1]:
             kept.append(row)
         last = block

@@ -1,0 +1,395 @@
+"""Pictures of a study, as PNG and SVG: colours that all readers tell apart, units."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from egoskin.study.findings import MARGIN, SAME, Judged
+from egoskin.study.manifest import Cell, Manifest
+from egoskin.study.metrics import frames_to
+from egoskin.study.statistics import Effect, Table, contrast, spread
+from egoskin.study.store import Result
+
+# Okabe and Ito's colours, told apart by colour-blind readers; and a mark of each.
+_STYLES = {
+    "localization": ("#0072B2", "o"),
+    "proximity": ("#D55E00", "s"),
+    "binary": ("#009E73", "^"),
+    "closeness": ("#CC79A7", "D"),
+}
+_OTHERS = ("#E69F00", "#56B4E9", "#CC79A7", "#0072B2", "#D55E00", "#009E73")
+_BLIND, _ORACLE = "#555555", "#000000"
+_VERDICTS = {"confirmed": "#0072B2", "refuted": "#D55E00", "undecided": "#888888"}
+_GEOMETRIES = {
+    ("field", "none"): "field",
+    ("ray", "none"): "ray, all 64 beams",
+    ("ray", "min"): "ray, closest beam",
+}
+# Fields that place a cell in the paper's grid.
+_GRID = {f"env.sensor.{name}" for name in ("coverage", "signal", "range", "reduce")}
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a cell stands in the paper's grid."""
+
+    geometry: str
+    """Coverage, and what of a ray is given."""
+    signal: str
+    """Signal."""
+    range: float
+    """Range [m]."""
+
+
+def places(manifest: Manifest) -> dict[str, Place]:
+    """Return where the cells stand that differ in nothing but the paper's fields.
+
+    Localization is the same with all beams and the closest: it stands for both.
+    """
+    found = {}
+    for cell in manifest.cells:
+        sensor = cell.config.env.sensor
+        key = (sensor.coverage, sensor.reduce)
+        if set(manifest.overrides(cell)) <= _GRID and key in _GEOMETRIES:
+            place = Place(_GEOMETRIES[key], sensor.signal, sensor.range)
+            found[cell.name] = place
+    return found
+
+
+def _geometry(name: str, grid: Mapping[str, Place]) -> dict[tuple[str, float], str]:
+    """Return the cells of a geometry by signal and range."""
+    ray = {p for p in _GEOMETRIES.values() if p.startswith("ray")}
+    return {
+        (place.signal, place.range): cell
+        for cell, place in grid.items()
+        if place.geometry == name
+        or (place.signal == "localization" and {place.geometry, name} <= ray)
+    }
+
+
+def _unskinned(manifest: Manifest, coverage: str) -> Cell | None:
+    """Return the cell without a skin, of those that differ in nothing else."""
+    for cell in manifest.cells:
+        own = cell.config.env.sensor.coverage
+        if own == coverage and set(manifest.overrides(cell)) <= _GRID:
+            return cell
+    return None
+
+
+def save(figure: Figure, folder: Path, name: str) -> None:
+    """Write a figure as PNG and SVG, the same bytes for the same figures."""
+    with mpl.rc_context({"svg.hashsalt": name, "svg.fonttype": "path"}):
+        figure.savefig(folder / f"{name}.png", dpi=130, metadata={"Software": None})
+        figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
+
+
+def _plain(axes: Axes) -> None:
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(axis="y", linewidth=0.4, alpha=0.5)
+
+
+def success_by_range(manifest: Manifest, table: Table) -> Figure | None:
+    """Draw the paper's figure: success against range; None without its cells.
+
+    A line for each signal, a panel for each geometry; interquartile mean and range over
+    seeds, and each seed as a small dot.
+    """
+    grid = {k: v for k, v in places(manifest).items() if table.get(k)}
+    names = [
+        n for n in _GEOMETRIES.values() if n in {p.geometry for p in grid.values()}
+    ]
+    if not names:
+        return None
+    figure = Figure(figsize=(1.2 + 3.5 * len(names), 4.0), layout="constrained")
+    panels = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
+    for axes, name in zip(panels, names, strict=True):
+        cells = _geometry(name, grid)
+        for signal, (colour, mark) in _STYLES.items():
+            ranges = sorted(r for s, r in cells if s == signal)
+            if not ranges:
+                continue
+            rows = [list(table[cells[signal, r]].values()) for r in ranges]
+            all_seeds = [spread(row) for row in rows]
+            x, mean = np.array(ranges), [s.iqm for s in all_seeds]
+            axes.plot(x, mean, marker=mark, color=colour, label=signal, linewidth=2)
+            low, high = ([getattr(s, k) for s in all_seeds] for k in ("low", "high"))
+            axes.fill_between(x, low, high, color=colour, alpha=0.18, linewidth=0)
+            for reach, row in zip(ranges, rows, strict=True):
+                axes.plot([reach] * len(row), row, ".", color=colour, markersize=4)
+        for coverage, colour in (("none", _BLIND), ("oracle", _ORACLE)):
+            cell = _unskinned(manifest, coverage)
+            if cell is not None and table.get(cell.name):
+                own = spread(list(table[cell.name].values()))
+                label = "blind" if coverage == "none" else coverage
+                axes.axhline(own.iqm, color=colour, linestyle="--", label=label)
+                axes.axhspan(own.low, own.high, color=colour, alpha=0.15, linewidth=0)
+        ticks = sorted({p.range for p in grid.values()})
+        axes.set_xscale("log")
+        axes.set_xticks(ticks, [f"{t:g}" for t in ticks], minor=False)
+        axes.xaxis.minorticks_off()
+        axes.set(xlabel="detection range [m]", title=name, ylim=(0, 100))
+        _plain(axes)
+    panels[0].set_ylabel("success: untouched for 3 s [%]")
+    _legend_above(figure, panels)
+    return figure
+
+
+def _legend_above(figure: Figure, panels: Iterable[Axes]) -> None:
+    """Draw one legend for all panels."""
+    handles: dict[str, Any] = {}
+    for axes in panels:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            handles.setdefault(label, handle)
+    figure.legend(
+        list(handles.values()),
+        list(handles),
+        loc="outside upper center",
+        ncols=min(len(handles), 5),
+        frameon=False,
+        fontsize=9,
+    )
+
+
+def learning_curves(manifest: Manifest, results: Sequence[Result]) -> Figure | None:
+    """Draw success in training against frames: each seed thin, their mean thick.
+
+    Rows are geometries, columns ranges; cells of another kind have a row of their own.
+    """
+    by_cell: dict[str, list[Result]] = {}
+    for result in results:
+        if len(result.stored.frames):
+            by_cell.setdefault(result.run.cell.name, []).append(result)
+    if not by_cell:
+        return None
+    grid = {k: v for k, v in places(manifest).items() if k in by_cell}
+    blind, oracle = (_unskinned(manifest, c) for c in ("none", "oracle"))
+    bare = {c.name for c in (blind, oracle) if c is not None}
+    others = [name for name in by_cell if name not in grid and name not in bare]
+    rows = [n for n in _GEOMETRIES.values() if n in {p.geometry for p in grid.values()}]
+    ranges = sorted({p.range for p in grid.values()})
+    panels: list[list[tuple[str, dict[str, str]]]] = [
+        [
+            (
+                f"{row}, {reach:g} m",
+                {
+                    cell: _STYLES[signal][0]
+                    for (signal, r), cell in _geometry(row, grid).items()
+                    if r == reach
+                },
+            )
+            for reach in ranges
+        ]
+        for row in rows
+    ]
+    if others or not panels:
+        colours = {n: _OTHERS[i % len(_OTHERS)] for i, n in enumerate(others)}
+        panels.append([("other cells" if panels else "all cells", colours)])
+    width = max(map(len, panels))
+    figure = Figure(
+        figsize=(1.0 + 3.0 * max(width, 2), 0.6 + 2.3 * len(panels)),
+        layout="constrained",
+    )
+    axes_grid = figure.subplots(
+        len(panels), width, sharex=True, sharey=True, squeeze=False
+    )
+    for axes, panel in zip(
+        axes_grid.flat,
+        (p for row in panels for p in row + [None] * (width - len(row))),
+        strict=True,
+    ):
+        if panel is None:
+            axes.set_visible(False)
+            continue
+        title, cells = panel
+        shown = {**cells}
+        for cell, colour in ((blind, _BLIND), (oracle, _ORACLE)):
+            if cell is not None:
+                shown[cell.name] = colour
+        for name, colour in shown.items():
+            if name in by_cell:
+                label = _legend(name, grid)
+                _draw_curves(axes, by_cell[name], colour, label)
+        axes.set_title(title, fontsize=10)
+        axes.set_ylim(0, 100)
+        _plain(axes)
+    _legend_above(figure, axes_grid.flat)
+    figure.supxlabel("environment steps [millions]", fontsize=10)
+    figure.supylabel("success at 3 s in training [%]", fontsize=10)
+    return figure
+
+
+def _legend(name: str, grid: Mapping[str, Place]) -> str:
+    return grid[name].signal if name in grid else name
+
+
+def _draw_curves(
+    axes: Axes, results: Sequence[Result], colour: str, label: str
+) -> None:
+    """Draw the learning curves of a cell."""
+    first = max(r.stored.frames[0] for r in results)
+    last = min(r.stored.frames[-1] for r in results)
+    for result in results:
+        frames, success = result.stored.frames, 100 * result.stored.success
+        axes.plot(frames / 1e6, success, color=colour, linewidth=0.6, alpha=0.6)
+    x = np.array([f for f in results[0].stored.frames if first <= f <= last])
+    if len(x):
+        mean = np.mean(
+            [np.interp(x, r.stored.frames, r.stored.success) for r in results], 0
+        )
+        axes.plot(x / 1e6, 100 * mean, color=colour, linewidth=2, label=label)
+
+
+def _draw_effect(axes: Axes, y: float, effect: Effect, colour: str) -> None:
+    """Draw an estimate with its 90 % (thick) and 95 % (thin) interval."""
+    if effect.error > 0:
+        for level, width in ((0.95, 1.0), (0.9, 3.0)):
+            axes.plot(effect.interval(level), [y, y], color=colour, linewidth=width)
+    face = colour if effect.error > 0 else "white"
+    axes.plot(effect.mean, y, "o", color=colour, markerfacecolor=face, markersize=5)
+    axes.text(
+        1.01,
+        y,
+        f"n = {effect.seeds}",
+        transform=axes.get_yaxis_transform(),
+        fontsize=7,
+        va="center",
+    )
+
+
+def forest(judged: Sequence[Judged]) -> Figure:
+    """Draw the claims of the findings: where each should lie, and where it does."""
+    rows = sum(len(j.claims) + 1 for j in judged)
+    figure = Figure(figsize=(10.5, 0.8 + 0.24 * rows), layout="constrained")
+    axes = figure.subplots()
+    y, ticks, labels = 0.0, [], []
+    for each in judged:
+        colour = _VERDICTS[each.verdict]
+        mark = " (stand-in)" * bool(each.finding.stand_in)
+        title = f"{each.finding.label}  {each.finding.text}{mark}: {each.verdict}"
+        axes.text(-99, y, title, fontsize=8.5, weight="bold", color=colour, va="center")
+        y += 1
+        for claim in each.claims:
+            low, high = np.clip(
+                [claim.claim.region.low, claim.claim.region.high], -100, 100
+            )
+            axes.barh(y, high - low, left=low, height=0.9, color="#E9E3B4", linewidth=0)
+            if claim.effect is None:
+                axes.text(0, y, " no runs", fontsize=7, color="#888888", va="center")
+            else:
+                _draw_effect(axes, y, claim.effect, colour)
+            ticks.append(y)
+            labels.append(claim.claim.name)
+            y += 1
+    axes.axvline(0, color="black", linewidth=0.8)
+    axes.set_yticks(ticks, labels, fontsize=7)
+    axes.set_xlim(-100, 100)
+    axes.set_ylim(y - 0.3, -0.7)
+    axes.set_xlabel("effect [percentage points]")
+    axes.spines[["top", "right", "left"]].set_visible(False)
+    axes.tick_params(axis="y", length=0)
+    return figure
+
+
+def equivalence(manifest: Manifest, table: Table) -> Figure | None:
+    """Draw which signals of one geometry and range are equivalent; None without pairs.
+
+    Equivalent is a pair whose 90 % interval lies within the margin; different, one
+    whose 95 % interval does not hold 0.
+    """
+    grid = {k: v for k, v in places(manifest).items() if table.get(k)}
+    pairs = []
+    for name in _GEOMETRIES.values():
+        cells = _geometry(name, grid)
+        for one, other in (
+            ("proximity", "localization"),
+            ("binary", "localization"),
+            ("binary", "proximity"),
+        ):
+            for reach in sorted({r for _, r in cells}):
+                if (one, reach) in cells and (other, reach) in cells:
+                    weights = {cells[one, reach]: 1.0, cells[other, reach]: -1.0}
+                    effect = contrast(weights, table)
+                    assert effect is not None
+                    pairs.append((f"{name}, {reach:g} m: {one} - {other}", effect))
+    if not pairs:
+        return None
+    figure = Figure(figsize=(9.5, 1.3 + 0.25 * len(pairs)), layout="constrained")
+    axes = figure.subplots()
+    axes.axvspan(-MARGIN, MARGIN, color="#E9E3B4", linewidth=0)
+    axes.axvline(0, color="black", linewidth=0.8)
+    kinds = {
+        "equivalent within 5 points": "#0072B2",
+        "different": "#D55E00",
+        "undecided": "#888888",
+    }
+    for y, (_, effect) in enumerate(pairs):
+        low, high = effect.interval()
+        kind = "undecided"
+        if SAME.p_inside(effect) <= 0.05:
+            kind = "equivalent within 5 points"
+        elif low > 0 or high < 0:
+            kind = "different"
+        _draw_effect(axes, y, effect, kinds[kind])
+    for kind, colour in kinds.items():
+        axes.plot([], [], "o-", color=colour, label=kind, markersize=5)
+    figure.legend(loc="outside upper center", ncols=3, frameon=False, fontsize=9)
+    axes.set_yticks(range(len(pairs)), [name for name, _ in pairs], fontsize=8)
+    axes.set_ylim(len(pairs) - 0.4, -0.6)
+    reach = max(abs(e.mean) for _, e in pairs)
+    reach = max(
+        [
+            reach,
+            *(min(max(map(abs, e.interval())), 100) for _, e in pairs if e.error > 0),
+        ]
+    )
+    axes.set_xlim(-1.1 * reach - MARGIN, 1.1 * reach + MARGIN)
+    axes.set_xlabel("difference of the success at 3 s [percentage points]")
+    axes.spines[["top", "right", "left"]].set_visible(False)
+    axes.tick_params(axis="y", length=0)
+    return figure
+
+
+def sample_efficiency(manifest: Manifest, results: Sequence[Result]) -> Figure | None:
+    """Draw the frames until 50 % and 90 % of a run's own end, by cell and seed."""
+    grid = places(manifest)
+    rows: list[tuple[str, str, list[float], list[float]]] = []
+    for cell in manifest.cells:
+        own = [r for r in results if r.run.cell == cell]
+        half, most = ([frames_to(r, s) for r in own] for s in (0.5, 0.9))
+        found = [[f / 1e6 for f in x if f is not None] for x in (half, most)]
+        if found[1]:
+            signal = grid[cell.name].signal if cell.name in grid else ""
+            colour = _STYLES.get(signal, (_BLIND, ""))[0]
+            rows.append((cell.name, colour, found[0], found[1]))
+    if not rows:
+        return None
+    rows.sort(key=lambda row: spread(row[3]).iqm)
+    figure = Figure(figsize=(8.5, 1.2 + 0.26 * len(rows)), layout="constrained")
+    axes = figure.subplots()
+    for y, (_, colour, half, most) in enumerate(rows):
+        ends = [spread(half).iqm, spread(most).iqm]
+        axes.plot(ends, [y, y], color=colour, linewidth=2)
+        axes.plot(ends[0], y, "o", color=colour, markerfacecolor="white", markersize=6)
+        axes.plot(ends[1], y, "o", color=colour, markersize=6)
+        axes.plot(most, [y] * len(most), "|", color=colour, markersize=9)
+    for signal, (colour, _) in _STYLES.items():
+        if colour in {row[1] for row in rows}:
+            axes.plot([], [], "o-", color=colour, label=signal)
+    axes.plot([], [], "o", color="black", markerfacecolor="white", label="50 %")
+    axes.plot([], [], "o", color="black", label="90 % (bars: seeds)")
+    figure.legend(loc="outside upper center", ncols=5, frameon=False, fontsize=9)
+    axes.set_yticks(range(len(rows)), [row[0] for row in rows], fontsize=8)
+    axes.set_ylim(len(rows) - 0.4, -0.6)
+    axes.set_xlim(left=0)
+    axes.set_xlabel("environment steps to 50 and 90 % of the run's own end [millions]")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(axis="x", linewidth=0.4, alpha=0.5)
+    return figure

@@ -1,0 +1,307 @@
+"""The paper's findings as contrasts of cells, fixed before any run.
+
+A finding is one or more claims, all of which must hold: each says in which region a
+contrast of cells lies. A claim is *confirmed* by a test that it lies there, *refuted*
+by a test that it lies beyond; otherwise it is undecided. A finding is confirmed if all
+of its claims are (the largest p-value), refuted if any is (Bonferroni); and the whole
+family is corrected by Holm's method.
+
+Two findings of the paper speak of its own budget, of 3000 and of 1000 epochs. For them
+stands another one, of our budget, which is called a stand-in.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import product
+from typing import Literal
+
+from egoskin.study.shipped import RANGES
+from egoskin.study.statistics import (
+    ALPHA,
+    Effect,
+    Region,
+    Table,
+    contrast,
+    holm,
+    seed_sd,
+    seeds_needed,
+)
+
+MARGIN = 5.0
+"""Two successes closer than this are equivalent [percentage points]."""
+ABOVE, SAME = Region(low=0.0), Region(low=-MARGIN, high=MARGIN)
+NOT_BELOW = Region(low=-MARGIN)
+
+Verdict = Literal["confirmed", "refuted", "undecided"]
+"""What the runs say of a finding."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Claim:
+    """That a contrast lies in a region."""
+
+    name: str
+    """What is compared."""
+    weights: Mapping[str, float]
+    """Weight of each cell."""
+    region: Region
+    """Where the contrast is claimed to lie."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """A finding of the paper."""
+
+    label: str
+    """Its number in the paper, with a letter for each of several claims."""
+    text: str
+    """What the paper says."""
+    claims: tuple[Claim, ...]
+    """What of it is tested; all must hold."""
+    metric: str = "success_3s"
+    """Metric of the contrasts, see `egoskin.study.report.METRICS`."""
+    stand_in: str = ""
+    """What stands for a finding of another budget, "" if it is tested as it is."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tested:
+    """A claim and what the runs say of it."""
+
+    claim: Claim
+    """The claim."""
+    effect: Effect | None
+    """The contrast; None if one of its cells has no run."""
+    p_confirm: float
+    """P-value of "it lies in its region"."""
+    p_refute: float
+    """P-value of "it lies beyond"."""
+    seeds_needed: int | None
+    """Seeds that would decide it; None if unknown or none would."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Judged:
+    """A finding and what the runs say of it."""
+
+    finding: Finding
+    """The finding."""
+    claims: tuple[Tested, ...]
+    """Its claims."""
+    verdict: Verdict
+    """What the runs say."""
+    p_value: float
+    """P-value of the verdict, or of the likelier one, after Holm's correction."""
+    seeds_needed: int | None
+    """Seeds a cell that would decide it; None if unknown or none would."""
+
+
+def cell(coverage: str, signal: str, reach: float, *, reduced: bool = False) -> str:
+    """Return the name of a cell, as `egoskin.study.manifest.cell_name` gives it."""
+    return f"{coverage}-{signal}-{reach:g}m" + "-reduce-min" * reduced
+
+
+def _difference(one: str, other: str, region: Region) -> Claim:
+    name = f"{one} - {other}"
+    return Claim(name=name, weights={one: 1.0, other: -1.0}, region=region)
+
+
+def _best(coverage: str, *, reduced: bool, ranges: tuple[float, ...]) -> list[Claim]:
+    """That localization is better than what else a geometry can give."""
+    return [
+        _difference(
+            cell(coverage, "localization", reach),
+            cell(coverage, signal, reach, reduced=reduced),
+            ABOVE,
+        )
+        for reach, signal in product(ranges, ("proximity", "binary"))
+    ]
+
+
+# Of full and reduced rays the study has no pairs at 0.2 m.
+_RAY_RANGES = RANGES[1:]
+_DEFICIT = [
+    {cell("field", "localization", r): 1.0, cell("ray", "localization", r): -1.0}
+    for r in (RANGES[0], RANGES[-1])
+]
+
+FINDINGS = (
+    Finding(
+        label="1a",
+        text="Localization is the best signal at every range and geometry",
+        claims=(
+            *_best("field", reduced=False, ranges=RANGES),
+            *_best("ray", reduced=False, ranges=_RAY_RANGES),
+            *_best("ray", reduced=True, ranges=_RAY_RANGES),
+        ),
+    ),
+    Finding(
+        label="1b",
+        text="With rays localization is worse than with fields",
+        claims=tuple(
+            _difference(
+                cell("field", "localization", r), cell("ray", "localization", r), ABOVE
+            )
+            for r in RANGES
+        ),
+    ),
+    Finding(
+        label="1c",
+        text="... most at short range",
+        claims=(
+            Claim(
+                name="deficit of rays at 0.2 m - at 2 m",
+                weights={**_DEFICIT[0], **{k: -w for k, w in _DEFICIT[1].items()}},
+                region=ABOVE,
+            ),
+        ),
+    ),
+    Finding(
+        label="2",
+        text="Field proximity matches localization at 1 m and more",
+        claims=tuple(
+            _difference(
+                cell("field", "proximity", r), cell("field", "localization", r), SAME
+            )
+            for r in (1.0, 2.0)
+        ),
+    ),
+    Finding(
+        label="3",
+        text="Field binary beats field proximity at 0.5 m",
+        claims=(
+            _difference(
+                cell("field", "binary", 0.5), cell("field", "proximity", 0.5), ABOVE
+            ),
+        ),
+    ),
+    Finding(
+        label="4",
+        text="Proximity and binary of the full ray grid do not converge in 3000 epochs",
+        stand_in="at our budget each has less than half of the success of the field "
+        "with the same signal, at 1 and 2 m",
+        claims=tuple(
+            Claim(
+                name=f"{cell('field', signal, r)} / 2 - {cell('ray', signal, r)}",
+                weights={
+                    cell("field", signal, r): 0.5,
+                    cell("ray", signal, r): -1.0,
+                },
+                region=ABOVE,
+            )
+            for r, signal in product((1.0, 2.0), ("proximity", "binary"))
+        ),
+    ),
+    Finding(
+        label="5",
+        text="The closest beam of each ray sensor recovers nearly all of "
+        "localization's performance at 1 m",
+        claims=(
+            _difference(
+                cell("ray", "proximity", 1.0, reduced=True),
+                cell("ray", "localization", 1.0),
+                NOT_BELOW,
+            ),
+        ),
+    ),
+    Finding(
+        label="6a",
+        text='"Any beam" is better than the full binary ray grid at 1 m',
+        claims=(
+            _difference(
+                cell("ray", "binary", 1.0, reduced=True),
+                cell("ray", "binary", 1.0),
+                ABOVE,
+            ),
+        ),
+    ),
+    Finding(
+        label="6b",
+        text="Field proximity beyond 1 m converges in under 1000 of 3000 epochs",
+        stand_in="at 2 m it reaches 90 % of its own end within a third of our budget",
+        metric="share_to_90",
+        claims=(
+            Claim(
+                name=f"share of the budget until 90 %, {cell('field', 'proximity', 2)}",
+                weights={cell("field", "proximity", 2.0): 1.0},
+                region=Region(high=100 / 3),
+            ),
+        ),
+    ),
+)
+"""The findings, in the paper's order. Values are percentages."""
+
+
+def judge_findings(tables: Mapping[str, Table]) -> list[Judged]:
+    """Return what runs say of the findings.
+
+    Args:
+        tables: Values by metric, then by cell and seed [%].
+    """
+    tested = [_test(finding, tables[finding.metric]) for finding in FINDINGS]
+    p_confirm = [max(t.p_confirm for t in claims) for claims in tested]
+    p_refute = [
+        min(1.0, len(claims) * min(t.p_refute for t in claims)) for claims in tested
+    ]
+    confirms = [c <= r for c, r in zip(p_confirm, p_refute, strict=True)]
+    corrected = holm([min(pair) for pair in zip(p_confirm, p_refute, strict=True)])
+    result = []
+    for finding, claims, p, up in zip(
+        FINDINGS, tested, corrected, confirms, strict=True
+    ):
+        verdict: Verdict = "undecided"
+        if p <= ALPHA:
+            verdict = "confirmed" if up else "refuted"
+        result.append(
+            Judged(
+                finding=finding,
+                claims=tuple(claims),
+                verdict=verdict,
+                p_value=p,
+                seeds_needed=_needed(claims),
+            )
+        )
+    return result
+
+
+def _test(finding: Finding, table: Table) -> list[Tested]:
+    result = []
+    # As if the whole family were to be decided at once.
+    alpha, one = ALPHA / len(FINDINGS), seed_sd(table)
+    for claim in finding.claims:
+        effect = contrast(claim.weights, table)
+        known = effect is not None
+        # As if cells with one seed had the others' spread, and pairing did nothing.
+        sd = one * math.sqrt(sum(w**2 for w in claim.weights.values()))
+        result.append(
+            Tested(
+                claim=claim,
+                effect=effect,
+                p_confirm=claim.region.p_inside(effect) if known else 1.0,
+                p_refute=claim.region.p_outside(effect) if known else 1.0,
+                seeds_needed=(
+                    seeds_needed(effect, claim.region, alpha, sd) if known else None
+                ),
+            )
+        )
+    return result
+
+
+def _needed(claims: list[Tested]) -> int | None:
+    """Return how many seeds decide a finding for the side that it leans to."""
+    against = [
+        t.seeds_needed
+        for t in claims
+        if t.effect is not None
+        and t.effect.mean not in t.claim.region
+        and t.seeds_needed is not None
+    ]
+    if against:
+        # One that is refuted is enough.
+        return min(against)
+    needed = [t.seeds_needed for t in claims]
+    known = [n for n in needed if n is not None]
+    return max(known) if len(known) == len(needed) else None

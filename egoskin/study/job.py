@@ -1,0 +1,131 @@
+"""A run of a study and its evaluation, in a process of its own.
+
+python -m egoskin.study.job FOLDER NAME
+
+Whoever is called first claims the run, trains it from its last checkpoint to its end,
+judges its policy, and stores the result. A signal, or the end of the process that
+started it (``--parent``), stops it with a checkpoint. Its exit status says which.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import threading
+import time
+from pathlib import Path
+from types import FrameType
+
+from egoskin.agents.ppo import NonFiniteError
+from egoskin.interrupts import ENDING, take
+from egoskin.progress import ProgressLine
+from egoskin.study.claims import claimed
+from egoskin.study.manifest import PlannedRun
+from egoskin.study.store import StudyFolder, judge_run, now
+from egoskin.training import open_trainer, train
+from egoskin.workers import WorkerError
+
+FAILED = 1
+"""Exit status after an error; it has been written to stderr."""
+CLAIMED = 75
+"""Exit status if another process works on the run (EX_TEMPFAIL)."""
+STOPPED = 76
+"""Exit status after a stop, with a checkpoint."""
+
+# How often is looked whether the parent lives [s].
+_LOOK = 1.0
+
+
+class _StoppedError(Exception):
+    """An evaluation is stopped."""
+
+
+class Stop:
+    """Whether the job is to stop: after a signal, or its parent's end.
+
+    Args:
+        parent: Process id of the parent; None: it may end.
+    """
+
+    def __init__(self, parent: int | None = None) -> None:
+        self.requested = False
+        take(self._note, *ENDING)
+        if parent is not None:
+            args = (parent,)
+            threading.Thread(target=self._watch, args=args, daemon=True).start()
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        self.requested = True
+
+    def _watch(self, parent: int) -> None:
+        while os.getppid() == parent:
+            time.sleep(_LOOK)
+        self.requested = True
+
+    def check(self, step: int, running: int) -> None:
+        """Raise _StoppedError if it is to stop; called as ``on_step``."""
+        if self.requested:
+            raise _StoppedError
+
+
+def work(folder: StudyFolder, name: str, stop: Stop) -> int:
+    """Train and judge a run, as far as it has not been done; return the exit status.
+
+    Raises:
+        ValueError: If its folder is that of another run, or damaged.
+        OSError: If something cannot be written.
+        WorkerError: If a worker ends.
+        NonFiniteError: If an update is not finite.
+    """
+    manifest = folder.manifest()
+    planned = manifest.run(name)
+    with claimed(folder.claims, name) as mine:
+        if not mine:
+            return CLAIMED
+        if folder.is_finished(name):
+            return 0
+        print(f"{now()} {name}", flush=True)
+        run = folder.open_run(planned)
+        if folder.is_trained_elsewhere(name):
+            return CLAIMED
+        if not folder.is_trained(planned):
+            with open_trainer(run) as trainer:
+                line = ProgressLine(trainer.frames, planned.end)
+                train(trainer, lambda: stop.requested, line.update)
+            if trainer.frames < planned.end:
+                return STOPPED
+        print(f"{now()} judged on {manifest.evaluation.episodes} throws", flush=True)
+        try:
+            judge_run(folder, planned, manifest.evaluation, stop.check)
+        except _StoppedError:
+            return STOPPED
+        print(f"{now()} finished", flush=True)
+        return 0
+
+
+def command(folder: Path, run: PlannedRun, nice: int) -> list[str]:
+    """Return the command that works on a run, for a child of this process."""
+    module = [sys.executable, "-m", "egoskin.study.job"]
+    options = ["--parent", str(os.getpid()), "--nice", str(nice)]
+    return [*module, str(folder), run.name, *options]
+
+
+def main() -> int:
+    """Run the command."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("name")
+    parser.add_argument("--parent", type=int)
+    parser.add_argument("--nice", type=int, default=0)
+    args = parser.parse_args()
+    os.nice(args.nice)
+    try:
+        return work(StudyFolder(args.folder), args.name, Stop(args.parent))
+    except (ValueError, OSError, WorkerError, NonFiniteError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return FAILED
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

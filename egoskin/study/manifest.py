@@ -1,0 +1,418 @@
+"""A study: cells, seeds, budget, evaluation; and its manifest, the file it begins with.
+
+A study *describes* runs by the fields in which they differ from the default. Its
+manifest *fixes* them: the complete configuration of the first day, in the format of
+that day, and each cell's differences from it, so that neither a default that changes
+nor an option that is renamed changes a study that has begun.
+
+Contract: cells and seeds may be added to a manifest, nothing of it changes.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import difflib
+import math
+import re
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from egoskin.checkpoint import write_file
+from egoskin.cli import check_counts
+from egoskin.draws import check_seed
+from egoskin.envs.standards import Standard, training_task
+from egoskin.formats import (
+    content_hash,
+    present_config,
+    read_sealed,
+    sealed_json,
+)
+from egoskin.make import EnvConfig
+from egoskin.plain import changed_fields, from_plain, read_json, to_plain
+from egoskin.runs import MACHINE_FIELDS, TrainConfig
+from egoskin.sensors import Skin
+
+Overrides = Mapping[str, Any]
+"""Values by the dotted names of fields, as on the command line: ``sensor.range``."""
+
+# What a study decides by itself, and what all its cells share.
+_NOT_OF_A_STUDY = MACHINE_FIELDS | {"seed", "total_frames", "device"}
+_OF_ALL_CELLS = {"snapshot_frames", "checkpoint_interval"}
+# What names a cell already.
+_LABEL = ("env.sensor.coverage", "env.sensor.signal", "env.sensor.range")
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationPlan:
+    """How the policy of each run is judged."""
+
+    standard: Standard = "2"
+    """Version of the standard throw."""
+    throw_set: int = 1000
+    """Seed of the throw set: one that nothing was chosen on."""
+    episodes: int = 4096
+    """Throw sequences in the set."""
+    masked: bool = True
+    """Whether to judge it with all its sensors masked, too."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a throw set that is none."""
+        check_seed(self.throw_set, "throw_set")
+        check_counts(self, "episodes")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Study:
+    """What is to be run."""
+
+    name: str
+    """Name of the study."""
+    purpose: str
+    """What it is to find out, in a sentence."""
+    cells: tuple[dict[str, Any], ...]
+    """`Overrides` of each cell."""
+    seeds: tuple[int, ...]
+    """Seeds of each cell, in the order in which they are run."""
+    frames: int
+    """Environment steps of each run."""
+    standard: Standard = "2"
+    """Version of the standard throw that is trained on."""
+    base: dict[str, Any] = field(default_factory=dict)
+    """`Overrides` that all cells share."""
+    evaluation: EvaluationPlan = field(default_factory=EvaluationPlan)
+    """How the policies are judged."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a study of nothing, or seeds that are none."""
+        if not self.cells or not self.seeds:
+            raise ValueError(f"study {self.name}: needs at least a cell and a seed")
+        if not re.fullmatch(r"[\w.-]+", self.name):
+            raise ValueError(
+                f"a study's name has letters, digits, '-', '_' and '.' alone, got "
+                f"{self.name!r}"
+            )
+        for seed in self.seeds:
+            check_seed(seed)
+        check_counts(self, "frames")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cell:
+    """A cell of a manifest: runs that differ in nothing but their seed."""
+
+    name: str
+    """Name, of the fields in which it differs from the default."""
+    config: TrainConfig
+    """Its configuration, with seed 0."""
+    skin_sha256: str
+    """Hash of its skin."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlannedRun:
+    """A run of a manifest."""
+
+    cell: Cell
+    """What is run."""
+    seed: int
+    """Its seed."""
+
+    @property
+    def name(self) -> str:
+        """Name of its folders."""
+        return f"{self.cell.name}-seed{self.seed}"
+
+    @property
+    def config(self) -> TrainConfig:
+        """Its configuration: one worker and one learner thread."""
+        return dataclasses.replace(
+            self.cell.config, seed=self.seed, num_workers=1, learner_threads=1
+        )
+
+    @property
+    def end(self) -> int:
+        """Environment steps at its end: whole rollouts."""
+        size = self.config.frames_per_batch
+        return math.ceil(self.config.total_frames / size) * size
+
+    def differences(self, other: TrainConfig) -> list[str]:
+        """Return the names of the fields that make another configuration another run.
+
+        Its length is none: a shorter run may be gone on with.
+        """
+        names = changed_fields(to_plain(self.config), to_plain(other))
+        free = MACHINE_FIELDS | {"total_frames"}
+        return [name.removeprefix("env.") for name in names if name not in free]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Manifest:
+    """What a study runs, resolved and fixed."""
+
+    study: str
+    """Name of the study."""
+    purpose: str
+    """What it is to find out."""
+    base: TrainConfig
+    """Configuration that the cells differ from."""
+    cells: tuple[Cell, ...]
+    """The cells, in the order in which they are run."""
+    seeds: tuple[int, ...]
+    """The seeds."""
+    evaluation: EvaluationPlan
+    """How the policies are judged."""
+
+    @cached_property
+    def runs(self) -> tuple[PlannedRun, ...]:
+        """All runs: every cell with the first seed, then with the second, ..."""
+        return tuple(PlannedRun(cell=c, seed=s) for s in self.seeds for c in self.cells)
+
+    def run(self, name: str) -> PlannedRun:
+        """Return the run of a name.
+
+        Raises:
+            ValueError: If there is none; the text names the closest.
+        """
+        named = {run.name: run for run in self.runs}
+        if name not in named:
+            raise ValueError(f"no run {name!r}{_closest(name, named)}")
+        return named[name]
+
+    def overrides(self, cell: Cell) -> dict[str, Any]:
+        """Return the values in which a cell differs from the base, by field."""
+        return _differences(self.base, cell.config)
+
+    def not_default(self) -> dict[str, Any]:
+        """Return the values in which all cells differ from the default, by field."""
+        found = _differences(TrainConfig(), self.base)
+        return {k: v for k, v in found.items() if k not in MACHINE_FIELDS}
+
+    def extended(self, other: Manifest) -> Manifest:
+        """Return this manifest with the cells and seeds that another one adds.
+
+        Raises:
+            ValueError: If the other changes anything that this one has.
+        """
+        for name in ("study", "evaluation"):
+            own, new = getattr(self, name), getattr(other, name)
+            if own != new:
+                raise ValueError(
+                    f"the manifest's {name} cannot be changed: it is {own}, not {new}"
+                )
+        if changed := _differences(self.base, other.base):
+            raise ValueError(
+                "the manifest's configuration cannot be changed; another is: "
+                + ", ".join(changed)
+            )
+        own = {cell.name: cell for cell in self.cells}
+        for cell in other.cells:
+            before = own.setdefault(cell.name, cell)
+            if before != cell:
+                names = [*_differences(before.config, cell.config)] or ["skin"]
+                raise ValueError(
+                    f"the manifest's cell {cell.name} cannot be changed; another is: "
+                    + ", ".join(names)
+                )
+        seeds = dict.fromkeys((*self.seeds, *other.seeds))
+        return dataclasses.replace(
+            self, cells=tuple(own.values()), seeds=tuple(seeds), purpose=other.purpose
+        )
+
+    def save(self, path: Path) -> None:
+        """Write the manifest."""
+        content = {
+            "study": self.study,
+            "purpose": self.purpose,
+            "seeds": list(self.seeds),
+            "evaluation": to_plain(self.evaluation),
+            "base": to_plain(self.base),
+            "cells": [
+                {
+                    "name": cell.name,
+                    "overrides": _plain_differences(self.base, cell.config),
+                    "skin_sha256": cell.skin_sha256,
+                }
+                for cell in self.cells
+            ],
+        }
+        write_file(path, sealed_json(content))
+
+    @classmethod
+    def load(cls, path: Path) -> Manifest:
+        """Return the manifest of a file, its configurations in the present format.
+
+        Raises:
+            ValueError: If it is none, or has options that are no more.
+        """
+        if not path.is_file():
+            raise ValueError(
+                f"{path.parent} is no folder of a study: it has no {path.name} (begin "
+                "with: python scripts/study.py plan NAME --dir FOLDER)"
+            )
+        content, number = read_sealed(path)
+        what = str(path)
+
+        def config(overrides: Overrides) -> TrainConfig:
+            # In the format that they were written in, and only then migrated.
+            plain = copy.deepcopy(content["base"])
+            for name, value in overrides.items():
+                _set(plain, name, value, known=False)
+            return from_plain(TrainConfig, present_config(plain, number, what), what)
+
+        try:
+            return cls(
+                study=content["study"],
+                purpose=content["purpose"],
+                base=config({}),
+                cells=tuple(
+                    Cell(
+                        name=cell["name"],
+                        config=config(cell["overrides"]),
+                        skin_sha256=cell["skin_sha256"],
+                    )
+                    for cell in content["cells"]
+                ),
+                seeds=tuple(content["seeds"]),
+                evaluation=from_plain(EvaluationPlan, content["evaluation"], what),
+            )
+        except (KeyError, TypeError, AttributeError) as error:
+            raise ValueError(f"{path} is no manifest of a study: {error}") from error
+
+
+def load_study(path: Path) -> Study:
+    """Return the study that a JSON file describes: the fields of `Study`.
+
+    Raises:
+        ValueError: If it describes none; the text names the field.
+    """
+    return from_plain(Study, read_json(path), str(path))
+
+
+def resolve(study: Study) -> Manifest:
+    """Return the manifest of a study that begins today.
+
+    Raises:
+        ValueError: If a cell cannot exist, or two are one; the text names the cell.
+    """
+    task = training_task(study.standard, TrainConfig().env.task)
+    default = TrainConfig(env=EnvConfig(task=task), total_frames=study.frames)
+    what = f"study {study.name}, base"
+    base = override(default, study.base, what, _NOT_OF_A_STUDY - _OF_ALL_CELLS)
+    skins: dict[Any, tuple[Skin, str]] = {}
+    cells: dict[str, Cell] = {}
+    for number, overrides in enumerate(study.cells, 1):
+        what = f"study {study.name}, cell {number}"
+        config = override(base, overrides, what, _NOT_OF_A_STUDY)
+        key = (config.env.robot, config.env.skin)
+        try:
+            if key not in skins:
+                skin = config.env.skin.build(config.env.robot_config)
+                skins[key] = skin, content_hash(skin.to_dict())
+            skin, digest = skins[key]
+            # Sensors that do not fit each other.
+            config.env.sensor.filled(skin)
+        except (ValueError, OSError) as error:
+            raise ValueError(f"{what}: {error}") from error
+        cell = Cell(name=cell_name(base, config), config=config, skin_sha256=digest)
+        if cell.name in cells:
+            raise ValueError(f"{what}: {cell.name} is there twice")
+        cells[cell.name] = cell
+    return Manifest(
+        study=study.name,
+        purpose=study.purpose,
+        base=base,
+        cells=tuple(cells.values()),
+        seeds=tuple(dict.fromkeys(study.seeds)),
+        evaluation=study.evaluation,
+    )
+
+
+def override(
+    config: TrainConfig, overrides: Overrides, what: str, fixed: Collection[str] = ()
+) -> TrainConfig:
+    """Return a configuration with other values of some fields.
+
+    Args:
+        config: The configuration.
+        overrides: The values.
+        what: What they belong to, for the error text.
+        fixed: Fields that must not be given.
+
+    Raises:
+        ValueError: If there is no such field, or the value is none of it.
+    """
+    plain = to_plain(config)
+    for name, value in overrides.items():
+        full = _full_name(name)
+        if full.split(".")[0] in fixed:
+            raise ValueError(f"{what}: {name} cannot be chosen here")
+        try:
+            _set(plain, full, to_plain(value), known=True)
+        except KeyError as error:
+            raise ValueError(f"{what}: {error.args[0]}") from None
+    try:
+        return from_plain(TrainConfig, plain, what)
+    except ValueError as error:
+        text = str(error).removeprefix(f"{what}: ")
+        given = ", ".join(f"{k}={v}" for k, v in overrides.items()) or "the default"
+        raise ValueError(f"{what} ({given}): {text}") from error
+
+
+def cell_name(base: TrainConfig, config: TrainConfig) -> str:
+    """Return the name of a cell: its sensor's, then what else differs from the base."""
+    parts = [config.env.sensor.label()]
+    for name, value in _differences(base, config).items():
+        if name not in _LABEL:
+            words = [name.rpartition(".")[2], str(value)]
+            parts += [re.sub(r"[^\w.]+", "-", word).strip("-") for word in words]
+    return "-".join(parts)
+
+
+def _differences(base: TrainConfig, config: TrainConfig) -> dict[str, Any]:
+    """Return the values in which a configuration differs, but for its seed."""
+    found = _plain_differences(base, config)
+    return {name: value for name, value in found.items() if name != "seed"}
+
+
+def _plain_differences(base: TrainConfig, config: TrainConfig) -> dict[str, Any]:
+    old, new = to_plain(base), to_plain(config)
+    return {name: _get(new, name) for name in changed_fields(old, new)}
+
+
+def _get(content: Any, name: str) -> Any:
+    for key in name.split("."):
+        content = content[key]
+    return content
+
+
+def _set(content: Any, name: str, value: Any, *, known: bool) -> None:
+    """Set the plain value at a dotted name, of a field that is there if it is known."""
+    *path, last = name.split(".")
+    for i, key in enumerate(path):
+        _check_key(content, key, ".".join(path[:i]))
+        content = content[key]
+    if known:
+        _check_key(content, last, ".".join(path))
+    content[last] = value
+
+
+def _check_key(content: Any, key: str, where: str) -> None:
+    if not isinstance(content, dict) or key not in content:
+        keys = content if isinstance(content, dict) else ()
+        full = f"{where}.{key}".lstrip(".").removeprefix("env.")
+        raise KeyError(f"there is no field {full!r}{_closest(key, keys)}")
+
+
+def _full_name(name: str) -> str:
+    """Return a field's name in a stored configuration."""
+    parts = {f.name for f in dataclasses.fields(EnvConfig)}
+    return f"env.{name}" if name.split(".")[0] in parts else name
+
+
+def _closest(name: str, valid: Collection[str]) -> str:
+    found = difflib.get_close_matches(name, list(valid), n=1)
+    return f"; do you mean {found[0]!r}?" if found else ""

@@ -1,0 +1,200 @@
+"""What is told of each run: one row of a tidy table, and a table for each metric."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from egoskin.study.manifest import Manifest
+from egoskin.study.statistics import Table
+from egoskin.study.store import Result
+
+# The end of a learning curve is its mean over this last share of the frames; of less
+# than this success there is no sample efficiency to speak of.
+_END_SHARE, _LEAST_END = 0.05, 0.05
+
+
+@dataclass(frozen=True, kw_only=True)
+class Metric:
+    """A figure of a run."""
+
+    name: str
+    """Name of its column."""
+    label: str
+    """What it is."""
+    unit: str
+    """Its unit."""
+    of: Callable[[Result], float | None]
+    """The figure; None if a run has none."""
+
+
+def frames_to(result: Result, share: float) -> float | None:
+    """Return the frames until a run's success in training is a share of its own end.
+
+    None if it never learnt: if its end is below 5 %.
+    """
+    frames, success = result.stored.frames, result.stored.success
+    if not len(frames):
+        return None
+    late = frames > (1 - _END_SHARE) * frames[-1]
+    end = float(success[late].mean())
+    if not end >= _LEAST_END:
+        return None
+    first = int(np.argmax(success >= share * end))
+    if first == 0:
+        return float(frames[0])
+    # Linear between the stored lines.
+    x, y = frames[first - 1 : first + 1], success[first - 1 : first + 1]
+    return float(x[0] + (share * end - y[0]) / (y[1] - y[0]) * (x[1] - x[0]))
+
+
+def _millions(share: float) -> Callable[[Result], float | None]:
+    def of(result: Result) -> float | None:
+        frames = frames_to(result, share)
+        return None if frames is None else frames / 1e6
+
+    return of
+
+
+def _share_to_90(result: Result) -> float | None:
+    frames = frames_to(result, 0.9)
+    return None if frames is None else 100 * frames / result.run.end
+
+
+def _percent(*path: str) -> Callable[[Result], float | None]:
+    def of(result: Result) -> float | None:
+        value: Any = result.stored.evaluation
+        for key in path:
+            if value is None:
+                return None
+            value = value[key]
+        return None if value is None else 100 * value
+
+    return of
+
+
+METRICS = (
+    Metric(
+        name="success_3s",
+        label="success at 3 s",
+        unit="%",
+        of=_percent("success", "mean"),
+    ),
+    Metric(
+        name="success_5s",
+        label="success at 5 s",
+        unit="%",
+        of=_percent("success_5s", "mean"),
+    ),
+    Metric(
+        name="survival_s",
+        label="mean survival, restricted to 10 s",
+        unit="s",
+        of=lambda result: result.stored.evaluation["survival_time"]["mean"],
+    ),
+    Metric(
+        name="first_avoided",
+        label="first balls avoided",
+        unit="%",
+        of=_percent("avoided", "first_ball"),
+    ),
+    Metric(
+        name="later_avoided",
+        label="later balls avoided",
+        unit="%",
+        of=_percent("avoided", "later_balls"),
+    ),
+    Metric(
+        name="falls", label="falls within 3 s", unit="%", of=_percent("ended_by_fall")
+    ),
+    Metric(
+        name="masked_success_3s",
+        label="success at 3 s, sensors masked",
+        unit="%",
+        of=_percent("masked", "success", "mean"),
+    ),
+    Metric(
+        name="m_frames_to_50",
+        label="frames to 50 % of its own end",
+        unit="M frames",
+        of=_millions(0.5),
+    ),
+    Metric(
+        name="m_frames_to_90",
+        label="frames to 90 % of its own end",
+        unit="M frames",
+        of=_millions(0.9),
+    ),
+    Metric(
+        name="share_to_90",
+        label="share of the budget to 90 % of its own end",
+        unit="%",
+        of=_share_to_90,
+    ),
+)
+"""The figures of a run; success, survival, balls and falls are of the throw set, frames
+of the success in training, exploration on."""
+
+
+def metric(name: str) -> Metric:
+    """Return the metric of a name."""
+    return next(m for m in METRICS if m.name == name)
+
+
+def tables(results: Sequence[Result]) -> Mapping[str, Table]:
+    """Return the values of each metric by cell and seed; of None there is no entry."""
+    found: dict[str, dict[str, dict[int, float]]] = {m.name: {} for m in METRICS}
+    for result in results:
+        for each in METRICS:
+            value = each.of(result)
+            if value is not None and math.isfinite(value):
+                row = found[each.name].setdefault(result.run.cell.name, {})
+                row[result.run.seed] = value
+    return found
+
+
+def runs_csv(manifest: Manifest, results: Sequence[Result]) -> str:
+    """Return a tidy table: a row for each run, in full precision.
+
+    Two studies of one manifest differ in nothing but the columns that are named after
+    wall time and speed (``wall_s``, ``frames_per_s``).
+    """
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    head = ("study", "run", "cell", "coverage", "signal", "range_m", "reduce", "seed")
+    judged = ("trained_on", "judged_on", "throw_set", "throws", "frames")
+    names = [m.name for m in METRICS]
+    last = ("policy_sha256", "wall_s", "frames_per_s")
+    writer.writerow([*head, *judged, *names, *last])
+    for result in results:
+        run, evaluation = result.run, result.stored.evaluation
+        sensor = run.config.env.sensor
+        skin = (sensor.signal, sensor.range, sensor.reduce)
+        values = (each.of(result) for each in METRICS)
+        wall = result.stored.record.wall_s
+        writer.writerow(
+            [
+                manifest.study,
+                run.name,
+                run.cell.name,
+                sensor.coverage,
+                *(skin if sensor.uses_skin else ("", "", "")),
+                run.seed,
+                evaluation["trained_on"],
+                evaluation["standard"],
+                evaluation["bank_seed"],
+                evaluation["episodes"],
+                run.end,
+                *("" if v is None else repr(float(v)) for v in values),
+                result.policy_sha256,
+                wall,
+                run.end / wall if wall else "",
+            ]
+        )
+    return out.getvalue()

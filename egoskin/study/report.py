@@ -1,0 +1,423 @@
+"""The report of a study: report.md, index.html, runs.csv and figures in one folder.
+
+Contract: it is written from the manifest and the results alone, and says of everything
+that is missing that it is.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from egoskin.checkpoint import write_file
+from egoskin.plain import read_json
+from egoskin.study.figures import (
+    equivalence,
+    forest,
+    learning_curves,
+    sample_efficiency,
+    save,
+    success_by_range,
+)
+from egoskin.study.findings import Judged, Tested, judge_findings
+from egoskin.study.manifest import Manifest
+from egoskin.study.metrics import METRICS, runs_csv, tables
+from egoskin.study.statistics import (
+    Table,
+    mean_effect,
+    separation,
+    spread,
+)
+from egoskin.study.store import Result, RunStatus, StudyFolder
+
+
+@dataclass(frozen=True)
+class Heading:
+    """The title of a section."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Text:
+    """A paragraph."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Rows:
+    """A table."""
+
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure that has been saved, by its name."""
+
+    name: str
+    caption: str
+
+
+Block = Heading | Text | Rows | Picture
+
+
+def write_report(folder: StudyFolder, out: Path) -> None:
+    """Write the report of a study.
+
+    Args:
+        folder: The study.
+        out: Folder to write to, made if it is not there.
+
+    Raises:
+        ValueError: If a result is damaged or not the manifest's.
+        OSError: If something cannot be written.
+    """
+    manifest = folder.manifest()
+    results = folder.results(manifest)
+    out.mkdir(parents=True, exist_ok=True)
+    values = tables(results)
+    judged = judge_findings(values)
+    concerned = [j for j in judged if any(c.effect for c in j.claims)]
+    pictures = _pictures(manifest, results, values["success_3s"], concerned)
+    for name, (figure, _) in pictures.items():
+        save(figure, out, name)
+    shown = {name: Picture(name, text) for name, (_, text) in pictures.items()}
+    blocks = list(_blocks(folder, manifest, results, values, concerned, shown))
+    contents = {
+        "runs.csv": runs_csv(manifest, results),
+        "report.md": markdown(blocks),
+        "index.html": page(f"Study {manifest.study}", blocks, out),
+    }
+    for name, content in contents.items():
+        write_file(out / name, content.encode())
+
+
+def _pictures(
+    manifest: Manifest,
+    results: Sequence[Result],
+    success: Table,
+    judged: Sequence[Judged],
+) -> dict[str, tuple[Figure, str]]:
+    """Return the figures that there is something to draw of, with their captions."""
+    drawn = {
+        "success-by-range": (
+            success_by_range(manifest, success),
+            "Success against range: interquartile mean and range over seeds, each seed "
+            "a dot.",
+        ),
+        "findings": (
+            forest(judged) if judged else None,
+            "The findings. Shaded: where each claim says that its effect lies; 90 % "
+            "(thick) and 95 % (thin) intervals; hollow: one seed, no interval.",
+        ),
+        "equivalence": (
+            equivalence(manifest, success),
+            "Which signals are as good as one another. Shaded: the margin of "
+            "equivalence; 90 % (thick) and 95 % (thin) intervals; hollow: one seed.",
+        ),
+        "learning-curves": (
+            learning_curves(manifest, results),
+            "Success in training, exploration on: each seed thin, their mean thick.",
+        ),
+        "sample-efficiency": (
+            sample_efficiency(manifest, results),
+            "How soon a run reaches 50 and 90 % of its own end.",
+        ),
+    }
+    return {k: (f, text) for k, (f, text) in drawn.items() if f is not None}
+
+
+def _blocks(
+    folder: StudyFolder,
+    manifest: Manifest,
+    results: Sequence[Result],
+    values: Mapping[str, Table],
+    judged: Sequence[Judged],
+    shown: dict[str, Picture],
+) -> Iterable[Block]:
+    plan, total = manifest.evaluation, len(manifest.runs)
+    yield Heading(f"Study {manifest.study}")
+    yield Text(
+        f"{manifest.purpose[0].upper()}{manifest.purpose[1:]}. {len(results)} of "
+        f"{total} runs are done. Judged on standard {plan.standard}, throw set "
+        f"{plan.throw_set} of {plan.episodes:,} sequences, mean action. The unit is "
+        "the seed: intervals are over seeds, not over throws."
+    )
+    if not results:
+        yield Text("There is nothing to tell yet.")
+        return
+    if judged:
+        yield Text(_answer(judged))
+    if "success-by-range" in shown:
+        yield shown["success-by-range"]
+    if judged:
+        yield Heading("The findings")
+        yield Text(
+            "Fixed in code before the runs. A finding is confirmed if each of its "
+            "claims lies in its region, refuted if one lies beyond; p-values are "
+            "corrected for the number of findings (Holm). Shown is the claim that "
+            "decides. *Seeds* are those it rests on and, if it is undecided, how many "
+            "in all would decide it with a power of 80 % if effect and spread stay as "
+            "observed. For findings that speak of another budget stands a stand-in."
+        )
+        yield _finding_rows(judged, results)
+        yield shown["findings"]
+    yield Heading("The cells")
+    yield Text(
+        "Interquartile mean and range over seeds; in brackets the mean with its 95 % "
+        "t interval, which one seed does not give."
+    )
+    yield _cell_rows(manifest, values)
+    for name in ("equivalence", "learning-curves", "sample-efficiency"):
+        if name in shown:
+            yield shown[name]
+    yield Heading("Which metric tells cells apart")
+    yield Text(
+        "Standard deviation between cells over that between the seeds of a cell: at 1 "
+        "two cells differ about as much as two seeds of one."
+    )
+    ratios = [(separation(values[m.name]), m) for m in METRICS]
+    known = sorted((r for r in ratios if r[0] >= 0), key=lambda r: -r[0])
+    if known:
+        yield Rows(
+            ("metric", "cells / seeds"), [(m.label, f"{r:.2f}") for r, m in known]
+        )
+    else:
+        yield Text("Unknown: no cell has two seeds that differ.")
+    seen = folder.path / "coverage.json"
+    if seen.is_file():
+        yield Heading("What is seen before any training")
+        yield _seen_rows(read_json(seen))
+    yield Heading("What is missing")
+    missing = [s for s in folder.status(manifest) if s.state != "done"]
+    yield Text(", ".join(map(_missing, missing)) or "Nothing: all runs are done.")
+    yield Heading("The runs")
+    default = manifest.not_default().items()
+    yield Text(
+        "Not the default in all of them: "
+        + (
+            ", ".join(f"{k.removeprefix('env.')} = {v}" for k, v in default)
+            or "nothing"
+        )
+        + ". All figures in full precision: runs.csv."
+    )
+    yield Rows(
+        ("run", "success at 3 s", "wall time", "commit", "machine"),
+        [
+            (
+                r.run.name,
+                f"{100 * r.stored.evaluation['success']['mean']:.1f} %",
+                f"{r.stored.record.wall_s / 3600:.2f} h",
+                r.stored.record.commit,
+                r.stored.record.machine,
+            )
+            for r in results
+        ],
+    )
+
+
+def _missing(status: RunStatus) -> str:
+    text = {"missing": "", "begun": " (stopped)"}
+    return status.run.name + text.get(status.state, f" ({status.state})")
+
+
+def _answer(judged: Sequence[Judged]) -> str:
+    """Return the verdicts in a sentence."""
+    parts = []
+    for verdict in ("confirmed", "refuted", "undecided"):
+        labels = [j.finding.label for j in judged if j.verdict == verdict]
+        if labels:
+            parts.append(f"{verdict}: {', '.join(labels)}")
+    return f"**Of the paper's findings {'; '.join(parts)}.**"
+
+
+def _deciding(judged: Judged) -> Tested:
+    """Return the claim that a verdict hangs on: the least sure, or the refuted one."""
+    if judged.verdict == "refuted":
+        return min(judged.claims, key=lambda c: c.p_refute)
+    known = [c for c in judged.claims if c.effect is not None]
+    return max(known, key=lambda c: c.p_confirm)
+
+
+def _finding_rows(judged: Sequence[Judged], results: Sequence[Result]) -> Rows:
+    hours = [r.stored.record.wall_s / 3600 for r in results]
+    each = sum(hours) / len(hours)
+    have: dict[str, int] = {}
+    for result in results:
+        have[result.run.cell.name] = have.get(result.run.cell.name, 0) + 1
+    rows = []
+    for j in judged:
+        claim = _deciding(j)
+        effect = claim.effect
+        assert effect is not None
+        low, high = effect.interval()
+        interval = f" ({low:+.1f} to {high:+.1f})" if effect.error > 0 else ""
+        known = sum(c.effect is not None for c in j.claims)
+        more = cost = ""
+        if j.verdict == "undecided":
+            cells = {name for c in j.claims for name in c.claim.weights}
+            more = ", needs more" if j.seeds_needed is None else f" of {j.seeds_needed}"
+            if j.seeds_needed is not None:
+                runs = sum(max(j.seeds_needed - have.get(c, 0), 0) for c in cells)
+                cost = f"{runs * each:,.0f}"
+        text = j.finding.text
+        if j.finding.stand_in:
+            text += f". Stand-in: {j.finding.stand_in}"
+        rows.append(
+            (
+                j.finding.label,
+                text,
+                f"**{j.verdict}**",
+                f"{j.p_value:.3f}",
+                f"{claim.claim.name}: {effect.mean:+.1f}{interval}",
+                f"{effect.seeds}{more}",
+                f"{known} of {len(j.claims)}",
+                cost,
+            )
+        )
+    head = (
+        "",
+        "finding",
+        "verdict",
+        "p",
+        "effect [points] (95 %)",
+        "seeds",
+        "claims with runs",
+        "core-hours to decide",
+    )
+    return Rows(head, rows)
+
+
+def _cell_rows(manifest: Manifest, values: Mapping[str, Table]) -> Rows:
+    shown = [m for m in METRICS if m.name != "share_to_90"]
+    rows = []
+    for cell in manifest.cells:
+        success = values["success_3s"].get(cell.name)
+        if not success:
+            continue
+        row = [cell.name, str(len(success))]
+        for metric in shown:
+            own = list(values[metric.name].get(cell.name, {}).values())
+            row.append(_spread(own))
+        effect = mean_effect(list(success.values()))
+        low, high = effect.interval()
+        if effect.error > 0:
+            row[2] += f" [{effect.mean:.1f}, {low:.1f} to {high:.1f}]"
+        rows.append(row)
+    return Rows(("cell", "seeds", *(f"{m.label} [{m.unit}]" for m in shown)), rows)
+
+
+def _spread(values: Sequence[float]) -> str:
+    if not values:
+        return "-"
+    own = spread(values)
+    if own.seeds == 1:
+        return f"{own.iqm:.1f}"
+    return f"{own.iqm:.1f} ({own.low:.1f} to {own.high:.1f})"
+
+
+def _seen_rows(seen: dict) -> Rows:
+    rows = []
+    for row in seen["cells"]:
+        warning = row["warning"]
+        share = "-" if warning["seen"] is None else f"{100 * warning['seen']:.1f} %"
+        times = [warning[key] for key in ("5%", "median", "95%")]
+        text = " / ".join("-" if t is None else f"{1e3 * t:.0f}" for t in times)
+        rows.append((f"{row['coverage']} {row['range']:g} m", share, text))
+    head = ("cell", "hits seen before contact", "warning [ms], 5 / 50 / 95 %")
+    return Rows(head, rows)
+
+
+# --- two ways to write the blocks ---------------------------------------------------
+
+
+def markdown(blocks: Iterable[Block]) -> str:
+    """Return blocks as Markdown; figures lie beside it."""
+    parts = []
+    for number, block in enumerate(blocks):
+        match block:
+            case Heading(text):
+                parts.append(f"{'#' * (2 if number else 1)} {text}")
+            case Text(text):
+                parts.append(text)
+            case Rows(head, rows):
+                lines = [head, ["---"] * len(head), *rows]
+                cells = [[x.replace("|", "\\|") for x in line] for line in lines]
+                parts.append("\n".join(f"| {' | '.join(line)} |" for line in cells))
+            case Picture(name, caption):
+                parts.append(f"![{caption}]({name}.png)\n\n*{caption}*")
+    return "\n\n".join(parts) + "\n"
+
+
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 72rem; margin: 2rem auto;
+  padding: 0 1rem; color: #222; }
+.wide { overflow-x: auto; }
+table { border-collapse: collapse; font-size: 13px; }
+th, td { padding: .25rem .6rem; border-bottom: 1px solid #ddd; text-align: left;
+  vertical-align: top; }
+th { background: #f4f4f4; }
+figure { margin: 1.5rem 0; } figure img { max-width: 100%; }
+figcaption { color: #555; font-size: 13px; }
+"""
+
+
+def page(title: str, blocks: Iterable[Block], folder: Path) -> str:
+    """Return blocks as one HTML page that needs no other file.
+
+    Args:
+        title: Its title.
+        blocks: The blocks.
+        folder: Where the figures were saved.
+    """
+    parts = []
+    for number, block in enumerate(blocks):
+        match block:
+            case Heading(text):
+                tag = "h2" if number else "h1"
+                parts.append(f"<{tag}>{html.escape(text)}</{tag}>")
+            case Text(text):
+                parts.append(f"<p>{_inline(text)}</p>")
+            case Rows(head, rows):
+                first = "".join(f"<th>{_inline(x)}</th>" for x in head)
+                lines = (
+                    f"<tr>{''.join(f'<td>{_inline(x)}</td>' for x in r)}</tr>"
+                    for r in rows
+                )
+                body = "\n".join([f"<tr>{first}</tr>", *lines])
+                parts.append(f'<div class="wide"><table>\n{body}\n</table></div>')
+            case Picture(name, caption):
+                data = base64.b64encode((folder / f"{name}.svg").read_bytes()).decode()
+                text = html.escape(caption)
+                parts.append(
+                    f'<figure><img alt="{text}" src="data:image/svg+xml;base64,{data}">'
+                    f"<figcaption>{text}</figcaption></figure>"
+                )
+    body = "\n".join(parts)
+    return (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{html.escape(title)}</title>\n<style>{_STYLE}</style>\n</head>\n"
+        f"<body>\n{body}\n</body>\n</html>\n"
+    )
+
+
+def _inline(text: str) -> str:
+    """Return a text with its **bold** and *slanted* parts as HTML."""
+    result, tags = html.escape(text), {"**": "strong", "*": "em"}
+    for mark, tag in tags.items():
+        pieces = result.split(mark)
+        if len(pieces) % 2:
+            result = "".join(
+                f"<{tag}>{piece}</{tag}>" if i % 2 else piece
+                for i, piece in enumerate(pieces)
+            )
+    return result

@@ -1,0 +1,212 @@
+"""The runs of a study side by side on this machine, each in a process of its own.
+
+Contract: nothing is run twice, whoever else works on the folder; what ends the runner,
+even SIGKILL, ends its runs with a checkpoint, and whoever starts it again goes on.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from egoskin.study.claims import is_claimed
+from egoskin.study.job import CLAIMED, STOPPED, command
+from egoskin.study.manifest import Manifest, PlannedRun
+from egoskin.study.store import START, RunStatus, StudyFolder, duration, now
+
+# How often the runner looks at its processes, and a claimed run is asked for again [s].
+_POLL, _AGAIN = 0.2, 5.0
+# How often the progress line is written: on a terminal, in a file [s].
+_SHOW_LIVE, _SHOW_FILE = 2.0, 60.0
+# How long a run may take to stop with a checkpoint [s].
+_PATIENCE = 120.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Progress:
+    """How far a whole study is."""
+
+    counts: dict[str, int]
+    """Number of runs in each state."""
+    share: float
+    """Share of all environment steps that is done."""
+    left_s: float | None
+    """Time left at the present speed [s], None if unknown."""
+
+    @classmethod
+    def of(cls, status: list[RunStatus]) -> Progress:
+        """Return how far a study is."""
+        counts = {"done": 0, "running": 0, "failed": 0, "begun": 0, "missing": 0}
+        for each in status:
+            counts[each.state] += 1
+        total = sum(each.run.end for each in status)
+        done = sum(each.frames for each in status)
+        speeds = [s.per_s for s in status if s.state == "running" and s.per_s]
+        # Those that have just begun are as fast as the others.
+        speed = sum(speeds) / len(speeds) * counts["running"] if speeds else 0.0
+        left = (total - done) / speed if speed else None
+        left = 0.0 if counts["done"] == len(status) else left
+        return cls(counts=counts, share=done / total, left_s=left)
+
+    def __str__(self) -> str:
+        """Return a line of text."""
+        counts = ", ".join(f"{n} {k}" for k, n in self.counts.items() if n)
+        return f"{counts}; {self.share:.1%} of the frames, ETA {duration(self.left_s)}"
+
+
+class LocalRunner:
+    """Works on the runs of a study until all are done or have failed too often.
+
+    Args:
+        folder: The study.
+        parallel: Runs side by side.
+        tries: How often a run that fails is tried in all.
+        nice: Niceness of the runs.
+        show: Told the progress line, and each failure.
+    """
+
+    def __init__(
+        self,
+        folder: StudyFolder,
+        *,
+        parallel: int,
+        tries: int = 3,
+        nice: int = 5,
+        show: Callable[[str], None] = lambda text: None,
+    ) -> None:
+        self._folder, self._manifest = folder, folder.manifest()
+        self._parallel, self._tries, self._nice = parallel, tries, nice
+        self._show = show
+        self._jobs: dict[str, subprocess.Popen[bytes]] = {}
+        self._finished: set[str] = set()
+        # When to ask again for a run that somebody else has claimed.
+        self._again: dict[str, float] = {}
+
+    def run(self) -> list[RunStatus]:
+        """Work; return how far each run is at the end.
+
+        Raises:
+            OSError: If a log or a failure cannot be written.
+        """
+        for name in ("runs", "results", "claims", "logs", "failed"):
+            (self._folder.path / name).mkdir(exist_ok=True)
+        interval = _SHOW_LIVE if sys.stdout.isatty() else _SHOW_FILE
+        shown = float("-inf")
+        try:
+            while True:
+                self._reap()
+                open_runs = self._open_runs()
+                if not (open_runs or self._jobs):
+                    return self._folder.status(self._manifest)
+                self._start(open_runs)
+                if time.monotonic() - shown > interval:
+                    status = self._folder.status(self._manifest)
+                    self._show(str(Progress.of(status)))
+                    shown = time.monotonic()
+                time.sleep(_POLL)
+        finally:
+            self._stop()
+
+    def _open_runs(self) -> list[PlannedRun]:
+        """Return the runs that somebody still has to work on, but for our own."""
+        result = []
+        for run in self._manifest.runs:
+            if run.name in self._finished or run.name in self._jobs:
+                continue
+            if self._folder.is_finished(run.name):
+                self._finished.add(run.name)
+                continue
+            failure = self._folder.failure(run.name)
+            if failure is None or failure.tries < self._tries:
+                result.append(run)
+        return result
+
+    def _start(self, open_runs: list[PlannedRun]) -> None:
+        for run in open_runs:
+            if len(self._jobs) >= self._parallel:
+                return
+            clock = time.monotonic()
+            if self._again.get(run.name, clock) > clock:
+                continue
+            if is_claimed(self._folder.claims, run.name):
+                self._again[run.name] = clock + _AGAIN
+                continue
+            with open(self._folder.log_path(run.name), "ab") as log:
+                log.write(f"{START} {now()}\n".encode())
+                log.flush()
+                self._jobs[run.name] = subprocess.Popen(
+                    command(self._folder.path, run, self._nice),
+                    stdin=subprocess.DEVNULL,
+                    stdout=log,
+                    stderr=subprocess.STDOUT,
+                    # A terminal's Ctrl-C reaches the runner alone, which passes it on.
+                    start_new_session=True,
+                    env={**os.environ, "OMP_NUM_THREADS": "1"},
+                )
+
+    def _reap(self) -> None:
+        """Look what has ended, and how."""
+        for name, job in list(self._jobs.items()):
+            status = job.poll()
+            if status is None:
+                continue
+            del self._jobs[name]
+            if status == CLAIMED:
+                self._again[name] = time.monotonic() + _AGAIN
+            elif status not in (0, STOPPED):
+                error = self._folder.last_words(name)
+                if status < 0:
+                    error = f"killed by {signal.Signals(-status).name}"
+                failure = self._folder.note_failure(name, error)
+                self._show(
+                    f"{name} failed, try {failure.tries} of {self._tries}: {error}"
+                )
+
+    def _stop(self) -> None:
+        """Stop our runs, with checkpoints."""
+        for job in self._jobs.values():
+            job.terminate()
+        deadline = time.monotonic() + _PATIENCE
+        for job in self._jobs.values():
+            try:
+                job.wait(max(0.0, deadline - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                os.killpg(job.pid, signal.SIGKILL)
+                job.wait()
+        self._jobs.clear()
+
+
+def slurm_script(
+    manifest: Manifest, folder: Path, *, cores: int, elements: int, hours: float
+) -> str:
+    """Return a job array for Slurm, whose elements share the work on a folder.
+
+    Args:
+        manifest: The study.
+        folder: Its folder, which all nodes see.
+        cores: Cores of each element, and runs side by side.
+        elements: Elements of the array.
+        hours: Time limit of each; one that reaches it stops with checkpoints.
+    """
+    minutes = max(round(60 * hours), 1)
+    return f"""#!/bin/bash
+# Study {manifest.study}: {len(manifest.runs)} runs that all elements share.
+# An element that reaches its time limit stops with checkpoints, and one that is lost
+# loses a minute: submit this again as long as `status` says that runs are missing.
+#SBATCH --job-name=egoskin-{manifest.study}
+#SBATCH --array=0-{elements - 1}
+#SBATCH --nodes=1
+#SBATCH --ntasks=1
+#SBATCH --cpus-per-task={cores}
+#SBATCH --time={minutes}
+#SBATCH --signal=B:TERM@180
+#SBATCH --requeue
+#SBATCH --output={folder}/logs/slurm-%A-%a.log
+exec python scripts/study.py run --dir {folder} --parallel "$SLURM_CPUS_PER_TASK"
+"""

@@ -1,0 +1,238 @@
+"""Statistics over seeds: estimates, tests, power.
+
+The unit is the seed, never the episode: an interval over thousands of throws says how
+exactly a policy is measured, and nothing of what another seed would have learnt.
+
+Contract: a spread that is zero, or unknown because there is one seed, decides nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from egoskin.report import interquartile_mean, interquartile_range
+
+ALPHA = 0.05
+"""Level of every test, and of the whole family after Holm's correction."""
+POWER = 0.8
+"""Power at which a number of seeds is called enough."""
+# Numbers of seeds beyond this are as good as infinite.
+_MOST_SEEDS = 1000
+
+Table = Mapping[str, Mapping[int, float]]
+"""Values of a metric by cell and seed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spread:
+    """Values over the seeds of a cell, as the paper gives them."""
+
+    iqm: float
+    """Interquartile mean."""
+    low: float
+    """Quantile at 25 %."""
+    high: float
+    """Quantile at 75 %."""
+    seeds: int
+    """Number of seeds."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Effect:
+    """An estimate with what is known of its error."""
+
+    mean: float
+    """Estimate."""
+    error: float
+    """Standard error; NaN if it is unknown."""
+    df: float
+    """Degrees of freedom of the standard error."""
+    seeds: int
+    """Seeds it rests on: pairs, or the fewest of a cell."""
+    paired: bool = True
+    """Whether the cells were compared seed by seed."""
+
+    def interval(self, level: float = 0.95) -> tuple[float, float]:
+        """Return a two-sided t interval; NaN if the error is unknown."""
+        half = float(stats.t.ppf(0.5 + level / 2, self.df)) * self.error
+        return self.mean - half, self.mean + half
+
+    def p_above(self, bound: float) -> float:
+        """Return the p-value of "the effect is above a bound"."""
+        if not self.error > 0:
+            return 1.0
+        return float(stats.t.sf((self.mean - bound) / self.error, self.df))
+
+    def p_below(self, bound: float) -> float:
+        """Return the p-value of "the effect is below a bound"."""
+        if not self.error > 0:
+            return 1.0
+        return float(stats.t.cdf((self.mean - bound) / self.error, self.df))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Region:
+    """Where a claim says that an effect lies, open at its ends."""
+
+    low: float = -math.inf
+    """Lower end."""
+    high: float = math.inf
+    """Upper end."""
+
+    def __contains__(self, value: float) -> bool:
+        """Whether a value lies in it."""
+        return self.low < value < self.high
+
+    def p_inside(self, effect: Effect) -> float:
+        """Return the p-value of "the effect lies in it".
+
+        With two ends these are two one-sided tests (TOST): of equivalence.
+        """
+        ends = [effect.p_above(self.low)] if math.isfinite(self.low) else []
+        ends += [effect.p_below(self.high)] if math.isfinite(self.high) else []
+        return max(ends)
+
+    def p_outside(self, effect: Effect) -> float:
+        """Return the p-value of "the effect lies beyond an end of it"."""
+        ends = [effect.p_below(self.low)] if math.isfinite(self.low) else []
+        ends += [effect.p_above(self.high)] if math.isfinite(self.high) else []
+        # Bonferroni over the ends.
+        return min(1.0, len(ends) * min(ends))
+
+
+def spread(values: Sequence[float]) -> Spread:
+    """Return the interquartile mean and range of values over seeds."""
+    low, high = interquartile_range(values)
+    return Spread(iqm=interquartile_mean(values), low=low, high=high, seeds=len(values))
+
+
+def mean_effect(values: Sequence[float]) -> Effect:
+    """Return the mean of values over seeds."""
+    n = len(values)
+    error = float(np.std(values, ddof=1)) / math.sqrt(n) if n > 1 else math.nan
+    return Effect(mean=float(np.mean(values)), error=error, df=max(n - 1, 1), seeds=n)
+
+
+def contrast(weights: Mapping[str, float], table: Table) -> Effect | None:
+    """Return a weighted sum of cells, seed by seed where they share two or more.
+
+    Cells that do not are compared by Welch's test for the sum of their means.
+
+    Args:
+        weights: Weight of each cell.
+        table: Values of a metric.
+
+    Returns:
+        The effect, None if a cell has no value.
+    """
+    own = {name: table.get(name, {}) for name in weights}
+    if not all(own.values()):
+        return None
+    shared = sorted(set.intersection(*(set(x) for x in own.values())))
+    if len(shared) > 1 or (shared and min(map(len, own.values())) == 1):
+        return mean_effect(
+            [sum(w * own[name][seed] for name, w in weights.items()) for seed in shared]
+        )
+    mean = sum(w * float(np.mean(list(own[k].values()))) for k, w in weights.items())
+    fewest = min(map(len, own.values()))
+    if fewest == 1:
+        return Effect(mean=mean, error=math.nan, df=1, seeds=1, paired=False)
+    terms = [
+        (w**2 * float(np.var(list(own[k].values()), ddof=1)) / len(own[k]), len(own[k]))
+        for k, w in weights.items()
+    ]
+    variance = sum(v for v, _ in terms)
+    # Welch and Satterthwaite: v^2 / sum_i v_i^2 / (n_i - 1)
+    below = sum(v**2 / (n - 1) for v, n in terms)
+    df = variance**2 / below if below else 1.0
+    error = math.sqrt(variance)
+    return Effect(mean=mean, error=error, df=df, seeds=fewest, paired=False)
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Return p-values corrected for their number, by Holm's step-down method."""
+    m, result, running = len(p_values), [0.0] * len(p_values), 0.0
+    for rank, i in enumerate(np.argsort(p_values, kind="stable")):
+        running = max(running, min(1.0, (m - rank) * p_values[i]))
+        result[i] = running
+    return result
+
+
+def seeds_needed(
+    effect: Effect, region: Region, alpha: float = ALPHA, sd: float = math.nan
+) -> int | None:
+    """Return how many seeds decide a claim, if effect and spread are as observed.
+
+    They decide for the side on which the effect lies, with a power of `POWER`; the
+    seeds are taken as paired.
+
+    Args:
+        effect: The effect observed so far.
+        region: The claim.
+        alpha: Level of the test.
+        sd: Standard deviation between seeds, if one seed of the effect tells none.
+
+    Returns:
+        Number of seeds in all; None if the spread is unknown or no number is enough.
+    """
+    if effect.error > 0:
+        sd = effect.error * math.sqrt(effect.seeds)
+    if not sd > 0:
+        return None
+    bounds = [b for b in (region.low, region.high) if math.isfinite(b)]
+    inside = effect.mean in region
+    if not inside:
+        # The end that it lies beyond; Bonferroni over the ends.
+        alpha /= len(bounds)
+        bounds = [min(bounds, key=lambda b: abs(effect.mean - b))]
+    distances = [abs(effect.mean - b) / sd for b in bounds]
+
+    def power(n: int) -> float:
+        critical = float(stats.t.ppf(1 - alpha, n - 1))
+        # The power of a one-sided t test; of two, what both miss at most.
+        missed = sum(
+            float(stats.nct.cdf(critical, n - 1, d * math.sqrt(n))) for d in distances
+        )
+        return 1 - missed
+
+    if not power(_MOST_SEEDS) >= POWER:
+        return None
+    low, high = 1, _MOST_SEEDS
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if power(middle) >= POWER else (middle, high)
+    return high
+
+
+def separation(table: Table) -> float:
+    """Return how far a metric sets cells apart, relative to the spread of seeds.
+
+    The standard deviation of the cells' true means (estimated: a part of what is seen
+    between cells is the seeds' spread) over that of the seeds of a cell, pooled. 1 says
+    that two cells differ about as much as two seeds. NaN if no cell has two seeds or
+    there are fewer than two cells.
+    """
+    groups = [np.array(list(x.values())) for x in table.values() if len(x)]
+    within = seed_sd(table) ** 2
+    if len(groups) < 2 or not within > 0:
+        return math.nan
+    means = np.array([g.mean() for g in groups])
+    noise = within * float(np.mean([1 / len(g) for g in groups]))
+    between = max(float(means.var(ddof=1)) - noise, 0.0)
+    return math.sqrt(between / within)
+
+
+def seed_sd(table: Table) -> float:
+    """Return the standard deviation between seeds of a cell, pooled over the cells.
+
+    NaN if no cell has two seeds.
+    """
+    groups = [np.array(list(x.values())) for x in table.values() if len(x) > 1]
+    df = sum(len(g) - 1 for g in groups)
+    squares = sum(float(((g - g.mean()) ** 2).sum()) for g in groups)
+    return math.sqrt(squares / df) if df else math.nan

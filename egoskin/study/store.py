@@ -1,0 +1,471 @@
+"""A study as a folder, from which alone anybody can tell how far it is.
+
+    manifest.json      what is run, see `egoskin.study.manifest`
+    runs/NAME/         a run folder, or a link to one made before
+    results/NAME/      of a finished run what is small, see `egoskin.results`; its
+                       evaluation is written last, and marks the run as finished
+    claims/            who works on what, see `egoskin.study.claims`
+    logs/NAME.log      what the run's processes said
+    failed/NAME.json   how often it failed, and its last error
+    report/            what `egoskin.study.report` wrote
+
+Contract: ``manifest.json`` and ``results/`` are all that a report needs.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import json
+import os
+import shutil
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+from egoskin.checkpoint import load_tensors, write_file
+from egoskin.evaluation import play_bank, standard_task, summarize
+from egoskin.formats import content_hash, read_sealed, sealed_json
+from egoskin.make import MASK_ALL
+from egoskin.plain import read_json
+from egoskin.policies import Policy, load_policy
+from egoskin.results import StoredRun, load_run, record, thin, to_json
+from egoskin.runs import Run
+from egoskin.study.claims import is_claimed, is_locked
+from egoskin.study.manifest import EvaluationPlan, Manifest, PlannedRun
+
+State = Literal["done", "running", "failed", "begun", "missing"]
+"""How far a run is; begun: nobody works on it, and it can be gone on with."""
+
+START = "--- started"
+"""What a log begins with at each start."""
+
+# Lines of metrics that are stored of a run, at most about this many.
+_LINES = 250
+_EVALUATION = "evaluation_*.json"
+# The end of a log in which its last line is looked for [bytes].
+_TAIL = 2**16
+
+
+@dataclass(frozen=True, kw_only=True)
+class Failure:
+    """What went wrong with a run."""
+
+    tries: int
+    """How often it failed."""
+    error: str
+    """Its last error."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunStatus:
+    """How far a run is."""
+
+    run: PlannedRun
+    """The run."""
+    state: State
+    """How far it is."""
+    frames: int = 0
+    """Environment steps done."""
+    per_s: float | None = None
+    """Environment steps per second of wall time, None if unknown."""
+    success: float | None = None
+    """Success of a finished run on the throw set."""
+    failure: Failure | None = None
+    """Its last failure, unless it has finished since."""
+
+    @property
+    def left_s(self) -> float | None:
+        """Time left to its end at that speed [s], None if unknown."""
+        if self.state == "done":
+            return 0.0
+        return (self.run.end - self.frames) / self.per_s if self.per_s else None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Result:
+    """A finished run."""
+
+    run: PlannedRun
+    """What was planned."""
+    stored: StoredRun
+    """What is stored of it."""
+    policy_sha256: str
+    """Hash of the weights and of what else its policy holds."""
+
+
+class StudyFolder:
+    """The folder of a study.
+
+    Args:
+        path: The folder.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    @property
+    def manifest_path(self) -> Path:
+        """The manifest."""
+        return self.path / "manifest.json"
+
+    @property
+    def claims(self) -> Path:
+        """Folder of the claims."""
+        return self.path / "claims"
+
+    def run_path(self, name: str) -> Path:
+        """Run folder of a run."""
+        return self.path / "runs" / name
+
+    def result_path(self, name: str) -> Path:
+        """Folder of what is stored of a run."""
+        return self.path / "results" / name
+
+    def log_path(self, name: str) -> Path:
+        """What the processes of a run said."""
+        return self.path / "logs" / f"{name}.log"
+
+    def _failure_path(self, name: str) -> Path:
+        return self.path / "failed" / f"{name}.json"
+
+    def manifest(self) -> Manifest:
+        """Return the manifest.
+
+        Raises:
+            ValueError: If there is none.
+        """
+        return Manifest.load(self.manifest_path)
+
+    def plan(self, manifest: Manifest) -> Manifest:
+        """Write a manifest, or add to the one that is there; return what holds now.
+
+        Raises:
+            ValueError: If the one that is there is changed by it.
+        """
+        if self.manifest_path.exists():
+            before = self.manifest()
+            manifest = before.extended(manifest)
+            if manifest == before:
+                return manifest
+        self.path.mkdir(parents=True, exist_ok=True)
+        manifest.save(self.manifest_path)
+        return manifest
+
+    # --- a run ----------------------------------------------------------------------
+
+    def open_run(self, planned: PlannedRun) -> Run:
+        """Return the run folder of a run, made now if there is none.
+
+        Only who has claimed the run may call it.
+
+        Raises:
+            ValueError: If the one that is there is that of another run.
+        """
+        path, config = self.run_path(planned.name), planned.config
+        if not path.exists():
+            # Under its name there is a whole one or none.
+            new = path.with_name(f".{planned.name}.new")
+            shutil.rmtree(new, ignore_errors=True)
+            Run.create(dataclasses.replace(config, run_dir=new))
+            os.rename(new, path)
+        stored = Run.open(path).config
+        if differs := planned.differences(stored):
+            raise ValueError(
+                f"{path} is another run than the manifest's: it differs in "
+                + ", ".join(differs)
+            )
+        if stored.total_frames > config.total_frames:
+            raise ValueError(
+                f"{path} is planned for {stored.total_frames:,} frames, the study for "
+                f"{config.total_frames:,}: a longer run is another one"
+            )
+        run = Run(path, config)
+        run.load_skin()
+        if content_hash(read_json(run.skin_path)) != planned.cell.skin_sha256:
+            raise ValueError(
+                f"{run.skin_path} is not the skin of the study's cell "
+                f"{planned.cell.name}: its file, or where this version of egoskin "
+                "places sensors, has changed"
+            )
+        return run
+
+    def is_trained(self, planned: PlannedRun) -> bool:
+        """Return whether a run has been trained to its end, and its policy is there."""
+        path = self.run_path(planned.name)
+        run = Run(path, planned.config)
+        if not run.policy_path(planned.end).is_file():
+            return False
+        if run.checkpoint_path.is_file():
+            # The policy is written before the checkpoint, too.
+            _, header = load_tensors(run.checkpoint_path)
+            return header.get("frames", 0) >= planned.end
+        return _last_row(path / "metrics.csv").get("frames") == planned.end
+
+    def is_trained_elsewhere(self, name: str) -> bool:
+        """Return whether somebody else trains a run, such as ppo.py an adopted one."""
+        return is_locked(self.run_path(name) / "lock")
+
+    def is_finished(self, name: str) -> bool:
+        """Return whether a run has been trained and judged."""
+        return any(self.result_path(name).glob(_EVALUATION))
+
+    def finish(self, planned: PlannedRun, evaluation: Mapping[str, Any]) -> None:
+        """Store what is small of a trained run, and mark it as finished.
+
+        Args:
+            planned: The run.
+            evaluation: What `judge` returned for its policy.
+        """
+        source, end = self.run_path(planned.name), planned.end
+        run, folder = Run.open(source), self.result_path(planned.name)
+        policy, made = run.policy_path(end), record(run, end)
+        if made.command.split()[1].endswith("/job.py"):
+            # It was begun by a study; where its folder was is of no interest.
+            command = f"python -m egoskin.study.job FOLDER {planned.name}"
+            made = dataclasses.replace(made, command=command)
+        (folder / "policies").mkdir(parents=True, exist_ok=True)
+        every = max(planned.end // _LINES, 1)
+        contents = {
+            f"policies/{policy.name}": policy.read_bytes(),
+            "metrics.csv": thin(run.metrics(), every).encode(),
+            "config.json": (source / "config.json").read_bytes(),
+            "skin.json": run.skin_path.read_bytes(),
+            "run.json": to_json(made).encode(),
+            # Last: it marks the run as finished.
+            f"evaluation_{end:012d}.json": sealed_json(
+                {
+                    "run": planned.name,
+                    "policy_sha256": policy_hash(policy),
+                    **evaluation,
+                }
+            ),
+        }
+        for name, content in contents.items():
+            write_file(folder / name, content)
+        self._failure_path(planned.name).unlink(missing_ok=True)
+
+    def result(self, planned: PlannedRun) -> Result:
+        """Return a finished run.
+
+        Raises:
+            ValueError: If it is damaged, or not the run that was planned.
+        """
+        folder = self.result_path(planned.name)
+        stored = load_run(folder)
+        if differs := planned.differences(stored.config):
+            raise ValueError(
+                f"{folder} is another run than the manifest's: it differs in "
+                + ", ".join(differs)
+            )
+        (file,) = folder.glob(_EVALUATION)
+        evaluation, _ = read_sealed(file)
+        if evaluation["frames"] != planned.end:
+            raise ValueError(
+                f"{file} is of a policy of {evaluation['frames']:,} frames, not of "
+                f"{planned.end:,}"
+            )
+        digest = policy_hash(folder / "policies" / f"{planned.end:012d}.safetensors")
+        if digest != evaluation["policy_sha256"]:
+            raise ValueError(f"{file} is of another policy than the one beside it")
+        stored = dataclasses.replace(stored, evaluation=evaluation)
+        return Result(run=planned, stored=stored, policy_sha256=digest)
+
+    def results(self, manifest: Manifest) -> list[Result]:
+        """Return the finished runs, in the manifest's order.
+
+        Raises:
+            ValueError: If one is damaged, or not the run that was planned.
+        """
+        return [self.result(run) for run in manifest.runs if self.is_finished(run.name)]
+
+    # --- failures -------------------------------------------------------------------
+
+    def failure(self, name: str) -> Failure | None:
+        """Return how a run failed, None if it has not."""
+        path = self._failure_path(name)
+        if not path.exists():
+            return None
+        content = read_json(path)
+        return Failure(tries=content["tries"], error=content["error"])
+
+    def note_failure(self, name: str, error: str) -> Failure:
+        """Count a failure of a run; return all there is to say of it."""
+        before = self.failure(name)
+        failure = Failure(tries=(before.tries if before else 0) + 1, error=error)
+        path = self._failure_path(name)
+        path.parent.mkdir(exist_ok=True)
+        write_file(path, (json.dumps(dataclasses.asdict(failure)) + "\n").encode())
+        return failure
+
+    def forget_failures(self) -> None:
+        """Let runs that failed too often be tried again."""
+        for path in (self.path / "failed").glob("*.json"):
+            path.unlink()
+
+    def last_words(self, name: str) -> str:
+        """Return the last line that a run's last process said, its error first."""
+        with suppress(FileNotFoundError), open(self.log_path(name), "rb") as file:
+            file.seek(max(0, file.seek(0, os.SEEK_END) - _TAIL))
+            text = file.read().decode(errors="replace").rpartition(START)[2]
+            said = [line.strip() for line in text.split("\n")[1:] if line.strip()]
+            errors = [line for line in said if line.startswith("error: ")]
+            return (errors or said or [""])[-1].removeprefix("error: ")
+        return ""
+
+    # --- how far it is --------------------------------------------------------------
+
+    def status(self, manifest: Manifest) -> list[RunStatus]:
+        """Return how far each run is, in the manifest's order."""
+        return [self._status(run) for run in manifest.runs]
+
+    def _status(self, run: PlannedRun) -> RunStatus:
+        if self.is_finished(run.name):
+            (file,) = self.result_path(run.name).glob(_EVALUATION)
+            content, _ = read_sealed(file)
+            success = content["success"]["mean"]
+            return RunStatus(run=run, state="done", frames=run.end, success=success)
+        row = _last_row(self.run_path(run.name) / "metrics.csv")
+        frames, wall = int(row.get("frames", 0)), row.get("time/wall_s", 0.0)
+        failure = self.failure(run.name)
+        state: State = "missing"
+        if is_claimed(self.claims, run.name) or self.is_trained_elsewhere(run.name):
+            state = "running"
+        elif failure is not None:
+            state = "failed"
+        elif self.run_path(run.name).exists():
+            state = "begun"
+        return RunStatus(
+            run=run,
+            state=state,
+            frames=frames,
+            per_s=frames / wall if wall else None,
+            failure=failure,
+        )
+
+    def adopt(self, manifest: Manifest, source: Path) -> PlannedRun:
+        """Link to a run that was made before; return which of the study's it is.
+
+        Raises:
+            ValueError: If it is none of the study's; the text names what differs from
+                the closest.
+        """
+        config = Run.open(source).config
+        differs = {run: run.differences(config) for run in manifest.runs}
+        run = min(manifest.runs, key=lambda run: len(differs[run]))
+        if differs[run]:
+            raise ValueError(
+                f"{source} is no run of this study; the closest, {run.name}, differs "
+                f"in {', '.join(differs[run])}"
+            )
+        path = self.run_path(run.name)
+        if os.path.lexists(path):
+            raise ValueError(f"{path} is there already")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.symlink_to(source.resolve(), target_is_directory=True)
+        try:
+            self.open_run(run)
+        except ValueError:
+            path.unlink()
+            raise
+        return run
+
+
+def judge(
+    policy: Policy,
+    plan: EvaluationPlan,
+    on_step: Callable[[int, int], None] | None = None,
+) -> dict[str, Any]:
+    """Return the figures of a policy on a study's throw set, as JSON values.
+
+    Args:
+        policy: The policy.
+        plan: The throw set.
+        on_step: Called with (steps done, episodes still running).
+    """
+    config = standard_task(policy.env_config, plan.standard)
+    play = partial(
+        play_bank,
+        config=config,
+        skin=policy.skin,
+        bank_seed=plan.throw_set,
+        episodes=plan.episodes,
+        num_workers=1,
+        on_step=on_step,
+    )
+    rigid = play(None, hold=True)
+    result = summarize(play(policy), rigid, config.task)
+    masked = None
+    if plan.masked and config.sensor.coverage != "none":
+        masked = summarize(play(policy, mask=MASK_ALL), rigid, config.task)
+    return {
+        **dataclasses.asdict(result),
+        "masked": None if masked is None else dataclasses.asdict(masked),
+        "standard": plan.standard,
+        "trained_on": policy.env_config.standard,
+        "bank_seed": plan.throw_set,
+        "frames": policy.policy_spec.frames,
+        "mask": [],
+    }
+
+
+def judge_run(
+    folder: StudyFolder,
+    planned: PlannedRun,
+    plan: EvaluationPlan,
+    on_step: Callable[[int, int], None] | None = None,
+) -> None:
+    """Judge the policy of a trained run, and mark the run as finished."""
+    run = Run(folder.run_path(planned.name), planned.config)
+    policy = load_policy(run.policy_path(planned.end))
+    folder.finish(planned, judge(policy, plan, on_step))
+
+
+def policy_hash(path: Path) -> str:
+    """Return the hash of what a policy computes with, whoever wrote its file."""
+    tensors, header = load_tensors(path)
+    spec = header["policy"]
+    kept = {k: spec[k] for k in ("skin", "sizes", "num_actions", "frames")}
+    return content_hash(kept, tensors)
+
+
+def _last_row(path: Path) -> dict[str, float]:
+    """Return the last whole line of a log of metrics, nothing if there is none."""
+    try:
+        with open(path, "rb") as file:
+            columns = file.readline().decode().strip().split(",")
+            size = file.seek(0, os.SEEK_END)
+            file.seek(max(0, size - 2**14))
+            lines = file.read().decode(errors="replace").split("\n")
+    except OSError:
+        return {}
+    for line in reversed(lines[:-1]):
+        row = next(csv.reader(io.StringIO(line)), [])
+        if len(row) == len(columns):
+            with suppress(ValueError):
+                return dict(zip(columns, map(float, row), strict=True))
+    return {}
+
+
+def duration(seconds: float | None) -> str:
+    """Return a time as text: "3 d 04 h", "2 h 05 min", "40 s", "-" for None."""
+    if seconds is None:
+        return "-"
+    minutes, s = divmod(round(seconds), 60)
+    hours, m = divmod(minutes, 60)
+    days, h = divmod(hours, 24)
+    if days:
+        return f"{days} d {h:02d} h"
+    if hours:
+        return f"{hours} h {m:02d} min"
+    return f"{m} min" if minutes >= 5 else f"{60 * m + s} s"
+
+
+def now() -> str:
+    """Return the time of day, for logs."""
+    return time.strftime("%Y-%m-%d %H:%M:%S")

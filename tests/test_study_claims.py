@@ -1,0 +1,136 @@
+"""Claims: one worker at a time, whatever dies, on one host or many."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from egoskin.study.claims import claimed, is_claimed, this_host
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from egoskin.study.claims import claimed
+with claimed(Path(sys.argv[1]), "run", heartbeat=0.1) as mine:
+    print(mine, flush=True)
+    time.sleep(60)
+"""
+
+
+def hold(folder: Path) -> subprocess.Popen[str]:
+    """Start a process that claims "run", and wait until it has."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(folder)], stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "True\n"
+    return process
+
+
+def elsewhere(folder: Path, age: float, number: int = 1) -> Path:
+    """Leave the owner file of a process on another host, of an age [s]."""
+    folder.mkdir(exist_ok=True)
+    path = folder / f"run.owner.{number}"
+    path.write_text(json.dumps({"host": "other", "name": "other", "pid": 1}))
+    then = time.time() - age
+    os.utime(path, (then, then))
+    return path
+
+
+def test_a_claim_is_held_by_one_process_and_freed_by_its_death(tmp_path: Path):
+    folder = tmp_path / "claims"
+    process = hold(folder)
+    assert is_claimed(folder, "run")
+    assert not is_claimed(folder, "another")
+    with claimed(folder, "run") as mine:
+        assert not mine
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    # What it left behind is nobody's.
+    assert list(folder.glob("run.owner.*"))
+    assert not is_claimed(folder, "run")
+    with claimed(folder, "run") as mine:
+        assert mine
+        assert is_claimed(folder, "run")
+    assert not list(folder.glob("run.owner.*"))
+
+
+def test_names_that_begin_alike_are_others(tmp_path: Path):
+    with claimed(tmp_path, "run") as one, claimed(tmp_path, "run.owner") as two:
+        assert one
+        assert two
+
+
+def test_a_living_owner_on_another_host_keeps_its_claim(tmp_path: Path):
+    path = elsewhere(tmp_path, age=10)
+    assert is_claimed(tmp_path, "run", stale=60)
+    with claimed(tmp_path, "run", stale=60) as mine:
+        assert not mine
+    assert path.exists()
+
+
+def test_a_dead_owner_on_another_host_loses_its_claim(tmp_path: Path):
+    elsewhere(tmp_path, age=100)
+    assert not is_claimed(tmp_path, "run", stale=60)
+    with claimed(tmp_path, "run", stale=60) as mine:
+        assert mine
+        (owner,) = tmp_path.glob("run.owner.2")
+        assert json.loads(owner.read_text())["host"] == this_host()
+    assert not list(tmp_path.glob("run.owner.*"))
+
+
+def test_an_owner_that_slept_learns_that_its_claim_was_taken(tmp_path: Path):
+    lost = threading.Event()
+    with claimed(tmp_path, "run", heartbeat=0.02, lost=lost.set) as mine:
+        assert mine
+        other = elsewhere(tmp_path, age=0, number=2)
+        assert lost.wait(10)
+    # The other's claim is untouched.
+    assert other.exists()
+    assert is_claimed(tmp_path, "run")
+
+
+def test_a_heart_beats(tmp_path: Path):
+    with claimed(tmp_path, "run", heartbeat=0.02):
+        (owner,) = tmp_path.glob("run.owner.*")
+        os.utime(owner, (0, 0))
+        deadline = time.monotonic() + 10
+        while owner.stat().st_mtime < 1:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+
+
+def test_of_many_hosts_that_see_a_dead_owner_one_takes_its_claim(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    # Hosts among which locks are not shared: here each has a name of its own, and all
+    # get the lock.
+    monkeypatch.setattr("fcntl.flock", lambda file, operation: None)
+    local = threading.local()
+    monkeypatch.setattr("egoskin.study.claims.this_host", lambda: local.name)
+    elsewhere(tmp_path, age=1000)
+    ready, done = threading.Barrier(8), threading.Barrier(8)
+    won: list[int] = []
+
+    def take(number: int) -> None:
+        local.name = f"host{number}"
+        ready.wait()
+        with claimed(tmp_path, "run") as mine:
+            if mine:
+                won.append(number)
+            done.wait()
+
+    threads = [threading.Thread(target=take, args=(i,)) for i in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(won) == 1

@@ -1,0 +1,188 @@
+"""The report of a study, from runs that nobody has trained."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from egoskin.study.figures import places
+from egoskin.study.manifest import Manifest, resolve
+from egoskin.study.metrics import METRICS, frames_to, runs_csv, tables
+from egoskin.study.report import Heading, Rows, Text, markdown, page, write_report
+from egoskin.study.shipped import FINDINGS
+from egoskin.study.store import StudyFolder
+from studies import expected, store, store_all
+
+FIGURES = (
+    "equivalence",
+    "findings",
+    "learning-curves",
+    "sample-efficiency",
+    "success-by-range",
+)
+
+
+@pytest.fixture(scope="module")
+def manifest() -> Manifest:
+    return resolve(FINDINGS)
+
+
+@pytest.fixture(scope="module")
+def folder(manifest: Manifest, tmp_path_factory) -> StudyFolder:
+    """A study of which the rays have one seed, all else three; and its report."""
+    folder = StudyFolder(tmp_path_factory.mktemp("study"))
+    folder.plan(manifest)
+    store_all(folder, manifest, keep=lambda r: r.seed == 0 or "ray" not in r.name)
+    write_report(folder, folder.path / "report")
+    return folder
+
+
+def test_a_report_needs_nothing_else(folder: StudyFolder):
+    out = folder.path / "report"
+    names = {p.name for p in out.iterdir()}
+    pictures = {f"{name}.{kind}" for name in FIGURES for kind in ("png", "svg")}
+    assert names == {"report.md", "index.html", "runs.csv", *pictures}
+    text = (out / "report.md").read_text()
+    assert set(re.findall(r"!\[.*?\]\((.*?)\)", text)) == {f"{n}.png" for n in FIGURES}
+    html = (out / "index.html").read_text()
+    # The page holds its pictures, and refers to nothing.
+    assert html.count('src="data:image/svg+xml;base64,') == len(FIGURES)
+    assert not re.search(r'(src|href)="(?!data:)', html)
+
+
+def test_the_answer_comes_first_and_what_is_missing_is_told(folder: StudyFolder):
+    text = (folder.path / "report" / "report.md").read_text()
+    first = text.splitlines()[:5]
+    assert "55 of 87 runs are done" in first[2]
+    assert re.fullmatch(
+        r"\*\*Of the paper's findings (\w+: [\w, ]+(; )?)+\.\*\*", first[4]
+    )
+    missing = text.split("## What is missing")[1].split("##")[0]
+    assert missing.count("-seed1") == missing.count("-seed2") == 16
+    assert "blind" not in missing
+
+
+def test_the_table_has_a_row_for_each_run_in_full_precision(
+    folder: StudyFolder, manifest: Manifest
+):
+    with open(folder.path / "report" / "runs.csv", newline="") as source:
+        rows = list(csv.DictReader(source))
+    assert [row["run"] for row in rows] == [
+        r.name for r in manifest.runs if r.seed == 0 or "ray" not in r.name
+    ]
+    by_run = {row["run"]: row for row in rows}
+    result = folder.result(manifest.run("field-proximity-2m-seed1"))
+    row = by_run[result.run.name]
+    share = result.stored.evaluation["success"]["mean"]
+    assert float(row["success_3s"]) == 100 * share
+    assert float(row["later_avoided"]) == 100 * (0.8 * share)
+    assert (row["range_m"], row["signal"], row["frames"]) == (
+        "2.0",
+        "proximity",
+        str(result.run.end),
+    )
+    # A blind robot has no signal, and nothing to mask.
+    blind = by_run["blind-seed0"]
+    assert blind["signal"] == blind["range_m"] == blind["masked_success_3s"] == ""
+
+
+def test_nothing_but_named_columns_depends_on_when_and_where(
+    folder: StudyFolder, manifest: Manifest, tmp_path: Path
+):
+    other = StudyFolder(tmp_path)
+    other.plan(manifest)
+    run = manifest.runs[0]
+    store(
+        other,
+        manifest,
+        run,
+        100 * folder.result(run).stored.evaluation["success"]["mean"],
+    )
+    path = other.result_path(run.name) / "run.json"
+    path.write_text(
+        path.read_text().replace("3600.0", "7200.0").replace('"Linux"', '"Other"')
+    )
+    rows = []
+    for own in (folder, other):
+        text = runs_csv(manifest, [own.result(run)])
+        rows += list(csv.DictReader(io.StringIO(text)))
+    differ = {k for k in rows[0] if rows[0][k] != rows[1][k]}
+    assert differ == {"wall_s", "frames_per_s"}
+
+
+def test_a_report_is_the_same_bytes_each_time(folder: StudyFolder, tmp_path: Path):
+    write_report(folder, tmp_path / "again")
+    for path in (folder.path / "report").iterdir():
+        assert path.read_bytes() == (tmp_path / "again" / path.name).read_bytes()
+
+
+def test_a_study_without_runs_has_a_report(manifest: Manifest, tmp_path: Path):
+    folder = StudyFolder(tmp_path)
+    folder.plan(manifest)
+    write_report(folder, tmp_path / "report")
+    assert "0 of 87 runs" in (tmp_path / "report" / "report.md").read_text()
+
+
+def test_cells_of_other_kinds_are_reported_too(tmp_path: Path):
+    cells = ({}, {"history": 3}, {"ppo.network.hidden": [64, 64]})
+    study = dataclasses.replace(FINDINGS, name="mine", cells=cells, seeds=(0, 1))
+    folder, manifest = StudyFolder(tmp_path), resolve(study)
+    folder.plan(manifest)
+    store_all(folder, manifest)
+    # Nothing but the first stands in the paper's grid.
+    assert list(places(manifest)) == ["field-proximity-2m"]
+    write_report(folder, tmp_path / "report")
+    text = (tmp_path / "report" / "report.md").read_text()
+    assert "field-proximity-2m-history-3" in text
+    assert "learning-curves.png" in text
+
+
+def test_frames_to_a_share_are_read_off_the_curve(
+    folder: StudyFolder, manifest: Manifest
+):
+    result = folder.result(manifest.run("field-proximity-2m-seed0"))
+    end = result.run.end
+    # 1 - exp(-t / 0.2) is its own end times a half at t = 0.2 ln 2 = 0.1386; the end
+    # is the mean of the last twentieth, 0.9924.
+    own = -0.2 * np.log(1 - 0.5 * 0.9924)
+    assert frames_to(result, 0.5) == pytest.approx(own * end, rel=2e-3)
+    blind = folder.result(manifest.run("blind-seed0"))
+    assert frames_to(blind, 0.5) is None
+    # Between stored lines it is linear: 0, 0.2, 0.4 and then 0.8.
+    stored = dataclasses.replace(
+        result.stored,
+        frames=np.array([0.0, 10, 20, 30]),
+        success=np.array([0, 0.2, 0.4, 0.8]),
+    )
+    result = dataclasses.replace(result, stored=stored)
+    assert frames_to(result, 0.75) == pytest.approx(25)
+
+
+def test_the_tables_hold_what_there_is(folder: StudyFolder, manifest: Manifest):
+    values = tables(folder.results(manifest))
+    assert values.keys() == {m.name for m in METRICS}
+    assert "blind" not in values["masked_success_3s"]
+    assert set(values["success_3s"]["field-binary-1m"]) == {0, 1, 2}
+    own = values["success_3s"]["field-binary-1m"][0]
+    assert own == pytest.approx(expected(manifest.run("field-binary-1m-seed0")), abs=15)
+
+
+def test_markup_is_written_as_text(tmp_path: Path):
+    blocks = [
+        Heading("a < b"),
+        Text("**bold** & *slanted*"),
+        Rows(("x|y",), [("<b>1 * 2</b>",)]),
+    ]
+    assert markdown(blocks) == (
+        "# a < b\n\n**bold** & *slanted*\n\n| x\\|y |\n| --- |\n| <b>1 * 2</b> |\n"
+    )
+    html = page("t", blocks, tmp_path)
+    assert "<h1>a &lt; b</h1>" in html
+    assert "<strong>bold</strong> &amp; <em>slanted</em>" in html
+    assert "<td>&lt;b&gt;1 * 2&lt;/b&gt;</td>" in html
