@@ -134,8 +134,8 @@ def test_a_table_has_a_line_for_each_seed_and_one_for_all(tmp_path: Path):
     lines = table(group).splitlines()
     assert len(lines) == 2 + 3 + 1
     assert lines[2] == (
-        "| field proximity, 2 m | 2, judged on 1 | 0 | 0.0 M | 4,096 | 20.0 % (18.0 to 22.0) | 6.2 % "
-        "| 2.50 s | 80.0 % | - | 10.0 % | 1.00 m |"
+        "| field proximity, 2 m | 2, judged on 1 | 0 | 0.0 M | 4,096 "
+        "| 20.0 % (18.0 to 22.0) | 6.2 % | 2.50 s | 80.0 % | - | 10.0 % | 1.00 m |"
     )
     # Interquartile mean 0.35 by symmetry; quartiles half way: 0.275 and 0.425.
     assert "3 seeds" in lines[5]
