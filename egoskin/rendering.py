@@ -21,6 +21,8 @@ import mujoco
 import numpy as np
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import nn
 
 from egoskin.evaluation import play_bank
 from egoskin.film import Frame
@@ -28,9 +30,6 @@ from egoskin.make import EnvConfig
 from egoskin.robots import RobotConfig
 from egoskin.sensors import Ray, Skin
 from egoskin.shapes import Shape
-
-Policy = Callable[[TensorDictBase], TensorDictBase]
-"""Writes ``action`` into the tensordict it is given, and returns it."""
 
 # Colours (r, g, b, a). A line has the colour of the kind of sensor that detects: blue
 # for fields; yellow, (1, 0.8, 0.1), is kept for rays.
@@ -79,7 +78,7 @@ class Recording:
 def record_episodes(
     config: EnvConfig,
     skin: Skin,
-    policy: Policy | None,
+    policy: nn.Module | TensorDictModuleBase | None,
     *,
     bank_seed: int = 0,
     first: int = 0,
