@@ -202,6 +202,7 @@ def render_recording(
             state,
             config.sensor.detecting(skin, state),
             time=step / hz,
+            num_avoided=int(state["balls_avoided"].sum()),
             ending=ending if step == steps else None,
         )
         frames.append(frame)
@@ -298,16 +299,18 @@ class Painter:
         detecting: np.ndarray | None = None,
         *,
         time: float,
+        num_avoided: int = 0,
         ending: str | None = None,
     ) -> Frame:
         """Return the picture of a state.
 
         Args:
             state: One row with ``base_pose [7]``, ``joint_pos [J]``,
-                ``object_pose [O, 7]``, ``object_active [O]`` and ``balls_avoided [2]``.
+                ``object_pose [O, 7]`` and ``object_active [O]``.
             detecting: Whether each sensor detects something, ``[S]`` bool.
             time: Age of the episode [s]; the camera follows the base with time and
                 starts anew when time goes back.
+            num_avoided: Balls avoided so far, for the frame.
             ending: Why the episode ends here, for the frame.
         """
         active = np.asarray(state["object_active"])
@@ -327,7 +330,7 @@ class Painter:
             gap=self._gap(active),
             num_detecting=int(detecting.sum()),
             num_sensors=len(detecting),
-            num_avoided=int(state["balls_avoided"].sum()),
+            num_avoided=num_avoided,
             ending=ending,
         )
 

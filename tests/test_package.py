@@ -19,6 +19,7 @@ from tensordict import TensorDict
 import egoskin
 from egoskin.sensors import FieldSensor, RaySensor, Skin
 from egoskin.shapes import Sphere
+from throwing import TASK
 
 README = Path(__file__).parents[1] / "README.md"
 
@@ -51,7 +52,7 @@ def test_help_on_a_skin_says_shapes_and_units():
 
 
 def test_an_environment_has_the_skin_of_its_configuration_by_default():
-    config = egoskin.EnvConfig()
+    config = egoskin.EnvConfig(task=TASK)
 
     def still(td: TensorDict) -> TensorDict:
         return td.set("action", torch.zeros(*td.shape, 21))
