@@ -140,6 +140,8 @@ def make_worker_env(
             f"sparse gives the present state alone, history {config.history} needs "
             "signals: leave sparse off"
         )
+    if sparse and mask and tuple(mask) != MASK_ALL:
+        raise ValueError("sparse sources know no mask of some links: leave sparse off")
     robot = config.robot_config
     if skin is None:
         skin = config.skin.build(robot)
