@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -46,16 +47,27 @@ def to_plain(value: Any) -> Any:
     return value
 
 
-def check_numbers(content: Any, name: str = "") -> None:
-    """Raise ValueError if a plain value holds NaN; the text names where."""
-    if isinstance(content, dict):
-        for key, value in content.items():
-            check_numbers(value, f"{name}.{key}".lstrip("."))
-    elif isinstance(content, list):
+def check_numbers(
+    content: Any, may_be_infinite: Collection[str] = (), name: str = ""
+) -> None:
+    """Raise ValueError if a configuration holds a number that is not finite.
+
+    Args:
+        content: A dataclass, or what is in one.
+        may_be_infinite: Dotted names of fields that may be infinite, but not NaN.
+        name: Dotted name of the content, for the error text.
+    """
+    if dataclasses.is_dataclass(content):
+        for field in dataclasses.fields(content):
+            inner = f"{name}.{field.name}".lstrip(".")
+            check_numbers(getattr(content, field.name), may_be_infinite, inner)
+    elif isinstance(content, (tuple, list)):
         for value in content:
-            check_numbers(value, name)
-    elif isinstance(content, float) and math.isnan(content):
-        raise ValueError(f"{name} must be a number, got nan")
+            check_numbers(value, may_be_infinite, name)
+    elif isinstance(content, float) and not math.isfinite(content):
+        if name in may_be_infinite and not math.isnan(content):
+            return
+        raise ValueError(f"{name} must be a finite number, got {content}")
 
 
 def from_plain(kind: type[T], content: Any, what: str) -> T:

@@ -108,7 +108,7 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         """Raise ValueError for values with which no run can start."""
-        check_numbers(to_plain(self))
+        check_numbers(self, may_be_infinite=("env.sensor.range",))
         check_counts(self, "total_frames", "snapshot_frames", "learner_threads")
         check_seed(self.seed)
         if not self.checkpoint_interval > 0:

@@ -58,16 +58,36 @@ def test_what_a_configuration_refuses_is_told_with_the_file():
         from_plain(TrainConfig, plain, "my.json")
 
 
-def test_what_is_no_number_is_refused_wherever_it_stands():
-    for field in ("env.task.reward.survival", "ppo.entropy_coeff"):
-        plain = to_plain(TrainConfig())
-        *parents, name = field.split(".")
-        inner = plain
-        for parent in parents:
-            inner = inner[parent]
-        inner[name] = math.nan
-        with pytest.raises(ValueError, match=f"{field} must be a number, got nan"):
-            from_plain(TrainConfig, plain, "here")
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("env.task.reward.survival", math.nan),
+        ("ppo.entropy_coeff", math.nan),
+        ("env.sensor.range", math.nan),
+        ("env.task.throws.mass", math.inf),
+        ("env.task.throws.speed", [4.0, math.inf]),
+        ("env.task.throws.height", [2.0, math.inf]),
+        ("env.task.throws.azimuth_deg", [-math.inf, 180.0]),
+        ("env.task.start_joint_noise", math.inf),
+    ],
+)
+def test_what_is_not_finite_is_refused_wherever_it_stands(field: str, value: object):
+    plain = to_plain(TrainConfig())
+    *parents, name = field.split(".")
+    inner = plain
+    for parent in parents:
+        inner = inner[parent]
+    inner[name] = value
+    with pytest.raises(
+        ValueError, match=rf"{field} must be a finite number|range must"
+    ):
+        from_plain(TrainConfig, plain, "here")
+
+
+def test_a_range_may_be_infinite():
+    plain = to_plain(TrainConfig())
+    plain["env"]["sensor"]["range"] = "inf"
+    assert from_plain(TrainConfig, plain, "here").env.sensor.range == math.inf
 
 
 def test_a_file_that_is_no_json_is_named(tmp_path):

@@ -388,6 +388,7 @@ def test_the_number_of_threads_changes_no_bit(threads: int):
         {"learning_rate": 0.1},
         {"learning_rate": 1e-6},
         {"clip_epsilon": float("inf")},
+        {"clip_epsilon": 1.5},
     ],
 )
 def test_values_outside_their_range_are_refused(field: dict):

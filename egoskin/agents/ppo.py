@@ -101,6 +101,9 @@ class PPOConfig:
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:
                 raise ValueError(f"{name} must be positive and finite, got {value}")
+        if self.clip_epsilon > 1:
+            # The bound 1 - clip_epsilon of the ratio would have no logarithm.
+            raise ValueError(f"clip_epsilon must be at most 1, got {self.clip_epsilon}")
         low, high = _LR_BOUNDS
         if self.desired_kl is not None and not low <= self.learning_rate <= high:
             raise ValueError(
@@ -334,8 +337,9 @@ class PPO:
             network.grad.copy_(part)
             norms.append(nn.utils.get_total_norm([network.grad]))
         actor_norm, critic_norm = norms
-        # A loss that is not finite shows in a gradient norm that is not.
-        if not torch.isfinite(actor_norm + critic_norm):
+        # A loss that is not finite may have a gradient that is zero.
+        total = metrics["loss_actor"] + metrics["loss_critic"]
+        if not torch.isfinite(actor_norm + critic_norm + total):
             losses = (f"{k} {float(v)}" for k, v in metrics.items() if "loss" in k)
             raise NonFiniteError(
                 f"{', '.join(losses)}, actor gradient norm {float(actor_norm)}, "
