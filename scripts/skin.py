@@ -307,7 +307,7 @@ def views(robot: RobotConfig, skin: Skin) -> np.ndarray:
     ends = starts + _NORMAL_LENGTH * (turn @ skin.normal[:, :, None])[..., 0]
     images = []
     for azimuth in (0.0, 180.0):
-        camera = CameraConfig(distance=3.4, azimuth_deg=azimuth, elevation_deg=8.0)
+        camera = CameraConfig(distance=3.4, azimuth_deg=azimuth, elevation_deg=12.0)
         painter = Painter(robot, skin, (), size=_VIEW_SIZE, camera=camera)
         with painter:
             painter.draw(state, time=0.0)
