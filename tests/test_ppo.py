@@ -374,6 +374,15 @@ def test_the_number_of_threads_changes_no_bit(threads: int):
     assert several == one
 
 
+def test_a_loss_that_is_not_finite_stops_the_update_though_its_gradient_is_zero():
+    config = PPOConfig(ppo_epochs=1)
+    # The logarithm of a negative bound: such a loss is NaN, with a gradient of zero.
+    object.__setattr__(config, "clip_epsilon", 1.5)
+    agent = bandit_agent()
+    with pytest.raises(NonFiniteError, match="loss_actor nan"):
+        PPO(agent, config).update(bandit_rollout(agent))
+
+
 @pytest.mark.parametrize(
     "field",
     [
