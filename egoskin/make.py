@@ -140,7 +140,7 @@ def make_worker_env(
             f"sparse gives the present state alone, history {config.history} needs "
             "signals: leave sparse off"
         )
-    if sparse and mask and tuple(mask) != MASK_ALL:
+    if sparse and mask and not masks_all(mask):
         raise ValueError("sparse sources know no mask of some links: leave sparse off")
     robot = config.robot_config
     if skin is None:
