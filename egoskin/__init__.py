@@ -17,7 +17,7 @@ from `egoskin.envs.dodgeball.DodgeballEnv` (all its keys: its docstring)
 from `egoskin.sensors.FieldSensor` or ``RaySensor``
 ``distance``                ``[*B, S]``   or ``[*B, S, K]`` [m], inf: none signals
 ``object_detected``         ``[*B, O]``   bool: by any sensor           signals
-from `egoskin.sensors.corruption.Corruption`
+from `egoskin.sensors.imperfections.corruption.Corruption`
 ``reading``                 as distance   as a real sensor reports it   signals
 ``reading_clock``           ``[*B, 2]``   episode, step                 itself
 ``reading_i_*``             any           state of the i-th imperfection itself
@@ -29,7 +29,7 @@ from `egoskin.sensors.history`
 from `egoskin.sensors.tactile`, in tasks of your own
 ``contact_force``           ``[*B, L, 3]`` yours [N]                     tactile
 ``contact_free``            ``[*B, 1]``   bool: untouched so far        -
-from `egoskin.observations`
+from `egoskin.envs.observations`
 ``observation``             ``[*B, 6+2J]`` body; 6+3J: and last action  actor, critic
 ``privileged_observation``  ``[*B, P]``   told in training only         critic
 ``signal``                  ``[*B, 7 O]`` an oracle's: the truth        actor, critic
@@ -54,7 +54,7 @@ os.environ.setdefault("GOMP_SPINCOUNT", "0")
 
 if TYPE_CHECKING:
     from egoskin.make import EnvConfig, make_env, make_worker_env
-    from egoskin.policies import Policy, load_policy
+    from egoskin.policies.policy import Policy, load_policy
 
 __version__ = "0.1.0"
 
@@ -62,8 +62,8 @@ _EXPORTS = {
     "EnvConfig": "egoskin.make",
     "make_env": "egoskin.make",
     "make_worker_env": "egoskin.make",
-    "Policy": "egoskin.policies",
-    "load_policy": "egoskin.policies",
+    "Policy": "egoskin.policies.policy",
+    "load_policy": "egoskin.policies.policy",
 }
 
 __all__ = ["EnvConfig", "Policy", "load_policy", "make_env", "make_worker_env"]

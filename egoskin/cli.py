@@ -13,7 +13,7 @@ from types import FrameType
 from typing import Any
 
 from egoskin.interrupts import ENDING, end_next_time, end_now, say, take
-from egoskin.workers import WorkerError
+from egoskin.parallel import WorkerError
 
 
 class _Ended(KeyboardInterrupt):

@@ -18,16 +18,16 @@ from torchrl.envs import (
     TransformedEnv,
 )
 
-from egoskin.checkpoint import part, prefixed
 from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
+from egoskin.envs.observations import HideObjects, Oracle, Privileged, Proprioception
 from egoskin.envs.standards import standard_of
-from egoskin.observations import HideObjects, Oracle, Privileged, Proprioception
-from egoskin.robots import ROBOTS, RobotConfig, RobotName
+from egoskin.parallel import WorkerPool, default_num_workers
+from egoskin.robots.config import ROBOTS, RobotConfig, RobotName
 from egoskin.sensors import History, Skin
 from egoskin.sensors.config import SensorConfig, SkinConfig
 from egoskin.sensors.geometry import STATE_KEYS
+from egoskin.storage.tensor_file import part, prefixed
 from egoskin.transform import StatefulTransform
-from egoskin.workers import WorkerPool, default_num_workers
 
 # Raw state that neither the networks nor the metrics read: it stays in the workers.
 _RAW_KEYS = (

@@ -153,7 +153,7 @@ def _lasting(run: StoredRun) -> float | None:
 
 
 def _at_age(run: StoredRun, age: float) -> dict[str, Any] | None:
-    """Return the `egoskin.behaviour.Displacement` at an age [s], None without one."""
+    """Return the `behaviour.Displacement` at an age [s], None without one."""
     ways = run.evaluation.get("behaviour", {}).get("displacement", ())
     return next((way for way in ways if way["age"] == age), None)
 

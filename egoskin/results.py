@@ -27,10 +27,15 @@ import numpy as np
 
 from egoskin.envs.dodgeball import DodgeballConfig
 from egoskin.envs.standards import Standard, training_task
-from egoskin.formats import migrate, read_sealed
 from egoskin.make import EnvConfig
-from egoskin.plain import changed_fields, from_plain, read_json, to_plain
-from egoskin.runs import MACHINE_FIELDS, SKIN_HASH, Run, TrainConfig
+from egoskin.runs.run import MACHINE_FIELDS, SKIN_HASH, Run, TrainConfig
+from egoskin.storage.formats import migrate, read_sealed
+from egoskin.storage.serialization import (
+    changed_fields,
+    from_plain,
+    read_json,
+    to_plain,
+)
 
 # Environment steps between the stored lines of metrics (about 250 in the paper's 1000
 # epochs), and their significant digits.

@@ -30,10 +30,10 @@ import tyro
 from torch import Tensor
 
 from egoskin.cli import check_counts, check_output, clear_errors, counted
-from egoskin.draws import check_seed
-from egoskin.evaluation import standard_task
-from egoskin.planning import Ceiling, Outcome, SearchConfig, find_ceiling
-from egoskin.policies import load_policy
+from egoskin.evaluation.throw_set import standard_task
+from egoskin.evaluation.upper_bound import Ceiling, Outcome, SearchConfig, find_ceiling
+from egoskin.policies.policy import load_policy
+from egoskin.rng import check_seed
 
 # Bounds of the groups by height aimed at [m].
 BOUNDS = (0.0, 0.7, 0.9, 1.1, 1.3, 2.0)

@@ -44,15 +44,15 @@ except ImportError:
     )
     raise SystemExit(2) from None
 
-from egoskin.analysis import Analysis, analyse
 from egoskin.cli import clear_errors, counted
-from egoskin.envs.physics import PhysicsConfig
+from egoskin.envs.physics.mujoco import PhysicsConfig
 from egoskin.envs.throws import ThrowConfig
-from egoskin.film import check_path
-from egoskin.plain import to_plain
-from egoskin.robots import ROBOTS, RobotName
+from egoskin.evaluation.visibility import Analysis, analyse
+from egoskin.robots.config import ROBOTS, RobotName
 from egoskin.sensors import Field, Ray
 from egoskin.sensors.config import SkinConfig
+from egoskin.storage.serialization import to_plain
+from egoskin.viewer.film import check_path
 
 # Cells whose warning differs for fewer hits than this see alike.
 ALIKE = 0.05

@@ -27,16 +27,16 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from egoskin.behaviour import Behaviour, Motion, behave
 from egoskin.cli import check_counts, check_output, clear_errors, counted
-from egoskin.draws import check_seed
-from egoskin.evaluation import Estimate, Evaluation, evaluate, standard_task
-from egoskin.film import check_path
+from egoskin.evaluation.behaviour import Behaviour, Motion, behave
+from egoskin.evaluation.operating_map import check_map, draw_map, operating_map
+from egoskin.evaluation.throw_set import Estimate, Evaluation, evaluate, standard_task
 from egoskin.make import MASK_ALL, EnvConfig, check_mask, check_num_workers
-from egoskin.operating_map import check_map, draw_map, operating_map
-from egoskin.policies import load_policy
+from egoskin.policies.policy import load_policy
 from egoskin.progress import StatusLine
 from egoskin.report import metres
+from egoskin.rng import check_seed
+from egoskin.viewer.film import check_path
 
 PICTURE_SUFFIXES = (".png", ".svg", ".pdf")
 
@@ -83,7 +83,7 @@ class EvaluateConfig:
 
     @property
     def masked(self) -> tuple[str, ...]:
-        """The mask as `egoskin.evaluation` takes it."""
+        """The mask as `egoskin.evaluation.throw_set` takes it."""
         if self.mask is None:
             return ()
         return self.mask or MASK_ALL

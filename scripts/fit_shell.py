@@ -4,8 +4,8 @@ Skin sits on the outside of the robot, so outsides are compared, in the default 
 A point of a mesh is *outer* if at least ``min_openness`` of the cosine-weighted rays
 over its outward hemisphere leave the robot without meeting any mesh: 0.15 rejects the
 floor of a round pit deeper than 1.2 diameters. Points of the primitives are those that
-skin is placed on (`egoskin.surface`). Distances run between the outer points of one
-region, nearest to nearest, both ways. Points stand for surfaces, so a figure is
+skin is placed on (`egoskin.robots.surface`). Distances run between the outer points of
+one region, nearest to nearest, both ways. Points stand for surfaces, so a figure is
 too high, never too low: a perfect fit gives half the spacing of the points.
 
     python scripts/fit_shell.py --meshes DIR
@@ -37,8 +37,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from egoskin.cli import clear_errors
-from egoskin.robots import H1_2
-from egoskin.surface import sample_surface
+from egoskin.robots.config import H1_2
+from egoskin.robots.surface import sample_surface
 
 Array = NDArray[np.float64]
 Scene = tuple[mujoco.MjModel, mujoco.MjData]

@@ -21,10 +21,10 @@ from egoskin.agents.ppo import NonFiniteError
 from egoskin.cli import clear_errors, counted
 from egoskin.interrupts import ENDING, end_next_time, say, take
 from egoskin.make import check_num_workers
+from egoskin.parallel import WorkerError
 from egoskin.progress import ProgressLine
-from egoskin.runs import Run, parse_config
-from egoskin.training import open_trainer, train
-from egoskin.workers import WorkerError
+from egoskin.runs.run import Run, parse_config
+from egoskin.runs.trainer import open_trainer, train
 
 
 class Stop:

@@ -37,19 +37,19 @@ except (AttributeError, ImportError, RuntimeError) as fault:
     raise SystemExit(2) from None
 
 from egoskin.cli import check_counts, clear_errors, counted
-from egoskin.draws import check_seed
-from egoskin.evaluation import standard_task
-from egoskin.film import (
+from egoskin.evaluation.throw_set import standard_task
+from egoskin.make import EnvConfig
+from egoskin.policies.policy import load_policy
+from egoskin.progress import StatusLine
+from egoskin.rng import check_seed
+from egoskin.viewer.film import (
     FILM_SUFFIXES,
     check_path,
     contact_sheet,
     save_film,
     save_picture,
 )
-from egoskin.make import EnvConfig
-from egoskin.policies import load_policy
-from egoskin.progress import StatusLine
-from egoskin.rendering import (
+from egoskin.viewer.offscreen import (
     CameraConfig,
     check_film,
     painter_of,

@@ -25,10 +25,10 @@ from torch import Tensor, nn
 
 from egoskin.agents.networks import Agent, input_keys
 from egoskin.agents.ppo import PPO, NonFiniteError, PPOConfig
-from egoskin.checkpoint import load_tensors, part
 from egoskin.cli import clear_errors
-from egoskin.plain import from_plain
-from egoskin.policies import PolicySpec, load_agent_tensors
+from egoskin.policies.policy import PolicySpec, load_agent_tensors
+from egoskin.storage.serialization import from_plain
+from egoskin.storage.tensor_file import load_tensors, part
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -39,14 +39,12 @@ except ImportError:
     )
     raise SystemExit(2) from None
 
-from egoskin.behaviour import behave
-from egoskin.checkpoint import write_file
 from egoskin.cli import check_output, clear_errors, counted
-from egoskin.draws import check_seed
 from egoskin.envs.standards import Standard
-from egoskin.evaluation import standard_task
+from egoskin.evaluation.behaviour import behave
+from egoskin.evaluation.throw_set import standard_task
 from egoskin.make import check_num_workers
-from egoskin.policies import Policy, load_policy
+from egoskin.policies.policy import Policy, load_policy
 from egoskin.report import curve, report, sections
 from egoskin.results import (
     StoredRun,
@@ -57,7 +55,9 @@ from egoskin.results import (
     thin,
     to_json,
 )
-from egoskin.runs import Run
+from egoskin.rng import check_seed
+from egoskin.runs.run import Run
+from egoskin.storage.tensor_file import write_file
 
 # Okabe and Ito's colours, told apart by colour-blind readers as well.
 _COLOURS = (

@@ -33,8 +33,8 @@ from torch import Tensor
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 from torchrl.envs import Compose, GymWrapper, StepCounter, TransformedEnv
 
-from egoskin.chains import build_chain
 from egoskin.cli import clear_errors
+from egoskin.robots.chains import build_chain
 from egoskin.sensors import FieldSensor, Proximity, Skin
 from egoskin.shapes import Sphere
 from egoskin.transform import RowTransform

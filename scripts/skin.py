@@ -32,15 +32,15 @@ import tyro
 from tensordict import TensorDict
 
 from egoskin.cli import clear_errors, counted
-from egoskin.film import check_path, save_picture
-from egoskin.kinematics import LinkKinematics
-from egoskin.rendering import CameraConfig, Painter
-from egoskin.robots import ROBOTS, Primitive, RobotConfig, RobotName, read_robot
+from egoskin.robots.config import ROBOTS, Primitive, RobotConfig, RobotName, read_robot
+from egoskin.robots.kinematics import LinkKinematics
 from egoskin.sensors import Skin
-from egoskin.sensors.coverage import Coverage
-from egoskin.sensors.gentact import load_gentact, save_gentact
-from egoskin.sensors.mesh_surface import Meshes, meshes_in_folder, meshes_of_mjcf
-from egoskin.sensors.placement import place_sensors
+from egoskin.sensors.skin.coverage import Coverage
+from egoskin.sensors.skin.gentact import load_gentact, save_gentact
+from egoskin.sensors.skin.mesh_surface import Meshes, meshes_in_folder, meshes_of_mjcf
+from egoskin.sensors.skin.placement import place_sensors
+from egoskin.viewer.film import check_path, save_picture
+from egoskin.viewer.offscreen import CameraConfig, Painter
 
 # So many sensors take long enough to say so.
 _MANY = 10_000

@@ -29,16 +29,16 @@ from typing import Annotated, Any
 
 import tyro
 
-from egoskin.analysis import analyse
-from egoskin.checkpoint import write_file
 from egoskin.cli import check_counts, clear_errors, counted
-from egoskin.plain import to_plain
+from egoskin.evaluation.visibility import analyse
+from egoskin.parallel import available_cores
+from egoskin.storage.serialization import to_plain
+from egoskin.storage.tensor_file import write_file
 from egoskin.study.cost import cost, measure
 from egoskin.study.manifest import Manifest, load_study, resolve
 from egoskin.study.runner import LocalRunner, Progress, slurm_script
 from egoskin.study.shipped import STUDIES
 from egoskin.study.store import RunStatus, StudyFolder, duration
-from egoskin.workers import available_cores
 
 # A server that many have.
 _MANY_CORES = 64

@@ -33,12 +33,12 @@ import torch
 import tyro
 
 from egoskin.agents.ppo import PPOConfig
-from egoskin.checkpoint import load_tensors
 from egoskin.cli import clear_errors, counted
-from egoskin.compilation import SETTING, can_compile
 from egoskin.make import EnvConfig
-from egoskin.runs import Run, TrainConfig, parse_config
-from egoskin.training import open_trainer, train
+from egoskin.runs.run import Run, TrainConfig, parse_config
+from egoskin.runs.trainer import open_trainer, train
+from egoskin.sensors.kernels.compilation import SETTING, can_compile
+from egoskin.storage.tensor_file import load_tensors
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,9 +12,9 @@ import torch
 from hypothesis import settings
 from tensordict import TensorDict
 
-from egoskin import compilation
-from egoskin.robots import H1_2, RobotConfig
+from egoskin.robots.config import H1_2, RobotConfig
 from egoskin.sensors import Skin, place_sensors
+from egoskin.sensors.kernels import compilation
 
 # The same examples in every run: a test turns red with the change that broke it.
 settings.register_profile(

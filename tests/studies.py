@@ -10,9 +10,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import egoskin
-from egoskin.formats import content_hash, read_sealed, sealed_json
 from egoskin.results import Record, to_json
-from egoskin.runs import Run
+from egoskin.runs.run import Run
+from egoskin.storage.formats import content_hash, read_sealed, sealed_json
 from egoskin.study.manifest import Manifest, PlannedRun
 from egoskin.study.store import StudyFolder, policy_hash
 

@@ -5,62 +5,53 @@ from __future__ import annotations
 import ast
 from pathlib import Path
 
-import pytest
+import egoskin
 
-PACKAGE = Path(__file__).parents[1] / "egoskin"
-MODULES = sorted(
-    path.relative_to(PACKAGE).with_suffix("").as_posix().replace("/", ".")
+PACKAGE = Path(egoskin.__file__).parent
+MODULES = {
+    path.relative_to(PACKAGE).with_suffix("").as_posix().replace("/", "."): path
     for path in PACKAGE.rglob("*.py")
-)
+}
 
-# What each part may import of the package; a folder's name covers all it holds.
-ALLOWED = {
-    "files": set(),
-    "chains": set(),
-    "robots": {"files", "chains"},
-    "compilation": set(),
-    "rounding": set(),
-    "events": set(),
-    "sparse": set(),
-    "shapes": {"rounding"},
-    "draws": set(),
-    "kinematics": {"rounding"},
-    "surface": {"robots", "shapes", "kinematics"},
-    "transform": {"kinematics"},
-    "observations": {"kinematics", "transform"},
-    "envs": {"robots", "shapes", "draws", "kinematics", "surface", "envs"},
-    "sensors": {
-        "files",
-        "compilation",
-        "rounding",
-        "chains",
-        "robots",
-        "shapes",
-        "draws",
-        "kinematics",
-        "surface",
-        "transform",
-        "sparse",
-        "sensors",
-    },
-    "agents": {"sparse", "agents"},
+# Small tools that many rooms share; the last ones import those before them.
+TOOLS = [
+    "rounding",
+    "rng",
+    "sparse",
+    "progress",
+    "interrupts",
+    "parallel",
+    "cli",
+    "shapes",
+]
+# What each room may import besides the tools: one way, so no two import each other.
+ROOMS = {
+    "storage": set(),
+    "robots": {"storage"},
+    "transform": {"robots"},
+    "envs": {"robots", "transform"},
+    "sensors": {"storage", "robots", "transform"},
+    "agents": set(),
+    "make": {"storage", "robots", "transform", "envs", "sensors"},
+    "policies": {"storage", "sensors", "agents", "make"},
+    "evaluation": {"robots", "transform", "envs", "sensors", "policies", "make"},
+    "runs": {"storage", "envs", "sensors", "agents", "make", "policies"},
 }
 # The simulator, and what draws pictures of it.
 MUJOCO = {
-    "chains",
-    "robots",
+    "robots.chains",
+    "robots.config",
     "shapes",
-    "envs.physics",
-    "rendering",
-    "sensors.mesh_surface",
+    "envs.physics.mujoco",
+    "sensors.skin.mesh_surface",
+    "viewer.offscreen",
 }
 
 
 def imports(module: str) -> set[str]:
     """Full names of all that a module imports, wherever the import stands."""
-    path = PACKAGE / (module.replace(".", "/") + ".py")
     names = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(ast.parse(MODULES[module].read_text())):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -72,27 +63,45 @@ def imports(module: str) -> set[str]:
     return names
 
 
-def part(name: str) -> str:
-    """The part of the package that a full name belongs to: a module or a folder."""
-    return name.split(".")[1]
+def rooms(module: str) -> set[str]:
+    """Rooms and tools of the package that a module imports, its own left out."""
+    own = {name.split(".")[1] for name in imports(module) if name[:8] == "egoskin."}
+    return own - {module.split(".")[0]}
 
 
-@pytest.mark.parametrize("module", [m for m in MODULES if m.split(".")[0] in ALLOWED])
-def test_a_module_imports_only_what_lies_before_it(module):
-    names = imports(module)
-    own = {part(name) for name in names if name.startswith("egoskin.")}
-    assert own <= ALLOWED[module.split(".")[0]]
-    # The public face of the package sees everything, so nothing may look at it.
-    assert not any(name == "egoskin" for name in names)
+def test_a_room_imports_only_rooms_before_it():
+    wrong = {
+        module: strange
+        for module in MODULES
+        if (room := module.split(".")[0]) in ROOMS
+        and (strange := rooms(module) - ROOMS[room] - set(TOOLS))
+    }
+    assert not wrong
 
 
-@pytest.mark.parametrize("module", MODULES)
-def test_the_simulator_is_imported_in_few_places(module):
-    uses = any(name.split(".")[0] == "mujoco" for name in imports(module))
-    assert not uses or module in MUJOCO
+def test_a_tool_imports_only_tools_before_it():
+    for number, tool in enumerate(TOOLS):
+        assert rooms(tool) <= set(TOOLS[:number]), tool
 
 
-def test_the_layers_exist():
-    parts = {module.split(".")[0] for module in MODULES}
-    assert set(ALLOWED) <= parts
-    assert MUJOCO - {"rendering"} <= set(MODULES)
+def test_no_two_rooms_import_each_other():
+    ready, left = set(TOOLS), dict(ROOMS)
+    while left:
+        free = [room for room, needs in left.items() if needs <= ready]
+        assert free, f"a circle among {sorted(left)}"
+        ready |= set(free)
+        for room in free:
+            del left[room]
+
+
+def test_the_public_face_is_imported_by_nothing():
+    assert not [m for m in MODULES if m != "__init__" and "egoskin" in imports(m)]
+
+
+def test_the_simulator_is_imported_in_few_places():
+    uses = {
+        module
+        for module in MODULES
+        if any(name.split(".")[0] == "mujoco" for name in imports(module))
+    }
+    assert uses == MUJOCO

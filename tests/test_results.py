@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from egoskin.plain import to_plain
 from egoskin.report import (
     curve,
     interquartile_mean,
@@ -30,7 +29,8 @@ from egoskin.results import (
     thin,
     to_json,
 )
-from egoskin.runs import Run, TrainConfig
+from egoskin.runs.run import Run, TrainConfig
+from egoskin.storage.serialization import to_plain
 
 ROOT = Path(__file__).parents[1]
 RECORD = Record(

@@ -13,16 +13,16 @@ from tensordict import TensorDict
 
 from egoskin.agents.networks import Agent, NetworkConfig, SignalNorm
 from egoskin.agents.ppo import PPO, PPOConfig
-from egoskin.collection import collect
+from egoskin.agents.rollout import collect
 from egoskin.make import EnvConfig, make_env
-from egoskin.policies import (
+from egoskin.policies.policy import (
     PolicySpec,
     agent_tensors,
     load_policy,
     save_policy,
     sparse_sources,
 )
-from egoskin.robots import H1_2
+from egoskin.robots.config import H1_2
 from egoskin.sensors import Ray, RaySensor, place_sensors
 from egoskin.sensors.config import SensorConfig
 from egoskin.shapes import Sphere

@@ -17,10 +17,10 @@ from torchrl.envs import Compose, ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from egoskin.envs.dodgeball import DodgeballEnv
+from egoskin.envs.observations import Oracle, Privileged, Proprioception, approaches_b
 from egoskin.envs.throws import GRAVITY
 from egoskin.make import MASK_ALL, EnvConfig, make_worker_env
-from egoskin.observations import Oracle, Privileged, Proprioception, approaches_b
-from egoskin.robots import H1_2
+from egoskin.robots.config import H1_2
 from egoskin.sensors import (
     Binary,
     Field,

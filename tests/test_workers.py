@@ -18,8 +18,7 @@ import torch
 from torchrl.envs import Compose, Transform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from egoskin import workers
-from egoskin.compilation import SETTING
+from egoskin import parallel as workers
 from egoskin.envs.dodgeball import DodgeballEnv
 from egoskin.make import (
     EnvConfig,
@@ -28,14 +27,15 @@ from egoskin.make import (
     make_worker_env,
     save_env_state,
 )
-from egoskin.robots import H1_2
-from egoskin.sensors import place_sensors
-from egoskin.workers import (
+from egoskin.parallel import (
     WorkerError,
     WorkerPool,
     default_num_workers,
     in_halves,
 )
+from egoskin.robots.config import H1_2
+from egoskin.sensors import place_sensors
+from egoskin.sensors.kernels.compilation import SETTING
 from throwing import TASK
 
 NUM_ENVS = 32
@@ -340,7 +340,7 @@ pool.step_and_maybe_reset(root)
 
 UNGUARDED = """
 from egoskin.make import EnvConfig, make_env
-from egoskin.robots import H1_2
+from egoskin.robots.config import H1_2
 from egoskin.sensors import place_sensors
 skin = place_sensors(H1_2, 8, seed=0)
 pool = make_env(EnvConfig(), skin, num_envs=8, seed=0, num_workers=2)
@@ -534,7 +534,7 @@ def test_workers_that_do_not_divide_the_agents_are_refused(skin):
 FAULTS = """
 import ctypes, resource, sys
 import torch
-from egoskin.workers import keep_freed_memory
+from egoskin.parallel import keep_freed_memory
 if sys.argv[1] == "keep":
     keep_freed_memory()
 

@@ -11,12 +11,17 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from egoskin.draws import Stream, uniform
-from egoskin.envs.physics import Physics, PhysicsConfig, PhysicsState, build_scene
+from egoskin.envs.physics.mujoco import (
+    Physics,
+    PhysicsConfig,
+    PhysicsState,
+    build_scene,
+)
 from egoskin.envs.rewards import TERMS, RewardConfig, reward_terms
 from egoskin.envs.throws import ThrowConfig, Thrower
-from egoskin.kinematics import pad_rows, rotate_inverse
-from egoskin.robots import RobotConfig
+from egoskin.rng import Stream, uniform
+from egoskin.robots.config import RobotConfig
+from egoskin.robots.kinematics import pad_rows, rotate_inverse
 
 PASSED_DISTANCE = 1.0
 """A ball has passed once it flies away from the base and is farther than this [m]."""

@@ -15,11 +15,11 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from egoskin.draws import Stream, uniform
-from egoskin.kinematics import LinkKinematics, rotate
-from egoskin.robots import RobotConfig
+from egoskin.rng import Stream, uniform
+from egoskin.robots.config import RobotConfig
+from egoskin.robots.kinematics import LinkKinematics, rotate
+from egoskin.robots.surface import sample_surface
 from egoskin.shapes import Sphere
-from egoskin.surface import sample_surface
 
 GRAVITY = 9.81
 # Points of the body that throws are aimed at: dense enough that two neighbours are
@@ -302,7 +302,7 @@ class Thrower:
         """Return position and velocity of balls thrown at robots as they are now.
 
         A row's result is the same whichever rows are computed with it if their
-        number is a multiple of 32 (`egoskin.kinematics.pad_rows`).
+        number is a multiple of 32 (`egoskin.robots.kinematics.pad_rows`).
 
         Args:
             draw: Draws of ``n`` throws.

@@ -4,15 +4,15 @@ Everything here works on TensorDicts with the keys named in `egoskin`, from this
 project's environment, another simulator, a recording or a real robot.
 """
 
-from egoskin.sensors.corruption import Corruption
-from egoskin.sensors.coverage import Field, Ray
 from egoskin.sensors.field import FieldSensor
-from egoskin.sensors.gentact import load_gentact, save_gentact
 from egoskin.sensors.history import History, HoldLast
-from egoskin.sensors.placement import place_sensors
+from egoskin.sensors.imperfections.corruption import Corruption
 from egoskin.sensors.ray import RaySensor
 from egoskin.sensors.signals import BeamMinimum, Binary, Localization, Proximity
-from egoskin.sensors.skin import Skin
+from egoskin.sensors.skin.coverage import Field, Ray
+from egoskin.sensors.skin.gentact import load_gentact, save_gentact
+from egoskin.sensors.skin.placement import place_sensors
+from egoskin.sensors.skin.skin import Skin
 from egoskin.sensors.tactile import (
     ContactFree,
     ContactPenalty,

@@ -13,17 +13,17 @@ import numpy as np
 from tensordict import TensorDictBase
 from torchrl.envs import Transform
 
-from egoskin.draws import offset_seed
-from egoskin.robots import RobotConfig
-from egoskin.sensors.corruption import Corruption
-from egoskin.sensors.coverage import Field, Ray
+from egoskin.rng import offset_seed
+from egoskin.robots.config import RobotConfig
 from egoskin.sensors.field import FieldSensor
 from egoskin.sensors.history import HoldLast
-from egoskin.sensors.placement import place_sensors
-from egoskin.sensors.presets import PRESETS
+from egoskin.sensors.imperfections.corruption import Corruption
+from egoskin.sensors.imperfections.presets import PRESETS
 from egoskin.sensors.ray import RaySensor, SparseRays
 from egoskin.sensors.signals import Binary, Localization, Proximity, SkinOrder
-from egoskin.sensors.skin import Skin
+from egoskin.sensors.skin.coverage import Field, Ray
+from egoskin.sensors.skin.placement import place_sensors
+from egoskin.sensors.skin.skin import Skin
 from egoskin.shapes import Shape
 
 # The golden ratio's bits: seeds far apart for sensors of different kinds.

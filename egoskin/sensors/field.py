@@ -11,9 +11,8 @@ import torch
 from tensordict import NestedKey
 from torch import Tensor
 
-from egoskin.robots import Primitive
+from egoskin.robots.config import Primitive
 from egoskin.rounding import exact_sqrt
-from egoskin.sensors.coverage import Field
 from egoskin.sensors.geometry import (
     STATE_KEYS,
     ProximitySensor,
@@ -21,7 +20,8 @@ from egoskin.sensors.geometry import (
     View,
     checked,
 )
-from egoskin.sensors.skin import Skin
+from egoskin.sensors.skin.coverage import Field
+from egoskin.sensors.skin.skin import Skin
 from egoskin.shapes import Shape, Sphere
 
 

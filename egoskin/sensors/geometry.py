@@ -3,7 +3,7 @@
 All is computed as a structure of arrays with the batch last (``[S, B]``), in the order
 of the skin, by +, -, x, /, `sincos` and `exact_sqrt` (`egoskin.rounding`) alone: a
 row's result has the same bits whatever rows are computed with it, here or, for balls
-and a transparent robot, in C++ (`egoskin/sensors/kernels.cpp`).
+and a transparent robot, in C++ (`egoskin/sensors/kernels/kernels.cpp`).
 
 Contract: a reading of infinity means that nothing is in range; NaN in the input gives
 a reading of NaN, never one of nothing.
@@ -23,12 +23,12 @@ from torch import Tensor
 from torchrl.data import Binary as BinarySpec
 from torchrl.data import Composite, TensorSpec, Unbounded
 
-from egoskin.kinematics import LinkKinematics, quat_to_entries
-from egoskin.robots import Primitive
-from egoskin.sensors.coverage import Coverage
-from egoskin.sensors.kernels import Kernels
+from egoskin.robots.config import Primitive
+from egoskin.robots.kinematics import LinkKinematics, quat_to_entries
+from egoskin.sensors.kernels.binding import Kernels
 from egoskin.sensors.occlusion import Occluder
-from egoskin.sensors.skin import Skin
+from egoskin.sensors.skin.coverage import Coverage
+from egoskin.sensors.skin.skin import Skin
 from egoskin.shapes import Shape, Sphere
 from egoskin.transform import RowTransform
 

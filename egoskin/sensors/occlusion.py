@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from egoskin.robots import Primitive
+from egoskin.robots.config import Primitive
 from egoskin.shapes import shape_of
 
 # A path is blocked if more than this of it lies inside one primitive [m]: a sensor on

@@ -11,8 +11,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
-from egoskin.robots import Primitive
-from egoskin.sensors.coverage import Ray
+from egoskin.robots.config import Primitive
 from egoskin.sensors.geometry import (
     STATE_KEYS,
     ProximitySensor,
@@ -21,9 +20,10 @@ from egoskin.sensors.geometry import (
     checked,
     product,
 )
-from egoskin.sensors.kernels import VECTOR
+from egoskin.sensors.kernels.binding import VECTOR
 from egoskin.sensors.signals import Binary, Proximity
-from egoskin.sensors.skin import Skin
+from egoskin.sensors.skin.coverage import Ray
+from egoskin.sensors.skin.skin import Skin
 from egoskin.shapes import Shape, first_hit
 from egoskin.sparse import SparseRows, offsets_of
 

@@ -19,7 +19,7 @@ from tensordict import NestedKey
 from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 
-from egoskin.kinematics import LinkKinematics, rotate_inverse
+from egoskin.robots.kinematics import LinkKinematics, rotate_inverse
 from egoskin.sensors.geometry import ProximitySensor
 from egoskin.transform import RowTransform
 

@@ -9,9 +9,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from egoskin.runs import Run
+from egoskin.runs.run import Run
+from egoskin.runs.trainer import open_trainer
 from egoskin.study.manifest import Manifest, PlannedRun
-from egoskin.training import open_trainer
 
 # Rollouts that are measured, after one that warms up.
 _ROLLOUTS = 3

@@ -19,12 +19,12 @@ from types import FrameType
 
 from egoskin.agents.ppo import NonFiniteError
 from egoskin.interrupts import ENDING, take
+from egoskin.parallel import WorkerError
 from egoskin.progress import ProgressLine
+from egoskin.runs.trainer import open_trainer, train
 from egoskin.study.claims import claimed
 from egoskin.study.manifest import PlannedRun
 from egoskin.study.store import StudyFolder, judge_run, now
-from egoskin.training import open_trainer, train
-from egoskin.workers import WorkerError
 
 FAILED = 1
 """Exit status after an error; it has been written to stderr."""

@@ -21,20 +21,25 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from egoskin.checkpoint import write_file
 from egoskin.cli import check_counts
-from egoskin.draws import check_seed
 from egoskin.envs.standards import Standard, training_task
-from egoskin.formats import (
+from egoskin.make import EnvConfig
+from egoskin.rng import check_seed
+from egoskin.runs.run import MACHINE_FIELDS, TrainConfig
+from egoskin.sensors import Skin
+from egoskin.storage.formats import (
     content_hash,
     present_config,
     read_sealed,
     sealed_json,
 )
-from egoskin.make import EnvConfig
-from egoskin.plain import changed_fields, from_plain, read_json, to_plain
-from egoskin.runs import MACHINE_FIELDS, TrainConfig
-from egoskin.sensors import Skin
+from egoskin.storage.serialization import (
+    changed_fields,
+    from_plain,
+    read_json,
+    to_plain,
+)
+from egoskin.storage.tensor_file import write_file
 
 Overrides = Mapping[str, Any]
 """Values by the dotted names of fields, as on the command line: ``sensor.range``."""

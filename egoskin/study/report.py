@@ -14,8 +14,8 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from egoskin.checkpoint import write_file
-from egoskin.plain import read_json
+from egoskin.storage.serialization import read_json
+from egoskin.storage.tensor_file import write_file
 from egoskin.study.figures import (
     equivalence,
     forest,

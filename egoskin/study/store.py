@@ -28,14 +28,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-from egoskin.checkpoint import load_tensors, write_file
-from egoskin.evaluation import play_bank, standard_task, summarize
-from egoskin.formats import content_hash, read_sealed, sealed_json
+from egoskin.evaluation.throw_set import play_bank, standard_task, summarize
 from egoskin.make import MASK_ALL
-from egoskin.plain import read_json
-from egoskin.policies import Policy, load_policy
+from egoskin.policies.policy import Policy, load_policy
 from egoskin.results import StoredRun, load_run, record, thin, to_json
-from egoskin.runs import Run
+from egoskin.runs.run import Run
+from egoskin.storage.formats import content_hash, read_sealed, sealed_json
+from egoskin.storage.serialization import read_json
+from egoskin.storage.tensor_file import load_tensors, write_file
 from egoskin.study.claims import is_claimed, is_locked
 from egoskin.study.manifest import EvaluationPlan, Manifest, PlannedRun
 

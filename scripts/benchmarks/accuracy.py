@@ -11,10 +11,10 @@ import numpy as np
 import torch
 
 from benchmarks.report import Row, show
-from egoskin.envs.physics import PhysicsConfig, build_scene
+from egoskin.envs.physics.mujoco import PhysicsConfig, build_scene
 from egoskin.envs.throws import Release, ThrowConfig, Thrower
 from egoskin.make import EnvConfig
-from egoskin.robots import RobotConfig
+from egoskin.robots.config import RobotConfig
 
 # A zero action does not stand for ever: it is compared for as long as it does [s].
 _STAND = 0.5

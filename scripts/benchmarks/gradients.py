@@ -14,9 +14,9 @@ from torch import Tensor
 
 from benchmarks.report import Row, show
 from egoskin.agents.ppo import PPO, add_advantages
-from egoskin.collection import collect
-from egoskin.runs import Run
-from egoskin.training import open_trainer
+from egoskin.agents.rollout import collect
+from egoskin.runs.run import Run
+from egoskin.runs.trainer import open_trainer
 
 
 @dataclass(frozen=True, kw_only=True)

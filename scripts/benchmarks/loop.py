@@ -21,10 +21,9 @@ from torchrl.envs import EnvBase
 from benchmarks.report import Row, show
 from egoskin.agents.networks import RunningNorm
 from egoskin.agents.ppo import PPO, PPOConfig
-from egoskin.checkpoint import part
-from egoskin.collection import collect
+from egoskin.agents.rollout import collect
 from egoskin.envs.dodgeball import DodgeballEnv
-from egoskin.envs.physics import Physics
+from egoskin.envs.physics.mujoco import Physics
 from egoskin.make import (
     EnvConfig,
     check_num_workers,
@@ -32,8 +31,9 @@ from egoskin.make import (
     make_env,
     save_env_state,
 )
-from egoskin.policies import PolicySpec, sparse_sources
-from egoskin.workers import WorkerPool, in_halves
+from egoskin.parallel import WorkerPool, in_halves
+from egoskin.policies.policy import PolicySpec, sparse_sources
+from egoskin.storage.tensor_file import part
 
 
 @dataclass(frozen=True, kw_only=True)

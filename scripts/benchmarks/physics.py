@@ -13,7 +13,7 @@ import torch
 
 from benchmarks.report import Row, show
 from egoskin.cli import check_counts
-from egoskin.envs.physics import Physics, PhysicsConfig, build_scene
+from egoskin.envs.physics.mujoco import Physics, PhysicsConfig, build_scene
 from egoskin.envs.throws import ThrowConfig
 from egoskin.make import EnvConfig
 

@@ -15,10 +15,10 @@ from torch import Tensor
 from benchmarks.report import Row, show
 from egoskin.cli import check_counts
 from egoskin.make import EnvConfig, make_worker_env
-from egoskin.robots import H1_2
+from egoskin.parallel import keep_freed_memory
+from egoskin.robots.config import H1_2
 from egoskin.sensors import FieldSensor, Proximity, RaySensor, Skin
 from egoskin.shapes import Sphere
-from egoskin.workers import keep_freed_memory
 
 # States are taken this often along the rollout [control steps]: balls are in flight.
 _STRIDE = 8

@@ -1,0 +1,258 @@
+"""What the actor feels of its own body, what the critic or an oracle is told."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from tensordict import NestedKey
+from torch import Tensor
+from torchrl.data import Composite, TensorSpec, Unbounded
+
+from egoskin.robots.kinematics import rotate_inverse
+from egoskin.transform import RowTransform
+
+# An approach is looked ahead for this long [s], a pass is told up to this far [m], and
+# what comes within this time [s] is near.
+_LONGEST_APPROACH, _FARTHEST_PASS, _SOON = 2.0, 3.0, 0.3
+
+
+class Proprioception(RowTransform):
+    """Base angular velocity, joint positions and velocities, gravity.
+
+    Reads ``base_pose``, ``base_ang_vel_b``, ``joint_pos``, ``joint_vel`` and, if asked
+    to, ``previous_action``; writes ``observation [*B, 6 + 2 J]``: angular velocity
+    [rad/s] 3, q - q_default [rad] J, joint velocities [rad/s] J, unit gravity in the
+    base frame 3; and then the previous action J.
+
+    Args:
+        default_joint_pos: Default pose [rad], ``[J]``.
+        in_keys: Keys of the inputs, in the order above; the fifth may be left out.
+        out_keys: Key of the observation.
+    """
+
+    _default: Tensor
+    STATE_KEYS = ("base_pose", "base_ang_vel_b", "joint_pos", "joint_vel")
+    """The inputs that it always reads."""
+
+    def __init__(
+        self,
+        default_joint_pos: Tensor,
+        in_keys: Sequence[NestedKey] = STATE_KEYS,
+        out_keys: Sequence[NestedKey] = ("observation",),
+    ) -> None:
+        super().__init__(in_keys, out_keys)
+        self.register_buffer("_default", default_joint_pos)
+
+    def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """Return the observation, ``[B, 6 + 2 J]`` or ``[B, 6 + 3 J]``."""
+        base_pose, base_ang_vel_b, joint_pos, joint_vel, *action = inputs
+        down = base_pose.new_tensor([0.0, 0.0, -1.0]).expand_as(base_ang_vel_b)
+        gravity_b = rotate_inverse(base_pose[:, 3:], down)
+        deviation = joint_pos - self._default.to(joint_pos.dtype)
+        parts = (base_ang_vel_b, deviation, joint_vel, gravity_b, *action)
+        return (torch.cat(parts, -1),)
+
+    def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
+        """Return the spec of the observation."""
+        size = 6 + (len(self.in_keys) - 2) * len(self._default)
+        dtype = spec[self.in_keys[2]].dtype
+        return (Unbounded(shape=torch.Size((*spec.shape, size)), dtype=dtype),)
+
+
+def object_states_b(
+    base_pose: Tensor,
+    base_lin_vel_w: Tensor,
+    object_pose: Tensor,
+    object_lin_vel_w: Tensor,
+    object_active: Tensor,
+) -> Tensor:
+    """Return what there is to know of the objects, seen from the base.
+
+    Args:
+        base_pose: Base pose in the world, ``[B, 7]``.
+        base_lin_vel_w: Base velocity [m/s], ``[B, 3]``.
+        object_pose: Poses in the world, ``[B, O, 7]``.
+        object_lin_vel_w: Velocities [m/s], ``[B, O, 3]``.
+        object_active: Whether each is in play, ``[B, O]`` bool.
+
+    Returns:
+        ``[B, 7 O]``, for each object: position relative to the base [m] 3, velocity
+        relative to the base's origin [m/s] 3, both along the base's axes, and active
+        flag; zero where inactive.
+    """
+    flag = object_active[..., None].to(object_pose.dtype)
+    turn = base_pose[:, None, 3:].expand(-1, object_pose.shape[1], -1)
+    position = rotate_inverse(turn, object_pose[..., :3] - base_pose[:, None, :3])
+    speed = rotate_inverse(turn, object_lin_vel_w - base_lin_vel_w[:, None])
+    return torch.cat((position * flag, speed * flag, flag), -1).flatten(1)
+
+
+def approaches_b(
+    base_pose: Tensor,
+    base_lin_vel_w: Tensor,
+    object_pose: Tensor,
+    object_lin_vel_w: Tensor,
+    object_active: Tensor,
+    *,
+    gravity: float,
+) -> Tensor:
+    """Return how soon and where each object passes the base, if both fly on.
+
+    It follows from the objects' states, but a small network cannot work it out.
+
+    Args:
+        base_pose: Base pose in the world, ``[B, 7]``.
+        base_lin_vel_w: Base velocity [m/s], ``[B, 3]``; the base keeps it.
+        object_pose: Poses in the world, ``[B, O, 7]``.
+        object_lin_vel_w: Velocities [m/s], ``[B, O, 3]``.
+        object_active: Whether each is in play, ``[B, O]`` bool.
+        gravity: What pulls the objects down [m/s^2].
+
+    Returns:
+        ``[B, 4 O]``, for each object: nearness in time 0.3 s / (0.3 s + t), where t
+        is the time until its horizontal distance from the base is least (at least 0,
+        at most 2 s), and its position relative to the base at that time [m], at most
+        3 m along each of the base's axes; zero where inactive.
+    """
+    gap = object_pose[..., :3] - base_pose[:, None, :3]
+    speed = object_lin_vel_w - base_lin_vel_w[:, None]
+    (x, y, _), (u, v, _) = gap.unbind(-1), speed.unbind(-1)
+    time = -(x * u + y * v) / (u * u + v * v).clamp(min=1e-3)
+    time = time.clamp(0.0, _LONGEST_APPROACH)[..., None]
+    fall = torch.nn.functional.pad(0.5 * gravity * time * time, (2, 0))
+    turn = base_pose[:, None, 3:].expand(-1, gap.shape[1], -1)
+    passing = rotate_inverse(turn, gap + speed * time - fall)
+    passing = passing.clamp(-_FARTHEST_PASS, _FARTHEST_PASS)
+    nearness = _SOON / (_SOON + time)
+    flag = object_active[..., None].to(gap.dtype)
+    return (torch.cat((nearness, passing), -1) * flag).flatten(1)
+
+
+class HideObjects(RowTransform):
+    """Hides all objects from the transforms after it: masks every sensor.
+
+    Reads ``object_active [*B, O]`` and writes it again, false.
+
+    Args:
+        keys: Key of the flags.
+    """
+
+    def __init__(self, keys: Sequence[NestedKey] = ("object_active",)) -> None:
+        super().__init__(keys, keys)
+
+    def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """Return the flags, ``[B, O]``."""
+        return (torch.zeros_like(inputs[0]),)
+
+    def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
+        """Return the spec of the flags."""
+        return (spec[self.in_keys[0]].clone(),)
+
+
+class Oracle(RowTransform):
+    """What every ball does: a diagnostic of the task, no sensor can give it.
+
+    Reads ``base_pose``, ``base_lin_vel_w``, ``object_pose``, ``object_lin_vel_w`` and
+    ``object_active``; writes ``signal [*B, 7 O]``, see `object_states_b`.
+
+    Args:
+        in_keys: Keys of the inputs, in the order above.
+        out_keys: Key of the signal.
+    """
+
+    def __init__(
+        self,
+        in_keys: Sequence[NestedKey] = (
+            "base_pose",
+            "base_lin_vel_w",
+            "object_pose",
+            "object_lin_vel_w",
+            "object_active",
+        ),
+        out_keys: Sequence[NestedKey] = ("signal",),
+    ) -> None:
+        super().__init__(in_keys, out_keys)
+
+    def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """Return the signal, ``[B, 7 O]``."""
+        return (object_states_b(*inputs),)
+
+    def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
+        """Return the spec of the signal."""
+        objects = spec[self.in_keys[4]].shape[-1]
+        shape = torch.Size((*spec.shape, 7 * objects))
+        return (Unbounded(shape=shape, dtype=spec[self.in_keys[0]].dtype),)
+
+
+class Privileged(RowTransform):
+    """What the critic is told in training; the same for every skin.
+
+    Reads ``base_pose``, ``base_lin_vel_w`` and, unless told of the velocity alone,
+    ``displacement_w``, ``previous_action``, ``object_pose``, ``object_lin_vel_w`` and
+    ``object_active``. Writes ``privileged_observation``: base velocity [m/s] 3; then
+    displacement from the start [m] 3, previous action J, the objects' states
+    (`object_states_b`) 7 O and approaches (`approaches_b`) 4 O, and height of the base
+    above the ground [m] 1. Vectors are in the base frame.
+
+    Args:
+        content: "objects" for everything above, "velocity" for the paper's critic.
+        num_joints: ``J``.
+        num_objects: ``O``.
+        gravity: What pulls the objects down [m/s^2].
+        in_keys: Keys of the inputs, in the order above.
+        out_keys: Key of the observation.
+
+    Raises:
+        ValueError: If the number of in keys is not that of the content.
+    """
+
+    _VELOCITY_KEYS = ("base_pose", "base_lin_vel_w")
+    _OBJECT_KEYS = (
+        "displacement_w",
+        "previous_action",
+        "object_pose",
+        "object_lin_vel_w",
+        "object_active",
+    )
+
+    def __init__(
+        self,
+        content: Literal["objects", "velocity"],
+        num_joints: int,
+        num_objects: int,
+        gravity: float,
+        in_keys: Sequence[NestedKey] | None = None,
+        out_keys: Sequence[NestedKey] = ("privileged_observation",),
+    ) -> None:
+        read = self._VELOCITY_KEYS
+        self._size = 3
+        if content == "objects":
+            read = (*read, *self._OBJECT_KEYS)
+            self._size += 3 + num_joints + 11 * num_objects + 1
+        if in_keys is not None and len(in_keys) != len(read):
+            raise ValueError(f"in_keys must name {', '.join(read)}, got {in_keys}")
+        super().__init__(in_keys or read, out_keys)
+        self._gravity = gravity
+
+    def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """Return the privileged observation, ``[B, P]``."""
+        base_pose, base_lin_vel_w, *rest = inputs
+        quat = base_pose[:, 3:]
+        parts = [rotate_inverse(quat, base_lin_vel_w)]
+        if rest:
+            displacement_w, previous_action, *objects = rest
+            planar = torch.nn.functional.pad(displacement_w, (0, 1))
+            states = object_states_b(base_pose, base_lin_vel_w, *objects)
+            approaches = approaches_b(
+                base_pose, base_lin_vel_w, *objects, gravity=self._gravity
+            )
+            parts += [rotate_inverse(quat, planar), previous_action, states]
+            parts += [approaches, base_pose[:, 2:3]]
+        return (torch.cat(parts, -1),)
+
+    def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
+        """Return the spec of the observation."""
+        dtype = spec[self.in_keys[0]].dtype
+        return (Unbounded(shape=torch.Size((*spec.shape, self._size)), dtype=dtype),)

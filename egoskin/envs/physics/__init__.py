@@ -1,0 +1,1 @@
+"""Physics of a batch of simulations: the contract, and an engine in a file each."""

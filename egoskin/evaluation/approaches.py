@@ -1,0 +1,362 @@
+"""Balls that come to a standing robot, and which sensors see them.
+
+The robot stands still in its default pose and a ball comes along given paths. A path
+ends where the ball first touches the body; what is under the floor does not count. The
+ball is *seen* from the first moment at which any sensor detects it.
+
+Contract: a path is followed in steps, so times and clearances are exact to one step.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from egoskin.envs.throws import GRAVITY, ThrowConfig, Thrower
+from egoskin.robots.config import RobotConfig
+from egoskin.robots.surface import default_frames, distance_to, sample_surface
+from egoskin.sensors import FieldSensor, Ray, RaySensor, Skin
+from egoskin.sensors.skin.coverage import Coverage
+from egoskin.shapes import Sphere
+from egoskin.transform import RowTransform
+
+THROW_STEP = 0.002
+"""Time step in which throws are followed [s]."""
+_STEP = 0.01
+"""Step in which straight approaches are followed [m]."""
+_GRID_DEG = 5.0
+"""Spacing of the map's directions [deg]."""
+_NUM_SURFACE_POINTS = 1000
+# Positions worked on at a time: temporaries then stay below 100 MB.
+_CHUNK, _BODY_CHUNK = 4096, 2**17
+
+Progress = Callable[[str, float], None]
+"""Told what is in work, and the share of it that is done."""
+
+
+class StandingRobot:
+    """A robot that stands still in its default pose, facing x, at the origin.
+
+    Args:
+        robot: The robot.
+    """
+
+    def __init__(self, robot: RobotConfig) -> None:
+        self.config = robot
+        self.joint_pos = torch.from_numpy(robot.default_joint_pos).float()
+        self.origin = np.array([0.0, 0.0, robot.default_base_height])
+        self.base_pose = torch.tensor([*self.origin, 1.0, 0.0, 0.0, 0.0]).float()
+        position, self.link_rotation = default_frames(robot)
+        self.link_position = position + self.origin
+        # Their "link frame" is now the world.
+        self._shapes = []
+        for shape in robot.primitives:
+            i = robot.links.index(shape.link)
+            turn, shift = self.link_rotation[i], self.link_position[i]
+            self._shapes.append(
+                replace(
+                    shape,
+                    position=turn @ shape.position + shift,
+                    rotation=turn @ shape.rotation,
+                )
+            )
+        # A capsule's end is its radius and its half length away.
+        self.reach = max(
+            float(np.linalg.norm(s.position - self.origin) + s.size.sum())
+            for s in self._shapes
+        )
+        """No point of the body is farther from the base than this [m]."""
+
+    def distance(self, points: np.ndarray, within: float = math.inf) -> np.ndarray:
+        """Signed distance from points to the body, negative inside.
+
+        Args:
+            points: Points in the world [m], ``[n, 3]``.
+            within: Farther points may get a lower bound that is above this [m].
+
+        Returns:
+            Distance [m], ``[n]``.
+        """
+        distance = np.linalg.norm(points - self.origin, axis=-1) - self.reach
+        near = distance <= within
+        close = points[near]
+        distance[near] = np.min([distance_to(s, close) for s in self._shapes], axis=0)
+        return distance
+
+    def standoff(self, skin: Skin) -> float:
+        """Return how far off the body a skin's outermost sensor is [m], at least 0."""
+        link = [self.config.links.index(name) for name in skin.links]
+        turned = (self.link_rotation[link] @ skin.position[..., None])[..., 0]
+        return max(0.0, float(self.distance(turned + self.link_position[link]).max()))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Trace:
+    """When the ball of each of ``n`` paths of ``T`` steps is seen, in ``C`` cells."""
+
+    gap: Tensor
+    """From the ball's surface to the body [m], ``[n, T]``; far away a lower bound."""
+    contact: Tensor
+    """Step of the contact, ``[n]``; T for a path that misses or meets the floor."""
+    runway: Tensor
+    """Gap from which on the ball is above the floor [m], ``[n]``; infinite: always."""
+    num_sensors: Tensor
+    """Sensors that detect the ball at each step before, ``[C, n, T]``."""
+
+    @property
+    def touches(self) -> Tensor:
+        """Whether the path ends at the body, ``[n]``."""
+        return self.contact < self.gap.shape[1]
+
+    @cached_property
+    def first_seen(self) -> Tensor:
+        """Step of the first detection, ``[C, n]``; that of the contact if never."""
+        first = (self.num_sensors > 0).to(torch.uint8).argmax(-1)
+        return torch.where(self.seen, first, self.contact)
+
+    @cached_property
+    def seen(self) -> Tensor:
+        """Whether the ball is detected before the contact, ``[C, n]``."""
+        return (self.num_sensors > 0).any(-1)
+
+    @property
+    def clearance(self) -> Tensor:
+        """Gap at the first detection [m], ``[C, n]``; 0 if never."""
+        last = self.gap.shape[1] - 1
+        at_first = self.gap.gather(1, self.first_seen.clamp(max=last).t()).t()
+        return torch.where(self.seen, at_first, 0.0)
+
+
+def farthest(
+    skin: Skin, coverages: Mapping[str, Coverage], ranges: Sequence[float]
+) -> float:
+    """Return how far any sensor sees in any cell [m].
+
+    Args:
+        skin: The sensors.
+        coverages: Coverages by name, for sensors without one of their own.
+        ranges: Ranges, for sensors without one of their own [m].
+    """
+    return max(
+        float(skin.filled(coverage, max(ranges)).reach().max())
+        for coverage in coverages.values()
+    )
+
+
+def _sensors(
+    robot: RobotConfig,
+    skin: Skin,
+    coverage: Coverage,
+    max_range: float,
+    ball: Sphere,
+    occlusion: bool,
+) -> tuple[list[RowTransform], Tensor]:
+    """Return transforms that together are the skin, and each sensor's own range.
+
+    The range is NaN where the sensor has none.
+    """
+    full = skin.filled(coverage, max_range)
+    body = robot.primitives if occlusion else ()
+    parts: list[RowTransform] = []
+    groups = full.groups()
+    for part in map(full.select, groups):
+        args = part, robot.chain, [ball], max_range
+        parts.append(
+            RaySensor(*args, reduce="min", body=body)
+            if isinstance(part.coverage[0], Ray)
+            else FieldSensor(*args, body=body)
+        )
+    order = [index for group in groups for index in group]
+    return parts, torch.from_numpy(skin.range[order]).float()
+
+
+def _measure(
+    body: StandingRobot, sensors: Sequence[RowTransform], centre: Tensor
+) -> Tensor:
+    """Return what sensors read of a ball [m], ``[m, S]``, for centres ``[m, 3]``."""
+    m = len(centre)
+    upright = centre.new_tensor([1.0, 0.0, 0.0, 0.0]).expand(m, 4)
+    state = TensorDict(
+        base_pose=body.base_pose.expand(m, -1),
+        joint_pos=body.joint_pos.expand(m, -1),
+        object_pose=torch.cat((centre, upright), -1)[:, None],
+        object_active=torch.ones(m, 1, dtype=torch.bool),
+        batch_size=[m],
+    )
+    return torch.cat([sensor(state)["distance"] for sensor in sensors], -1)
+
+
+def trace(
+    body: StandingRobot,
+    position: Tensor,
+    skin: Skin,
+    coverages: Mapping[str, Coverage],
+    ranges: Sequence[float],
+    ball: Sphere,
+    *,
+    occlusion: bool = False,
+    progress: Progress = lambda what, share: None,
+) -> Trace:
+    """Return when balls on given paths touch the body and who detects them before.
+
+    Args:
+        body: The robot.
+        position: Centres of the balls along the paths [m], ``[n, T, 3]``.
+        skin: The sensors.
+        coverages: Coverages by name, for sensors without one of their own.
+        ranges: Ranges, for sensors without one of their own [m].
+        ball: The ball.
+        occlusion: Whether the body hides what lies behind it.
+        progress: Told the coverage in work.
+
+    Returns:
+        The traces; cells in the order of coverages and, within one, of ranges.
+    """
+    n, steps, _ = position.shape
+    longest = float(np.nanmax([*ranges, *skin.range]))
+    # A sensor that stands off the body sees as much farther than the body is near.
+    near = farthest(skin, coverages, ranges) + body.standoff(skin)
+    flat = position.reshape(-1, 3)
+    distance = [
+        body.distance(part.double().numpy(), ball.radius + near)
+        for part in flat.split(_BODY_CHUNK)
+    ]
+    gap = torch.from_numpy(np.concatenate(distance)).float() - ball.radius
+    gap = gap.reshape(n, steps)
+    hit = gap <= 0
+    first = torch.where(hit.any(1), hit.to(torch.uint8).argmax(1), steps)
+    before = torch.arange(steps) < first[:, None]
+    above = position[..., 2] >= ball.radius
+    touches = above.gather(1, first.clamp(max=steps - 1)[:, None])[:, 0]
+    under = torch.where(before & ~above, gap, torch.inf).amin(1)
+    visible = before & above & (gap <= near)
+
+    rows = visible.reshape(-1).nonzero()[:, 0]
+    num_sensors = torch.zeros(len(coverages), len(ranges), n * steps, dtype=torch.int16)
+    for c, (name, coverage) in enumerate(coverages.items()):
+        sensors, own = _sensors(body.config, skin, coverage, longest, ball, occlusion)
+        limits = [torch.where(own.isnan(), r, own) for r in ranges]
+        # One measurement at the longest range serves all ranges.
+        for k, chunk in enumerate(rows.split(_CHUNK)):
+            progress(name, k * _CHUNK / max(len(rows), 1))
+            reading = _measure(body, sensors, flat[chunk])
+            for r, limit in enumerate(limits):
+                num_sensors[c, r, chunk] = (reading <= limit).sum(-1).short()
+        progress(name, 1.0)
+    return Trace(
+        gap=gap,
+        contact=torch.where(touches, first, steps),
+        runway=torch.where(touches, under, 0.0),
+        num_sensors=num_sensors.reshape(-1, n, steps),
+    )
+
+
+# --- paths ----------------------------------------------------------------------
+
+
+def direction_grid() -> tuple[np.ndarray, np.ndarray]:
+    """Return azimuth and elevation of the map's directions [rad], ``[E, A]`` each.
+
+    Elevation grows along the rows, azimuth (counter-clockwise from above, 0 ahead)
+    along the columns from -pi to pi.
+    """
+    step = math.radians(_GRID_DEG)
+    elevation = np.arange(0.5, round(180 / _GRID_DEG)) * step - math.pi / 2
+    azimuth = np.arange(0.5, round(360 / _GRID_DEG)) * step - math.pi
+    grid = np.meshgrid(elevation, azimuth, indexing="ij")
+    return grid[1], grid[0]
+
+
+def unit_vectors(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
+    """Return directions from angles [rad], ``[n, 3]``."""
+    flat = np.cos(elevation)
+    return np.stack(
+        (flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)), -1
+    )
+
+
+def direction_paths(body: StandingRobot, ball: Sphere, distance: float) -> Tensor:
+    """Return straight paths to the base from all directions of the map.
+
+    Args:
+        body: The robot.
+        ball: The ball.
+        distance: Clearance that the paths start with, at least [m].
+
+    Returns:
+        Centres of the ball [m], ``[n, T, 3]``.
+    """
+    along = np.arange(body.reach + ball.radius + distance, 0.0, -_STEP)
+    azimuth, elevation = direction_grid()
+    outward = unit_vectors(azimuth.ravel(), elevation.ravel())
+    paths = body.origin + along[None, :, None] * outward[:, None]
+    return torch.from_numpy(paths).float()
+
+
+def surface_paths(
+    body: StandingRobot, ball: Sphere, distance: float, seed: int
+) -> tuple[Tensor, np.ndarray]:
+    """Return straight paths along the normals of points spread over the body.
+
+    Args:
+        body: The robot.
+        ball: The ball.
+        distance: Clearance that the paths start with [m].
+        seed: Seed of the points.
+
+    Returns:
+        Centres of the ball [m], ``[n, T, 3]``, the last where it touches the point;
+        and the index of each point's link, ``[n]``.
+    """
+    links = list(dict.fromkeys(s.link for s in body.config.primitives))
+    points = sample_surface(body.config, links, _NUM_SURFACE_POINTS, seed)
+    turn = body.link_rotation[points.link]
+    start = (turn @ points.position[..., None])[..., 0]
+    start = start + body.link_position[points.link]
+    outward = (turn @ points.normal[..., None])[..., 0]
+    along = ball.radius + np.arange(math.ceil(distance / _STEP), -1, -1) * _STEP
+    paths = start[:, None] + along[None, :, None] * outward[:, None]
+    return torch.from_numpy(paths).float(), points.link
+
+
+def throw_paths(
+    body: StandingRobot, config: ThrowConfig, num_throws: int, seed: int, dt: float
+) -> tuple[Tensor, Tensor]:
+    """Return the flights of the first throws of some episodes.
+
+    Args:
+        body: The robot they are aimed at.
+        config: The throws.
+        num_throws: How many, ``n``.
+        seed: Seed of the run or of the bank.
+        dt: Time step of the simulation that they are thrown in [s].
+
+    Returns:
+        Centres of the ball [m], ``[n, T, 3]``, and the azimuth that each comes from
+        [rad], ``[n]``.
+    """
+    thrower = Thrower(config, body.config, dt)
+    row, zero = torch.arange(num_throws), torch.zeros(num_throws, dtype=torch.int64)
+    draw = thrower.draw(seed, row, zero, zero)
+    release = thrower.release(
+        draw,
+        body.base_pose.expand(num_throws, -1),
+        torch.zeros(num_throws, 3),
+        body.joint_pos.expand(num_throws, -1),
+    )
+    # Until the slowest is past the body.
+    way = draw.distance + body.reach + config.radius
+    longest = (way / release.velocity[:, :2].norm(dim=-1)).max()
+    time = torch.arange(0.0, float(longest), THROW_STEP)[:, None]
+    paths = release.position[:, None] + release.velocity[:, None] * time
+    if config.flight == "ballistic":
+        # z(t) = z0 + vz t - g t (t + dt) / 2, as the integrator makes it.
+        paths[..., 2] -= (0.5 * GRAVITY * time * (time + dt))[:, 0]
+    return paths, draw.azimuth

@@ -1,0 +1,408 @@
+"""A bank of throws -> what a policy does: which it dodges, where it goes, how hard.
+
+Everything comes from the environment's state. Throws are sorted by what they are at a
+robot that stands in its default pose, so a throw is in the same group for every policy.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+
+from egoskin.envs.throws import QUARTERS, Thrower, quarter_of
+from egoskin.evaluation.throw_set import (
+    Estimate,
+    Evaluation,
+    evaluate,
+    play_bank,
+    throw_seed,
+    wilson,
+)
+from egoskin.make import EnvConfig
+from egoskin.robots.config import RobotConfig
+from egoskin.robots.kinematics import LinkKinematics, rotate
+from egoskin.sensors import Skin
+
+# Ages at which it is read where the base is [s].
+_AGES = (1.0, 2.0, 3.0, 5.0)
+_NUMBERS = ("first", "second", "third", "later")
+# Bounds of the groups by height aimed at [m], by speed at arrival [m/s] and by time
+# since the throw before [s]: about a third of the standard throws in each.
+_HEIGHTS, _SPEEDS, _GAPS = (0.9, 1.2), (5.3, 6.7), (1.33, 1.67)
+# When a robot has settled from its start [s].
+_SETTLED = 0.5
+# A point of a foot this close to the floor stands on it [m] (contacts give way a
+# little, so zero is too strict).
+_ON_FLOOR = 0.005
+
+
+@dataclass(frozen=True, kw_only=True)
+class Group:
+    """How the throws of one kind fare."""
+
+    name: str
+    """What they have in common."""
+    success: Estimate | None
+    """Share of the episodes whose first ball is one of them that succeed, as in
+    `Evaluation`; None if there are none."""
+    episodes: int
+    """Number of these episodes."""
+    first_hits: float | None
+    """Share of the first balls that hit, of those that arrived."""
+    later_hits: float | None
+    """Share of the later balls that hit, of those that arrived."""
+    later_balls: int
+    """Number of later balls that arrived."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Displacement:
+    """Where the base is in the episodes that last to an age."""
+
+    age: float
+    """Age [s]."""
+    episodes: int
+    """Number of these episodes."""
+    mean: float | None
+    """Mean planar way from the start [m]."""
+    largest_tenth: float | None
+    """The way that a tenth of them exceeds [m]."""
+    height: float | None
+    """Mean height of the base above ground [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Motion:
+    """How a robot moves: means over all steps but those that end an episode."""
+
+    power: float
+    """Mechanical power of the joints, sum |torque x velocity| [W]."""
+    joint_acceleration: float
+    """Root mean square of the joints' accelerations, from step to step [rad/s^2]."""
+    torque_saturation: float
+    """Share of the joints' torques that are at their limit."""
+    foot_slip: float
+    """Speed at which the lowest corner of a foot slides while on the floor [m/s]."""
+    airborne: float
+    """Share of the steps in which no link touches the floor."""
+    self_contact: float
+    """Share of the steps in which the robot touches itself."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Waiting:
+    """How a robot waits for the first throw: means over all steps from 0.5 s on."""
+
+    base_speed: float
+    """Planar speed of the base [m/s]."""
+    power: float
+    """Mechanical power of the joints [W]."""
+    fallen: float
+    """Share of the episodes that end before the first throw."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Behaviour:
+    """What a policy does with a bank of throws, within 10 s."""
+
+    throws: dict[str, list[Group]]
+    """Groups by number of the ball, direction, height aimed at, speed at arrival, time
+    since the throw before, link aimed at."""
+    waiting: Waiting | None
+    """Before the first throw; None where that is at the start."""
+    displacement: list[Displacement]
+    """Way from the start."""
+    motion: Motion
+    """How it moves."""
+    motion_zero_action: Motion
+    """The same of the zero action, which asks for the default pose, on the bank."""
+
+
+def behave(
+    policy: nn.Module | TensorDictModuleBase | None,
+    config: EnvConfig,
+    skin: Skin,
+    *,
+    bank_seed: int,
+    episodes: int,
+    num_workers: int | None = None,
+    mask: Sequence[str] = (),
+    on_step: Callable[[int, int], None] | None = None,
+) -> tuple[Evaluation, Behaviour]:
+    """Return how a policy fares on a bank of throws, and what it does there.
+
+    Args:
+        policy: Writes ``action`` into a TensorDict; None is the zero action.
+        config: Robot, task (its throws are those of the bank), sensors.
+        skin: The skin.
+        bank_seed: Seed of the bank.
+        episodes: Size of the bank.
+        num_workers: Physics threads; the result does not depend on it.
+        mask: Links whose sensors detect nothing, or `egoskin.make.MASK_ALL`.
+        on_step: Called with (steps done, episodes still running).
+    """
+    bank: dict[str, Any] = {
+        "bank_seed": bank_seed,
+        "episodes": episodes,
+        "num_workers": num_workers,
+    }
+    seen, still = (Watcher(config, bank_seed, episodes) for _ in range(2))
+    watching: dict[str, Any] = {"mask": mask, "on_step": on_step, "watch": seen}
+    result = evaluate(policy, config, skin, **bank, **watching)
+    play_bank(None, config, skin, **bank, watch=still)
+    behaviour = Behaviour(
+        throws=seen.groups(),
+        waiting=seen.waiting(),
+        displacement=seen.displacement(),
+        motion=seen.motion(),
+        motion_zero_action=still.motion(),
+    )
+    return result, behaviour
+
+
+class Watcher:
+    """Sees every step of a bank (`egoskin.evaluation.throw_set.Watch`) and sums up.
+
+    Args:
+        config: What the environment is made of.
+        bank_seed: Seed of the bank.
+        episodes: Size of the bank, ``N``.
+    """
+
+    def __init__(self, config: EnvConfig, bank_seed: int, episodes: int) -> None:
+        task, robot = config.task, config.robot_config
+        self._hz, self._balls = task.physics.control_hz, task.throws.num_balls
+        self._limit = round(task.success_s * self._hz)
+        self._by_link = task.throws.aim != "box"
+        self._thrower = Thrower(task.throws, robot, task.physics.timestep)
+        shortest = max(1, round(task.throws.interval[0] * self._hz))
+        count = 1 + task.episode_steps // shortest
+        row = torch.arange(episodes).repeat_interleave(count)
+        index = torch.arange(count).repeat(episodes)
+        # The throws of each episode in turn, [N * K].
+        seed = throw_seed(config, bank_seed)
+        self._draw = self._thrower.draw(seed, row, row * 0, index)
+        gap = (self._draw.interval * self._hz).round().long().clamp(min=1)
+        gap = gap.reshape(episodes, count)
+        delay = self._thrower.first_delay(seed, row, row * 0).reshape(episodes, count)
+        # Step at the end of which each ball is thrown, [N, K]: the draws' alone.
+        self._thrown = gap.cumsum(1) - gap + (delay * self._hz).round().long()
+        self._arrived = torch.zeros(episodes, count, dtype=torch.bool)
+        self._hit = self._arrived.clone()
+        self._failed = torch.zeros(episodes, dtype=torch.bool)
+        # Way and height at each age, of the episodes that last, [2, n].
+        self._base: dict[float, Tensor] = {}
+        self._waited = self._fallen_waiting = 0
+        self._waiting_speed = self._waiting_power = 0.0
+        self._feet = _Feet(robot)
+        self._step = 0
+        self._sums: dict[str, float] = {}
+        self._counts: dict[str, int] = {}
+
+    def __call__(
+        self, before: TensorDictBase, after: TensorDictBase, running: Tensor
+    ) -> None:
+        """See one step; the arguments are those of `throw_set.Watch`."""
+        self._step += 1
+        ended = running & after["terminated"][:, 0]
+        age = self._step - after["first_throw_step"][:, 0]
+        self._failed |= ended & (age <= self._limit)
+        going = running & ~ended
+        self._fallen_waiting += int((ended & (age <= 0)).sum())
+        if self._step >= round(_SETTLED * self._hz):
+            self._see_waiting(after[going & (age <= 0)])
+        for moment in _AGES:
+            if self._step == round(moment * self._hz):
+                way = after["displacement_w"][going].square().sum(-1).sqrt()
+                self._base[moment] = torch.stack((way, after["base_pose"][going, 2]))
+        self._see_balls(after, running)
+        # A blow, a fall or a failed simulation is not how the policy moves.
+        self._see_motion(before[going], after[going])
+
+    def _see_balls(self, after: TensorDictBase, running: Tensor) -> None:
+        newest = (self._thrown < self._step).sum(1) - 1
+        rows = running.nonzero()[:, 0]
+        for ball in range(self._balls):
+            # The last throw so far of this ball: they are thrown in turn.
+            throw = (newest - (newest - ball) % self._balls)[rows]
+            flown, throw = rows[throw >= 0], throw[throw >= 0]
+            self._arrived[flown, throw] |= after["object_arrived"][flown, ball]
+            self._hit[flown, throw] |= after["object_hit"][flown, ball]
+
+    def _see_waiting(self, after: TensorDictBase) -> None:
+        speed = after["base_lin_vel_w"][:, :2].square().sum(-1).sqrt()
+        self._waited += len(after)
+        self._waiting_speed += float(speed.double().sum())
+        self._waiting_power += float(after["power"].double().sum())
+
+    def waiting(self) -> Waiting | None:
+        """Return how the robot waited for the first throw."""
+        if not self._waited:
+            return None
+        return Waiting(
+            base_speed=self._waiting_speed / self._waited,
+            power=self._waiting_power / self._waited,
+            fallen=self._fallen_waiting / len(self._failed),
+        )
+
+    def _see_motion(self, before: TensorDictBase, after: TensorDictBase) -> None:
+        acceleration = (after["joint_vel"] - before["joint_vel"]) * self._hz
+        slip = self._feet.slip(before, after) * self._hz
+        values = {
+            "power": after["power"],
+            "joint_acceleration": acceleration.square(),
+            "torque_saturation": after["torque_saturation"],
+            "foot_slip": slip[slip.isfinite()],
+            "airborne": ~after["tactile"].any(-1),
+            "self_contact": after["self_contact"],
+        }
+        for name, value in values.items():
+            total = float(value.double().sum())
+            self._sums[name] = self._sums.get(name, 0.0) + total
+            self._counts[name] = self._counts.get(name, 0) + value.numel()
+
+    def motion(self) -> Motion:
+        """Return how the robot moved."""
+        mean = {
+            name: total / max(self._counts[name], 1)
+            for name, total in self._sums.items()
+        }
+        mean["joint_acceleration"] = math.sqrt(mean["joint_acceleration"])
+        return Motion(**mean)
+
+    def displacement(self) -> list[Displacement]:
+        """Return where the base was at each age."""
+        result = []
+        for age in _AGES:
+            way, height = self._base.get(age, torch.zeros(2, 0))
+            some = len(way) > 0
+            result.append(
+                Displacement(
+                    age=age,
+                    episodes=len(way),
+                    mean=float(way.mean()) if some else None,
+                    largest_tenth=float(way.quantile(0.9)) if some else None,
+                    height=float(height.mean()) if some else None,
+                )
+            )
+        return result
+
+    def groups(self) -> dict[str, list[Group]]:
+        """Return how the throws of each kind fared."""
+        height, speed = self._thrower.at_standing_robot(self._draw)
+        number = torch.arange(self._arrived.shape[1]).clamp(max=len(_NUMBERS) - 1)
+        result = {
+            "number of the ball": self._split(
+                number.expand(self._arrived.shape), _NUMBERS
+            ),
+            "direction": self._split(quarter_of(self._draw.azimuth), QUARTERS),
+            "height aimed at": self._split(*_bands(height, _HEIGHTS, "m")),
+            "speed at arrival": self._split(*_bands(speed, _SPEEDS, "m/s")),
+            "since last throw": self._split(*self._gaps()),
+        }
+        if self._by_link:
+            links = [
+                name.removeprefix("left_").removeprefix("right_").removesuffix("_link")
+                for name in self._thrower.aim_link(self._draw)
+            ]
+            names = sorted(set(links))
+            index = torch.tensor([names.index(link) for link in links])
+            result["link aimed at"] = self._split(index, names)
+        return result
+
+    def _gaps(self) -> tuple[Tensor, list[str]]:
+        """Return the band of the time since the throw before; first balls are one."""
+        gap = (self._thrown[:, 1:] - self._thrown[:, :-1]) / self._hz
+        band, names = _bands(gap, _GAPS, "s")
+        first = torch.zeros_like(band[:, :1])
+        return torch.cat((first, band + 1), 1), ["first ball", *names]
+
+    def _split(self, kind: Tensor, names: Sequence[str]) -> list[Group]:
+        """Return the groups of throws of the same kind, ``[N * K]`` int64."""
+        kind = kind.reshape(self._arrived.shape)
+        return [self._group(kind == i, name) for i, name in enumerate(names)]
+
+    def _group(self, member: Tensor, name: str) -> Group:
+        """Return how some of the throws, ``[N, K]`` bool, fared."""
+        first = member[:, 0]
+        episodes = int(first.sum())
+        failed = int((self._failed & first).sum())
+
+        def hits(part: slice) -> tuple[float | None, int]:
+            arrived = self._arrived[:, part] & member[:, part]
+            number, hit = int(arrived.sum()), int((arrived & self._hit[:, part]).sum())
+            return hit / number if number else None, number
+
+        first_hits, _ = hits(slice(0, 1))
+        later_hits, later_balls = hits(slice(1, None))
+        return Group(
+            name=name,
+            success=wilson(episodes - failed, episodes) if episodes else None,
+            episodes=episodes,
+            first_hits=first_hits,
+            later_hits=later_hits,
+            later_balls=later_balls,
+        )
+
+
+class _Feet:
+    """The corners of the feet's boxes."""
+
+    def __init__(self, robot: RobotConfig) -> None:
+        boxes = [
+            p for p in robot.primitives if p.link in robot.feet and p.kind == "box"
+        ]
+        signs = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3)
+        corners = [
+            (signs.double().numpy() * box.size) @ box.rotation.T + box.position
+            for box in boxes
+        ]
+        # In the frames of the feet [m], [F, 8, 3].
+        self._corners = torch.from_numpy(np.stack(corners)).float()
+        self._kinematics = LinkKinematics(robot.chain, [box.link for box in boxes])
+
+    def corners_w(self, state: TensorDictBase) -> Tensor:
+        """Return the corners of each foot in the world [m], ``[B, F, 8, 3]``."""
+        position, rotation = self._kinematics.poses_b(state["joint_pos"])
+        # p + R x
+        turned = (rotation[:, :, None] * self._corners[..., None, :]).sum(-1)
+        points_b = position[:, :, None] + turned
+        pose = state["base_pose"][:, None, None].expand(*points_b.shape[:-1], 7)
+        return pose[..., :3] + rotate(pose[..., 3:], points_b)
+
+    def slip(self, before: TensorDictBase, after: TensorDictBase) -> Tensor:
+        """Return how far the lowest corner of each foot slides in a step [m].
+
+        Args:
+            before: State of ``B`` rows at the start of the step.
+            after: State at its end.
+
+        Returns:
+            Planar distance, ``[B, F]``; NaN where that corner does not stay on the
+            floor. A foot that rolls over an edge does not slide.
+        """
+        start, end = self.corners_w(before), self.corners_w(after)
+        lowest = start[..., 2:].argmin(2, keepdim=True).expand(-1, -1, 1, 3)
+        start, end = (x.gather(2, lowest)[:, :, 0] for x in (start, end))
+        stays = (start[..., 2] < _ON_FLOOR) & (end[..., 2] < _ON_FLOOR)
+        way = (end - start)[..., :2].norm(dim=-1)
+        return way.where(stays, math.nan)
+
+
+def _bands(
+    values: Tensor, bounds: Sequence[float], unit: str
+) -> tuple[Tensor, list[str]]:
+    """Return which band each value is in, ``[n]`` int64, and the bands' names."""
+    between = [
+        f"{a:g} to {b:g} {unit}" for a, b in zip(bounds, bounds[1:], strict=False)
+    ]
+    names = [f"below {bounds[0]:g} {unit}", *between, f"above {bounds[-1]:g} {unit}"]
+    return torch.bucketize(values.contiguous(), torch.tensor(bounds)), names

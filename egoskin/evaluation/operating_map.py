@@ -1,0 +1,295 @@
+"""What a skin is good for: success against speed, tempo, height and direction.
+
+Each is varied alone, beyond what is trained on, and speed with tempo. All else is the
+task's.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tensordict.nn import TensorDictModuleBase
+from torch import nn
+
+from egoskin.envs.dodgeball import PASSED_DISTANCE
+from egoskin.envs.throws import ThrowConfig
+from egoskin.evaluation.throw_set import Estimate, play_bank, summarize
+from egoskin.make import EnvConfig
+from egoskin.sensors import Skin
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+# Speed [m/s], time between throws [s], height aimed at [m] and direction [deg].
+_SPEEDS = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 10.0, 12.0)
+_INTERVALS = (0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 3.0)
+_HEIGHTS = (0.3, 0.5, 0.7, 0.9, 1.1, 1.3, 1.5)
+_DIRECTIONS = (-180.0, -135.0, -90.0, -45.0, 0.0, 45.0, 90.0, 135.0)
+_GRID_SPEEDS = (3.0, 4.0, 6.0, 8.0, 10.0)
+_GRID_INTERVALS = (0.5, 1.0, 1.5, 2.0, 3.0)
+# Balls aimed at one height come within this of the middle of the body [m].
+_HALF_WIDTH = 0.15
+# Half the width of a direction [deg].
+_SECTOR = 22.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Point:
+    """How a policy fares on throws that differ from the task's in one or two values."""
+
+    values: tuple[float, ...]
+    """The values."""
+    success: Estimate
+    """Share of episodes without contact, see `throw_set.Evaluation`."""
+    avoided: float | None
+    """Balls avoided per ball that arrived, first and later ones; None if none did."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Line:
+    """Success against one property of the throws, or two."""
+
+    names: tuple[str, ...]
+    """What is varied, with its unit."""
+    trained: tuple[tuple[float, float] | None, ...]
+    """The range that is trained on, of each; None if it says nothing."""
+    points: list[Point]
+    """Points, those of the second property fastest."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Property:
+    """A property of the throws."""
+
+    name: str
+    values: Sequence[float]
+    vary: Callable[[ThrowConfig, float], ThrowConfig]
+    trained: Callable[[ThrowConfig], tuple[float, float] | None]
+
+
+def _speed(values: Sequence[float]) -> _Property:
+    return _Property(
+        name="speed of the ball [m/s]",
+        values=values,
+        vary=lambda throws, x: dataclasses.replace(throws, speed=(x, x)),
+        trained=lambda throws: throws.speed,
+    )
+
+
+def _interval(values: Sequence[float]) -> _Property:
+    return _Property(
+        name="time between throws [s]",
+        values=values,
+        vary=lambda throws, x: dataclasses.replace(throws, interval=(x, x)),
+        trained=lambda throws: throws.interval,
+    )
+
+
+def _at_height(throws: ThrowConfig, height: float) -> ThrowConfig:
+    box = {"box_half_width": _HALF_WIDTH, "box_height": (height, height)}
+    return dataclasses.replace(throws, aim="box", **box)
+
+
+def _from_direction(throws: ThrowConfig, azimuth: float) -> ThrowConfig:
+    sector = (azimuth - _SECTOR, azimuth + _SECTOR)
+    return dataclasses.replace(throws, azimuth_deg=sector)
+
+
+_HEIGHT = _Property(
+    name="height aimed at [m]",
+    values=_HEIGHTS,
+    vary=_at_height,
+    trained=lambda throws: None,
+)
+_DIRECTION = _Property(
+    name="direction it comes from, left positive [deg]",
+    values=_DIRECTIONS,
+    vary=_from_direction,
+    trained=lambda throws: None,
+)
+_MAPS = (
+    (_speed(_SPEEDS),),
+    (_interval(_INTERVALS),),
+    (_HEIGHT,),
+    (_DIRECTION,),
+    (_speed(_GRID_SPEEDS), _interval(_GRID_INTERVALS)),
+)
+
+
+def check_map(config: EnvConfig) -> None:
+    """Raise ValueError if the actor tells balls apart: a map takes more of them."""
+    sensor = config.sensor
+    if sensor.coverage == "oracle" or sensor.per_object:
+        what = "an oracle" if sensor.coverage == "oracle" else "per_object"
+        raise ValueError(
+            f"a map takes more balls than the {config.task.throws.num_balls} that the "
+            f"policy's observation tells apart ({what}): no map can be made of it"
+        )
+
+
+def _with_enough_balls(throws: ThrowConfig) -> ThrowConfig:
+    """Return throws none of whose balls is thrown again before it has passed."""
+    # To the base, and on until the environment says that it has passed.
+    way = math.hypot(throws.distance[1], throws.height[1]) + PASSED_DISTANCE
+    number = math.ceil(way / throws.speed[0] / throws.interval[0])
+    return dataclasses.replace(throws, num_balls=max(throws.num_balls, number))
+
+
+def operating_map(
+    policy: nn.Module | TensorDictModuleBase | None,
+    config: EnvConfig,
+    skin: Skin,
+    *,
+    bank_seed: int,
+    episodes: int,
+    num_workers: int | None = None,
+    mask: Sequence[str] = (),
+    on_point: Callable[[int, int], None] | None = None,
+) -> list[Line]:
+    """Return how a policy fares on throws within and beyond what it was trained on.
+
+    Args:
+        policy: Writes ``action`` into a TensorDict; None is the zero action.
+        config: Robot, task, sensors.
+        skin: The skin.
+        bank_seed: Seed of the throws.
+        episodes: Episodes of each point.
+        num_workers: Processes; the result does not depend on it.
+        mask: Links whose sensors detect nothing, or `egoskin.make.MASK_ALL`.
+        on_point: Called with (points done, points in all).
+
+    Returns:
+        Success against speed, tempo, height and direction, and against speed and tempo.
+
+    Raises:
+        ValueError: If the policy's observation depends on the number of balls.
+    """
+    check_map(config)
+    grids = [_grid(properties) for properties in _MAPS]
+    total, done = sum(map(len, grids)), 0
+    lines = []
+    for properties, grid in zip(_MAPS, grids, strict=True):
+        points = []
+        for values in grid:
+            throws = config.task.throws
+            for what, value in zip(properties, values, strict=True):
+                throws = what.vary(throws, value)
+            throws = _with_enough_balls(throws)
+            task = dataclasses.replace(config.task, throws=throws)
+            played = play_bank(
+                policy,
+                dataclasses.replace(config, task=task),
+                skin,
+                bank_seed=bank_seed,
+                episodes=episodes,
+                num_workers=num_workers,
+                mask=mask,
+            )
+            arrived = float(played.arrived.sum())
+            points.append(
+                Point(
+                    values=values,
+                    success=summarize(played, played, task).success,
+                    avoided=float(played.avoided.sum()) / arrived if arrived else None,
+                )
+            )
+            done += 1
+            if on_point is not None:
+                on_point(done, total)
+        lines.append(
+            Line(
+                names=tuple(what.name for what in properties),
+                trained=tuple(what.trained(config.task.throws) for what in properties),
+                points=points,
+            )
+        )
+    return lines
+
+
+def _grid(properties: Sequence[_Property]) -> list[tuple[float, ...]]:
+    """Return all combinations of the values, those of the last property fastest."""
+    grid: list[tuple[float, ...]] = [()]
+    for what in properties:
+        grid = [(*values, value) for values in grid for value in what.values]
+    return grid
+
+
+def draw_map(path: Path, lines: Sequence[Line], title: str) -> None:
+    """Draw an operating map; needs matplotlib.
+
+    Args:
+        path: Picture to write.
+        lines: What `operating_map` returned.
+        title: Whose it is.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(13, 7.5), layout="constrained")
+    figure.suptitle(title)
+    axes = figure.subplots(2, 3).flatten()
+    for axis, line in zip(axes, lines, strict=False):
+        if len(line.names) == 1:
+            _draw_line(axis, line)
+        else:
+            _draw_grid(axis, line)
+    for axis in axes[len(lines) :]:
+        axis.axis("off")
+    handles, labels = axes[0].get_legend_handles_labels()
+    axes[-1].legend(handles, labels, loc="center", frameon=False)
+    figure.savefig(path, dpi=110)
+
+
+def _draw_line(axis: Axes, line: Line) -> None:
+    x = [point.values[0] for point in line.points]
+    success = [point.success for point in line.points]
+    if line.trained[0] is not None:
+        axis.axvspan(*line.trained[0], color="0.92", label="trained on")
+    axis.fill_between(
+        x,
+        [100 * s.low for s in success],
+        [100 * s.high for s in success],
+        color="#0072b2",
+        alpha=0.2,
+        lw=0,
+        label="its 95 % interval",
+    )
+    axis.plot(
+        x,
+        [100 * s.mean for s in success],
+        "o-",
+        color="#0072b2",
+        label="success (untouched for 3 s)",
+    )
+    axis.plot(
+        x,
+        [
+            100 * p.avoided if p.avoided is not None else float("nan")
+            for p in line.points
+        ],
+        "s--",
+        color="#d55e00",
+        label="balls avoided",
+    )
+    axis.set(xlabel=line.names[0], ylabel="[%]", ylim=(0, 100))
+    axis.grid(alpha=0.3)
+
+
+def _draw_grid(axis: Axes, line: Line) -> None:
+    first, second = (sorted({p.values[i] for p in line.points}) for i in range(2))
+    share: dict[Any, float] = {p.values: 100 * p.success.mean for p in line.points}
+    values = [[share[a, b] for a in first] for b in second]
+    axis.imshow(values, origin="lower", aspect="auto", cmap="viridis", vmin=0, vmax=100)
+    for row, y in enumerate(values):
+        for column, value in enumerate(y):
+            colour = "white" if value < 60 else "black"
+            axis.text(
+                column, row, f"{value:.0f}", ha="center", va="center", color=colour
+            )
+    axis.set_xticks(range(len(first)), [f"{v:g}" for v in first])
+    axis.set_yticks(range(len(second)), [f"{v:g}" for v in second])
+    axis.set(xlabel=line.names[0], ylabel=line.names[1], title="success [%]")

@@ -1,0 +1,329 @@
+"""A fixed bank of throws -> how well a policy dodges, with intervals.
+
+The bank of seed ``s`` is the draws of episode 0 of rows 0 to ``episodes - 1``: azimuth,
+distance, height, speed, interval, link and point aimed at. Draws are counter-based, so
+nothing is stored, and every policy, skin and number of workers meets the same throws.
+No training meets them (`throw_seed`). All times count from the first throw.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+
+from egoskin.envs.dodgeball import DodgeballConfig
+from egoskin.envs.standards import Standard, evaluation_task
+from egoskin.make import (
+    EnvConfig,
+    check_mask,
+    check_num_workers,
+    make_env,
+    make_worker_env,
+)
+from egoskin.rng import held_out
+from egoskin.sensors import Skin
+
+Watch = Callable[[TensorDictBase, TensorDictBase, Tensor], None]
+"""Called after each step with the state before it and the action, the state after it
+(``[N]`` rows, raw keys kept) and the rows whose episode it belongs to, ``[N]`` bool."""
+
+# Success is read once more at this age [s].
+_LATER = 5.0
+# Two-sided 95 % quantile of the normal distribution.
+_Z = 1.959964
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """A mean with its 95 % interval."""
+
+    mean: float
+    """Mean."""
+    low: float
+    """Lower end of the interval."""
+    high: float
+    """Upper end of the interval."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Avoided:
+    """Balls avoided per ball that arrived; None if none arrived."""
+
+    first_ball: float | None
+    """The first, thrown while the robot still stands."""
+    later_balls: float | None
+    """All others, as long as the episode lasts."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluation:
+    """How a policy fares on a bank of throws.
+
+    Success is read at the task's ``success_s``, 3 s of the standard task; success and
+    the shares of the ends up to then add up to 1. Times count from the first throw.
+    """
+
+    success: Estimate
+    """Share of episodes without contact, fall or divergence up to then (Wilson)."""
+    success_5s: Estimate
+    """The same up to 5 s, where what is learnt from a skin tells cells apart better."""
+    survival_time: Estimate
+    """Mean survival time [s], restricted to 10 s."""
+    ended_by_ball: float
+    """Share of episodes ended by a ball."""
+    ended_by_fall: float
+    """Share ended by a fall."""
+    ended_by_self_contact: float
+    """Share ended because the robot touched itself, where that ends it."""
+    diverged: float
+    """Share whose simulation failed."""
+    rigid_success: float
+    """Success on the same bank of the robot held rigid in its default pose."""
+    avoided: Avoided
+    """Balls avoided per ball that arrived, within 10 s."""
+    episodes: int
+    """Size of the bank."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Episodes:
+    """How each episode of a bank ended, ``[N]`` each."""
+
+    steps: Tensor
+    """Length from the first throw on [control steps]; not positive if it was not thrown
+    before the end."""
+    hit: Tensor
+    """Ended by a ball, bool."""
+    fallen: Tensor
+    """Ended by a fall (and no ball), bool."""
+    diverged: Tensor
+    """Ended by a failed simulation (and neither), bool."""
+    self_contact: Tensor
+    """Ended by self-contact alone, bool."""
+    arrived: Tensor
+    """Balls that arrived: the first, later ones, ``[N, 2]``."""
+    avoided: Tensor
+    """Of these without a touch, ``[N, 2]``."""
+
+
+def wilson(successes: int, n: int) -> Estimate:
+    """Return a share with its 95 % Wilson interval."""
+    p, z2 = successes / n, _Z**2
+    centre = (p + z2 / (2 * n)) / (1 + z2 / n)
+    half = _Z / (1 + z2 / n) * math.sqrt(p * (1 - p) / n + z2 / (4 * n**2))
+    low, high = max(centre - half, 0.0), min(centre + half, 1.0)
+    return Estimate(mean=p, low=min(low, p), high=max(high, p))
+
+
+def mean_estimate(values: Tensor) -> Estimate:
+    """Return the mean of samples ``[N]`` with its 95 % normal interval."""
+    values = values.double()
+    mean = float(values.mean())
+    half = _Z * float(values.std()) / math.sqrt(len(values)) if len(values) > 1 else 0.0
+    return Estimate(mean=mean, low=mean - half, high=mean + half)
+
+
+@torch.no_grad()
+def play_bank(
+    policy: nn.Module | TensorDictModuleBase | None,
+    config: EnvConfig,
+    skin: Skin,
+    *,
+    bank_seed: int,
+    episodes: int,
+    first: int = 0,
+    num_workers: int | None = None,
+    hold: bool = False,
+    mask: Sequence[str] = (),
+    on_step: Callable[[int, int], None] | None = None,
+    watch: Watch | None = None,
+) -> Episodes:
+    """Return how the episodes of a bank end.
+
+    Args:
+        policy: Writes ``action`` into a TensorDict; None is the zero action.
+        config: Robot, task, sensors.
+        skin: The skin.
+        bank_seed: Seed of the bank.
+        episodes: Number of episodes, all played side by side.
+        first: Row of the first of them; with ``watch`` alone.
+        num_workers: Processes; the result does not depend on it.
+        hold: Whether the robot is held rigid in its default pose.
+        mask: Links whose sensors detect nothing, or `egoskin.make.MASK_ALL`.
+        on_step: Called with (steps done, episodes still running).
+        watch: Sees every step; the bank is then played in this process, with threads
+            instead of workers, and comes to the same.
+    """
+    assert first == 0 or watch is not None
+    seed = throw_seed(config, bank_seed)
+    check_mask(config, skin, mask)
+    shared: dict[str, Any] = {
+        "num_envs": episodes,
+        "seed": seed,
+        "hold": hold,
+        "mask": mask,
+    }
+    if watch is None:
+        env = make_env(config, skin, num_workers=num_workers, **shared)
+    else:
+        threads = check_num_workers(episodes, num_workers)
+        env = make_worker_env(
+            config,
+            skin,
+            num_threads=threads,
+            row_offset=first,
+            keep_raw=True,
+            **shared,
+        )
+    steps = torch.zeros(episodes, dtype=torch.int64)
+    running = torch.ones(episodes, dtype=torch.bool)
+    causes = ("hit", "fallen", "diverged", "terminated")
+    ends = {k: torch.zeros(episodes, dtype=torch.bool) for k in causes}
+    balls = {k: torch.zeros(episodes, 2) for k in ("balls_arrived", "balls_avoided")}
+    try:
+        root: TensorDictBase = env.reset()
+        first_throw = root["first_throw_step"].reshape(-1).clone()
+        last = config.task.delay_steps + config.task.episode_steps
+        for step in range(1, last + 1):
+            flat = root.reshape(-1)
+            if policy is None:
+                action = torch.zeros(episodes, env.action_spec.shape[-1])
+            else:
+                action = policy(flat)["action"]
+                # MuJoCo would take NaN for zero, and the figures would look ordinary.
+                if not action.isfinite().all():
+                    raise ValueError(
+                        f"the policy's action is not finite at step {step}: its "
+                        "weights, or what it was given, are not those of training"
+                    )
+            root["action"] = action.reshape(*root.batch_size, -1)
+            data, root = env.step_and_maybe_reset(root)
+            following = data["next"]
+            assert isinstance(following, TensorDictBase)
+            after = following.reshape(-1)
+            if watch is not None:
+                watch(data.exclude("next").reshape(-1), after, running)
+            steps[running] = step - first_throw[running]
+            for key, value in balls.items():
+                value[running] = after[key][running]
+            ended = running & after["done"][:, 0]
+            for key, value in ends.items():
+                value[ended] = after[key][ended, 0]
+            running &= ~ended
+            if on_step is not None:
+                on_step(step, int(running.sum()))
+            if not running.any():
+                break
+    finally:
+        env.close()
+    hit, fallen, diverged, terminated = ends.values()
+    return Episodes(
+        steps=steps,
+        hit=hit,
+        fallen=fallen & ~hit,
+        diverged=diverged & ~fallen & ~hit,
+        # Nothing else terminates an episode.
+        self_contact=terminated & ~diverged & ~fallen & ~hit,
+        arrived=balls["balls_arrived"],
+        avoided=balls["balls_avoided"],
+    )
+
+
+def standard_task(config: EnvConfig, version: Standard = "2") -> EnvConfig:
+    """Return the configuration with the throws and ends a standard judges by."""
+    return dataclasses.replace(config, task=evaluation_task(version, config.task))
+
+
+def throw_seed(config: EnvConfig, bank_seed: int) -> int:
+    """Return the seed of a bank's draws.
+
+    It is one that no training uses. Version 1 of the standard throw alone keeps the
+    draws it had, which are those of the first episodes of a training with that seed.
+    """
+    return bank_seed if config.standard == "1" else held_out(bank_seed)
+
+
+def summarize(played: Episodes, rigid: Episodes, task: DodgeballConfig) -> Evaluation:
+    """Return the figures of a bank from how its episodes ended.
+
+    Args:
+        played: Episodes of the policy.
+        rigid: Episodes of the rigid robot on the same bank.
+        task: The task, for its control rate and the age of success.
+    """
+    control_hz = task.physics.control_hz
+    n, limit = len(played.steps), round(task.success_s * control_hz)
+    early = played.steps <= limit
+
+    def success(episodes: Episodes, limit: int) -> Estimate:
+        ended = episodes.hit | episodes.fallen | episodes.diverged
+        failed = (ended | episodes.self_contact) & (episodes.steps <= limit)
+        return wilson(n - int(failed.sum()), n)
+
+    def avoided(which: int) -> float | None:
+        arrived = float(played.arrived[:, which].sum())
+        return float(played.avoided[:, which].sum()) / arrived if arrived else None
+
+    return Evaluation(
+        success=success(played, limit),
+        success_5s=success(played, round(_LATER * control_hz)),
+        survival_time=mean_estimate(played.steps.clamp(min=0) / control_hz),
+        ended_by_ball=float((played.hit & early).double().mean()),
+        ended_by_fall=float((played.fallen & early).double().mean()),
+        ended_by_self_contact=float((played.self_contact & early).double().mean()),
+        diverged=float((played.diverged & early).double().mean()),
+        rigid_success=success(rigid, limit).mean,
+        avoided=Avoided(first_ball=avoided(0), later_balls=avoided(1)),
+        episodes=n,
+    )
+
+
+def evaluate(
+    policy: nn.Module | TensorDictModuleBase | None,
+    config: EnvConfig,
+    skin: Skin,
+    *,
+    bank_seed: int,
+    episodes: int,
+    num_workers: int | None = None,
+    mask: Sequence[str] = (),
+    on_step: Callable[[int, int], None] | None = None,
+    watch: Watch | None = None,
+) -> Evaluation:
+    """Return how a policy fares on a bank of throws, beside the rigid robot.
+
+    Args:
+        policy: Writes ``action`` into a TensorDict; None is the zero action.
+        config: Robot, task (its throws are those of the bank), sensors.
+        skin: The skin.
+        bank_seed: Seed of the bank.
+        episodes: Size of the bank.
+        num_workers: Processes; the result does not depend on it.
+        mask: Links whose sensors detect nothing, or `egoskin.make.MASK_ALL`.
+        on_step: Called with (steps done, episodes still running).
+        watch: Sees every step of the policy's episodes, see `play_bank`.
+    """
+
+    def play(who: Any, hold: bool) -> Episodes:
+        return play_bank(
+            who,
+            config,
+            skin,
+            bank_seed=bank_seed,
+            episodes=episodes,
+            num_workers=num_workers,
+            hold=hold,
+            mask=() if hold else mask,
+            on_step=None if hold else on_step,
+            watch=None if hold else watch,
+        )
+
+    return summarize(play(policy, False), play(None, True), config.task)

@@ -1,0 +1,298 @@
+"""A policy and a ball in reach -> what the body could still do about it.
+
+A search over actions, not a policy: what it finds no policy need ever find, but the
+body and the time that was left allow it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import cast
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import Compose, TransformedEnv
+
+from egoskin.envs.dodgeball import DodgeballEnv
+from egoskin.evaluation.throw_set import throw_seed
+from egoskin.make import EnvConfig, default_num_workers, make_worker_env
+from egoskin.policies.policy import Policy
+from egoskin.sensors import Skin
+from egoskin.sensors.config import SensorConfig
+
+# Share of the plans that the next ones are drawn around, and how much of their mean and
+# deviation stays from one iteration to the next.
+_ELITE, _KEPT = 0.1, 0.25
+# Below this deviation of the entries nothing new would be tried.
+_LEAST_SPREAD = 0.1
+# Of two plans that end alike the smaller one is better.
+_SIZE_COST = 1e-3
+# A step that no episode reaches.
+_NEVER = 2**31
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchConfig:
+    """Plans, and the search for the best of them."""
+
+    samples: int = 128
+    """Plans tried for each throw in each iteration."""
+    iterations: int = 20
+    """Iterations of the search."""
+    entries: int = 8
+    """Entries of a plan, one after the other."""
+    hold: int = 4
+    """Control steps that each entry lasts."""
+    spread: float = 1.2
+    """Standard deviation of the entries at first, in units of the action."""
+    stand_s: float = 1.25
+    """Time after the start of the plan that is watched: longer than the ball takes, and
+    the robot must not fall [s]."""
+    seed: int = 0
+    """Seed of the plans drawn."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for values with which nothing can be searched."""
+        for name in ("iterations", "entries", "hold", "spread", "stand_s"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        if self.samples < 4:
+            raise ValueError(f"samples must be at least 4, got {self.samples}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """How throws end, ``[N]`` bool each."""
+
+    avoided: Tensor
+    """The ball does not touch the robot within `SearchConfig.stand_s`."""
+    stood: Tensor
+    """Nor does the robot fall."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ceiling:
+    """What a policy makes of some balls, and what could be made of them."""
+
+    height: Tensor
+    """Height aimed at, at the standing robot [m], ``[N]``."""
+    policy: Outcome
+    """The policy alone."""
+    best: Outcome
+    """The policy, with the best plan that was found added to its actions."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Start:
+    """Where plans start, rows ``[N]``."""
+
+    throw: Tensor
+    simulation: dict[str, Tensor]
+    root: TensorDictBase
+
+    def repeated(self, times: int) -> _Start:
+        """Return each row several times, one after the other."""
+        row = torch.arange(len(self.throw)).repeat_interleave(times)
+        return _Start(
+            throw=self.throw[row],
+            simulation={key: value[row] for key, value in self.simulation.items()},
+            root=cast(TensorDictBase, self.root[row]),
+        )
+
+
+@torch.no_grad()
+def find_ceiling(
+    policy: Policy,
+    config: EnvConfig,
+    search: SearchConfig,
+    *,
+    bank_seed: int,
+    throws: int,
+    reach: float,
+    ball: int = 1,
+    on_iteration: Callable[[int, Outcome], None] | None = None,
+) -> Ceiling:
+    """Search the actions with which the balls of a bank would be avoided.
+
+    The policy plays until the ball is within reach of a sensor. From there on a plan, a
+    few vectors of actions that last some control steps each, is added to its actions:
+    it keeps the balance meanwhile and takes over again afterwards. Plans are improved
+    by the cross-entropy method (Rubinstein, 1999) with independent Gaussians. The empty
+    plan is among those tried, so the best is never worse than the policy.
+
+    Args:
+        policy: Writes the mean action.
+        config: Robot, task (its throws are those of the bank), sensors.
+        search: Plans and search.
+        bank_seed: Seed of the bank.
+        throws: Number of episodes of the bank.
+        reach: Distance from a sensor to the ball's surface at which plans start [m].
+        ball: Which ball of each episode, from 1; none is thrown after it.
+        on_iteration: Called with (iterations done, the best outcome so far).
+
+    Returns:
+        What becomes of the balls that came within reach before the episode ended.
+
+    Raises:
+        ValueError: If there is no such throw, or the sensors are corrupted: each copy
+            of a throw would wear other ones.
+    """
+    if config.sensor.corruption != "none":
+        raise ValueError(
+            "a ceiling is searched with ideal sensors, but the policy's have "
+            f"corruption={config.sensor.corruption}"
+        )
+    hz, seed = config.task.physics.control_hz, throw_seed(config, bank_seed)
+    if (steps := round(search.stand_s * hz)) < 1:
+        raise ValueError(
+            f"stand_s must be at least one control step, got {search.stand_s}"
+        )
+    # No plan is cut short by the age limit.
+    task = config.task
+    length = task.episode_length_s + search.stand_s
+    longer = replace(config, task=replace(task, episode_length_s=length))
+
+    def make(rows: int, config: EnvConfig) -> TransformedEnv:
+        return make_worker_env(
+            config,
+            policy.skin,
+            num_envs=rows,
+            seed=seed,
+            num_threads=default_num_workers(rows),
+            keep_raw=True,
+        )
+
+    start = _until_in_reach(make(throws, config), policy, config, reach, ball)
+    n, samples = len(start.throw), search.samples
+    if n == 0:
+        raise ValueError(f"none of {throws} balls came within {reach:g} m of a sensor")
+    env, starts = make(n * samples, longer), start.repeated(samples)
+    env.reset()
+    mean = torch.zeros(n, search.entries, len(config.robot_config.joints))
+    spread = torch.full_like(mean, search.spread)
+    generator = torch.Generator().manual_seed(search.seed)
+    elite = max(2, round(_ELITE * samples))
+    every = torch.arange(n)
+    least = torch.full((n,), torch.inf)
+    best = own = Outcome(avoided=least < 0, stood=least < 0)
+    for iteration in range(1, search.iterations + 1):
+        noise = torch.randn(n, samples, *mean.shape[1:], generator=generator)
+        plans = mean[:, None] + spread[:, None] * noise
+        plans[:, 0], plans[:, 1] = 0.0, mean
+        plan = plans.flatten(0, 1).repeat_interleave(search.hold, 1)
+        avoided, age = (
+            x.reshape(n, samples) for x in _play(env, policy, starts, plan, steps)
+        )
+        stood = avoided & (age == steps)
+        cost = torch.where(avoided, 1.0 - age / steps, 2.0)
+        cost += _SIZE_COST * plans.square().mean((2, 3))
+        if iteration == 1:
+            own = Outcome(avoided=avoided[:, 0], stood=stood[:, 0])
+        chosen = cost.argmin(1)
+        better = cost[every, chosen] < least
+        least = torch.minimum(least, cost[every, chosen])
+        best = Outcome(
+            avoided=torch.where(better, avoided[every, chosen], best.avoided),
+            stood=torch.where(better, stood[every, chosen], best.stood),
+        )
+        good = plans[every[:, None], cost.topk(elite, largest=False).indices]
+        mean = _KEPT * mean + (1 - _KEPT) * good.mean(1)
+        spread = _KEPT * spread + (1 - _KEPT) * good.std(1)
+        spread.clamp_(min=_LEAST_SPREAD)
+        if on_iteration is not None:
+            on_iteration(iteration, best)
+    thrower = _task(env).thrower
+    zero = torch.zeros_like(start.throw)
+    height, _ = thrower.at_standing_robot(
+        thrower.draw(seed, start.throw, zero, zero + ball - 1)
+    )
+    return Ceiling(height=height, policy=own, best=best)
+
+
+def _until_in_reach(
+    env: TransformedEnv, policy: Policy, config: EnvConfig, reach: float, ball: int = 1
+) -> _Start:
+    """Play a bank; return the state of each episode when its n-th ball is in reach."""
+    throws = env.batch_size[0]
+    sensor = SensorConfig(coverage="field", signal="binary", range=reach)
+    balls = config.task.throws.balls
+    skin = policy.skin
+    # Where the sensors are, not what each of them sees.
+    bare = Skin(
+        robot=skin.robot, links=skin.links, position=skin.position, normal=skin.normal
+    )
+    transforms = sensor.transforms(
+        config.robot_config,
+        bare,
+        balls,
+        dt=1 / config.task.physics.control_hz,
+    )
+    feel = Compose(transforms)
+    # Balls are thrown in turn: that of the others is not felt.
+    mine = torch.arange(len(balls)) == (ball - 1) % len(balls)
+    root = env.reset()
+    kept = root.clone()
+    simulation = _task(env).simulation_state()
+    waiting = torch.ones(throws, dtype=torch.bool)
+    started = ~waiting
+    for _ in range(config.task.delay_steps + config.task.episode_steps):
+        now = _task(env).simulation_state()
+        last = now["throw"] == ball
+        if (now["next_throw_step"][last] < _NEVER).any():
+            # Nothing is thrown after it.
+            now["next_throw_step"][last] = _NEVER
+            _task(env).load_simulation_state(now)
+        seen = root.clone(recurse=False)
+        seen["object_active"] = root["object_active"] & mine
+        felt = feel(seen)["signal"].any(-1) & last
+        begin = waiting & felt
+        if begin.any():
+            kept[begin] = root[begin]
+            for key, value in now.items():
+                simulation[key][begin] = value[begin]
+        started |= begin
+        waiting &= ~felt
+        if not waiting.any():
+            break
+        step, root = env.step_and_maybe_reset(policy(root))
+        waiting &= ~cast(TensorDictBase, step["next"])["done"][:, 0]
+    throw = started.nonzero()[:, 0]
+    return _Start(
+        throw=throw,
+        simulation={key: value[throw] for key, value in simulation.items()},
+        root=cast(TensorDictBase, kept[throw]),
+    )
+
+
+def _play(
+    env: TransformedEnv, policy: Policy, start: _Start, plan: Tensor, steps: int
+) -> tuple[Tensor, Tensor]:
+    """Play rows from their starts with a plan ``[M, T, J]`` added to the actions.
+
+    Returns:
+        Whether no ball hit, ``[M]`` bool, and steps survived, ``[M]``.
+    """
+    _task(env).load_simulation_state(start.simulation)
+    root = start.root.clone()
+    running = torch.ones(len(root), dtype=torch.bool)
+    avoided, age = running.clone(), torch.full((len(root),), steps)
+    for number in range(steps):
+        action = policy(root)["action"]
+        if number < plan.shape[1]:
+            root["action"] = action + plan[:, number]
+        step, root = env.step_and_maybe_reset(root)
+        after = cast(TensorDictBase, step["next"])
+        ended = running & after["done"][:, 0]
+        avoided &= ~(ended & after["hit"][:, 0])
+        age[ended] = number
+        running &= ~ended
+    return avoided, age
+
+
+def _task(env: TransformedEnv) -> DodgeballEnv:
+    """Return the environment below the transforms."""
+    task = env.base_env
+    assert isinstance(task, DodgeballEnv)
+    return task

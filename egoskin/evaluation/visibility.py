@@ -1,0 +1,317 @@
+"""What a skin sees before any training: directions, surface, seconds of warning.
+
+A *cell* is a coverage at a range, as in a table of ablations;
+`egoskin.evaluation.approaches` says what balls come and when they count as seen.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from egoskin.envs.throws import QUARTERS, ThrowConfig, quarter_of
+from egoskin.evaluation.approaches import (
+    THROW_STEP,
+    Progress,
+    StandingRobot,
+    Trace,
+    direction_grid,
+    direction_paths,
+    farthest,
+    surface_paths,
+    throw_paths,
+    trace,
+    unit_vectors,
+)
+from egoskin.rng import check_seed
+from egoskin.robots.config import RobotConfig
+from egoskin.sensors import Skin
+from egoskin.sensors.skin.coverage import Coverage
+from egoskin.shapes import Sphere
+
+CLEARANCES = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
+"""Clearances at which the share of directions seen by then is reported [m]."""
+BANDS = (0.0, 0.8, 1.2, 1.6, math.inf)
+"""Heights of contact above ground that are told apart [m]: legs to head."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cell:
+    """A coverage at a range."""
+
+    coverage: str
+    """Name of the coverage."""
+    range: float
+    """Detection range [m]; sensors with a range of their own keep it."""
+
+    def __str__(self) -> str:
+        """Name for tables and pictures."""
+        return f"{self.coverage} {self.range:g} m"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Analysis:
+    """What a skin sees, for every cell ``C``."""
+
+    cells: tuple[Cell, ...]
+    """Coverages and ranges."""
+    directions: Trace
+    """Straight approaches to the base, in the order of `direction_grid`."""
+    surface: Trace
+    """Straight approaches along the body's normals."""
+    surface_link: tuple[str, ...]
+    """Link of each of the latter."""
+    throws: Trace
+    """Throws."""
+    throw_azimuth: Tensor
+    """Where each comes from, relative to the heading [rad], ``[n]``."""
+    contact_height: Tensor
+    """Height of the ball's centre at contact [m], ``[n]``."""
+    control_period: float
+    """Time between two actions of a policy [s]."""
+
+    @cached_property
+    def warning(self) -> Tensor:
+        """Time from the first detection to the contact [s], ``[C, hits]``."""
+        steps = self.throws.contact - self.throws.first_seen
+        return THROW_STEP * steps[:, self.throws.touches].double()
+
+    def comes(self, cell: int) -> Tensor:
+        """Return from which directions of the map a ball can come, ``[n]`` bool.
+
+        It must be above the floor all the way from the cell's range to the contact.
+        """
+        return self.directions.runway >= self.cells[cell].range
+
+    def clearance_map(self, cell: int) -> np.ndarray:
+        """Return the clearance at which a ball is first seen [m], ``[E, A]``.
+
+        0 where never, NaN where no ball can come from.
+        """
+        clearance, comes = self.directions.clearance[cell], self.comes(cell)
+        values = torch.where(comes, clearance, torch.nan)
+        return values.reshape(direction_grid()[0].shape).numpy()
+
+    @property
+    def reached(self) -> Tensor:
+        """Whether a ball gets to the surface point along its normal, ``[n]`` bool."""
+        # Rounding may put the contact a step before the last.
+        last = self.surface.gap.shape[1] - 1
+        return self.surface.touches & (self.surface.contact >= last - 1)
+
+    def differing_share(self) -> np.ndarray:
+        """Return the share of hits whose warning differs by a control step, ``[C, C]``.
+
+        Cells of (almost) no difference give a policy the same time to act: only what
+        the signal says of the ball can set them apart.
+        """
+        warning = self.warning
+        apart = (warning[:, None] - warning).abs() > self.control_period
+        return apart.double().mean(-1).numpy()
+
+    def blind_cone(self, cell: int) -> dict[str, float]:
+        """Return the widest cone about a blind direction that holds no seen one [deg].
+
+        Directions from which no ball can come may lie in it.
+        """
+        azimuth, elevation = (angle.ravel() for angle in direction_grid())
+        vectors = unit_vectors(azimuth, elevation)
+        comes, detected = self.comes(cell), self.directions.seen[cell]
+        seen = (comes & detected).numpy()
+        blind = (comes & ~detected).nonzero()[:, 0].numpy()
+        if not len(blind):
+            return {"half_angle": 0.0}
+        nearest = (vectors[blind] @ vectors[seen].T).max(-1, initial=-1.0)
+        widest = int(nearest.argmin())
+        return {
+            "half_angle": math.degrees(math.acos(nearest[widest])),
+            "azimuth": math.degrees(azimuth[blind[widest]]),
+            "elevation": math.degrees(elevation[blind[widest]]),
+        }
+
+    def report(self) -> dict[str, Any]:
+        """Return all figures as JSON values (shares in [0, 1], SI units).
+
+        None stands for a share or a time of nothing.
+        """
+        hits = int(self.throws.touches.sum())
+        return {
+            "throws": len(self.throws.contact),
+            "hits": hits,
+            "control_period": self.control_period,
+            "cells": [self._cell(i) for i in range(len(self.cells))],
+            "differing_share": self.differing_share().tolist() if hits else None,
+        }
+
+    def _cell(self, i: int) -> dict[str, Any]:
+        cell, surface = self.cells[i], self.surface
+        unseen, reached = ~surface.seen[i], self.reached
+        links = np.array(self.surface_link)
+        return {
+            "coverage": cell.coverage,
+            "range": cell.range,
+            "directions_seen": self._solid_angle_seen(i, 0.0),
+            "directions_seen_by_clearance": {
+                f"{clearance:g}": self._solid_angle_seen(i, clearance)
+                for clearance in CLEARANCES
+                if clearance < cell.range
+            },
+            "widest_blind_cone_deg": self.blind_cone(i),
+            "surface_blind": _share(unseen, reached),
+            "surface_blind_by_link": {
+                name: _share(unseen, reached & torch.from_numpy(links == name))
+                for name in sorted(set(self.surface_link))
+            },
+            **self._warnings(i),
+            "sensors_at_once": self._sensors_at_once(i),
+        }
+
+    def _solid_angle_seen(self, i: int, clearance: float) -> float | None:
+        """Share of the directions in which a ball is seen by a clearance [m].
+
+        Of those from which one `comes`: the longer the range, the fewer lead over the
+        floor.
+        """
+        comes = self.comes(i)
+        # A cell of an equirectangular map has an area in proportion to cos(elevation).
+        solid = torch.from_numpy(np.cos(direction_grid()[1])).reshape(-1)[comes]
+        if not len(solid):
+            return None
+        seen = self.directions.seen[i] & (self.directions.clearance[i] >= clearance)
+        return float((solid * seen[comes]).sum() / solid.sum())
+
+    def _warnings(self, i: int) -> dict[str, Any]:
+        touches = self.throws.touches
+        warning, seen = self.warning[i], self.throws.seen[i, touches]
+
+        def group(mask: Tensor) -> dict[str, Any]:
+            if not mask.any():
+                return {"hits": 0}
+            levels = torch.tensor([0.05, 0.5, 0.95], dtype=warning.dtype)
+            low, median, high = warning[mask].quantile(levels).tolist()
+            return {
+                "hits": int(mask.sum()),
+                "seen": _share(seen, mask),
+                "median": median,
+                "5%": low,
+                "95%": high,
+            }
+
+        quarter = quarter_of(self.throw_azimuth[touches])
+        height = self.contact_height[touches]
+        return {
+            "warning": group(torch.ones_like(seen)),
+            "warning_by_azimuth": {
+                name: group(quarter == k) for k, name in enumerate(QUARTERS)
+            },
+            "warning_by_height": {
+                f"{low:g}-{high:g}": group((height >= low) & (height < high))
+                for low, high in itertools.pairwise(BANDS)
+            },
+        }
+
+    def _sensors_at_once(self, i: int) -> dict[str, float | None]:
+        """How many sensors detect a thrown ball at once, while any does.
+
+        One alone tells where the ball is as finely as sensors stand; all at once tell
+        nothing of it unless they also give the distance.
+        """
+        count = self.throws.num_sensors[i][self.throws.touches]
+        count = count[count > 0].float()
+        if not len(count):
+            return {"median": None, "one": None}
+        one = (count == 1).double().mean()
+        return {"median": float(count.median()), "one": float(one)}
+
+
+def _share(flags: Tensor, among: Tensor) -> float | None:
+    """Return the share of true flags, None among nothing (JSON has no NaN)."""
+    return float(flags[among].double().mean()) if among.any() else None
+
+
+def analyse(
+    robot: RobotConfig,
+    skin: Skin,
+    coverages: Mapping[str, Coverage],
+    ranges: Sequence[float],
+    throws: ThrowConfig,
+    *,
+    occlusion: bool = False,
+    num_throws: int = 2000,
+    seed: int = 0,
+    timestep: float = 1 / 120,
+    control_period: float = 1 / 60,
+    progress: Progress = lambda what, share: None,
+) -> Analysis:
+    """Return what a skin sees of balls that come to a standing robot.
+
+    Args:
+        robot: The robot.
+        skin: The sensors.
+        coverages: Coverages by name, for sensors without one of their own.
+        ranges: Ranges, for sensors without one of their own [m].
+        throws: The throws.
+        occlusion: Whether the robot's own body hides what lies behind it.
+        num_throws: How many throws are followed.
+        seed: Seed of the throws and of the points on the surface.
+        timestep: Physics time step of the task [s].
+        control_period: Time between two actions of a policy [s].
+        progress: Told what is in work, and how much of it is done.
+
+    Raises:
+        ValueError: If there is no coverage, range or throw, a range is not positive
+            and finite, or the seed is none.
+    """
+    if not coverages or not ranges:
+        raise ValueError("an analysis needs at least one coverage and one range")
+    if len(set(ranges)) < len(ranges):
+        raise ValueError(f"a range is given twice: {list(ranges)}")
+    if not all(0 < r < math.inf for r in ranges):
+        raise ValueError(f"ranges must be positive and finite, got {list(ranges)}")
+    if np.isinf(skin.range).any():
+        sensor = int(np.isinf(skin.range).argmax())
+        raise ValueError(
+            f"sensor {sensor} of the skin has an infinite range: there are no seconds "
+            "of warning of what is always in sight"
+        )
+    check_seed(seed)
+    if num_throws < 1:
+        raise ValueError(f"num_throws must be at least 1, got {num_throws}")
+    body, ball = StandingRobot(robot), Sphere(radius=throws.radius)
+    skin.check_links(robot.links)
+    far = farthest(skin, coverages, ranges)
+
+    def follow(what: str, paths: Tensor) -> Trace:
+        def tell(name: str, share: float) -> None:
+            progress(f"{what}, {name}", share)
+
+        return trace(
+            *(body, paths, skin, coverages, ranges, ball),
+            occlusion=occlusion,
+            progress=tell,
+        )
+
+    directions = follow("directions", direction_paths(body, ball, far))
+    paths, link = surface_paths(body, ball, far, seed)
+    surface = follow("surface", paths)
+    paths, azimuth = throw_paths(body, throws, num_throws, seed, timestep)
+    thrown = follow("throws", paths)
+    at_contact = thrown.contact.clamp(max=paths.shape[1] - 1)
+    return Analysis(
+        cells=tuple(Cell(coverage=c, range=r) for c in coverages for r in ranges),
+        directions=directions,
+        surface=surface,
+        surface_link=tuple(robot.links[i] for i in link),
+        throws=thrown,
+        throw_azimuth=azimuth,
+        contact_height=paths[torch.arange(num_throws), at_contact, 2],
+        control_period=control_period,
+    )

@@ -1,0 +1,527 @@
+"""A TorchRL ParallelEnv whose parent sleeps while it waits, and says what failed.
+
+TorchRL's parent polls shared flags in a busy loop, which takes a core away from the
+physics; reports of a dead worker only that it is dead; and waits thousands of seconds
+for one that hangs. Everything else is TorchRL's.
+
+Contract: no worker and no file of a pool outlives the parent, however it ends.
+"""
+
+from __future__ import annotations
+
+import atexit
+import ctypes
+import functools
+import os
+import shutil
+import signal
+import subprocess
+import tempfile
+import time
+import traceback
+import weakref
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from multiprocessing import (
+    active_children,
+    current_process,
+    forkserver,
+    parent_process,
+    resource_tracker,
+    set_forkserver_preload,
+    util,
+)
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from threading import Event, Thread
+from typing import NoReturn, TypeVar
+
+import torch
+import torchrl._utils
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase, ParallelEnv, Transform, TransformedEnv
+
+from egoskin.interrupts import ENDING
+
+# How long the parent sleeps between looks at its workers: first this share of the time
+# that the last step took, then at least this [s], and this share of the time it has
+# waited since. That adds as much to a step; more looks take CPU from the workers.
+_SURE_SHARE, _POLL, _POLL_SHARE = 0.75, 2e-4, 0.01
+# How often the parent looks at what its workers do [s].
+_LOOK = 0.2
+# A worker without an answer for this long hangs [s]. Long, because one that computes,
+# compiles or waits for a core looks the same. It is counted in looks: while all are
+# suspended (SIGSTOP, a closed laptop) there are none.
+HANG_LIMIT = 600.0
+# The server tells of a death soon after the channel of the dead closes [s].
+_DEATH_NOTICE = 5.0
+
+
+T = TypeVar("T")
+
+# Exit status of a worker that would start workers itself, and what to do about it.
+_UNGUARDED = 97
+_GUARD = (
+    "error: workers import the script that starts them, and this one would start them "
+    'again: put what it does into a function, called under `if __name__ == "__main__":`'
+)
+# When multiprocessing removes its folder at the end: later is lower.
+_REMOVES_FOLDER = -100
+# What to end when this process ends.
+_processes: weakref.WeakSet[BaseProcess] = weakref.WeakSet()
+
+# Numbers of glibc mallopt, and the threshold that every version of it takes [bytes].
+_TRIM_THRESHOLD, _MMAP_THRESHOLD, _MMAP_MOST = -1, -3, 2**25
+
+
+class WorkerError(RuntimeError):
+    """A worker died, raised or hung; the text holds its own traceback or signal."""
+
+
+def available_cores() -> int:
+    """Return the number of cores that this process may use."""
+    # macOS has no affinity.
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
+
+
+def default_num_workers(num_envs: int, cores: int | None = None) -> int:
+    """Return the largest divisor of the number of agents not above the cores.
+
+    Args:
+        num_envs: Number of agents.
+        cores: Number of cores; those this process may use by default.
+    """
+    cores = available_cores() if cores is None else cores
+    return max(n for n in range(1, cores + 1) if num_envs % n == 0)
+
+
+def keep_freed_memory() -> None:
+    """Let glibc's malloc keep what is freed, for this process.
+
+    Every step and update asks for the same megabytes again; to get fresh pages from
+    the system each time costs as much as the policy.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    # Other C libraries have no such function.
+    if mallopt is not None:
+        mallopt(_TRIM_THRESHOLD, 2**31 - 1)
+        if not mallopt(_MMAP_THRESHOLD, 2**30):
+            mallopt(_MMAP_THRESHOLD, _MMAP_MOST)
+
+
+class WorkerEnv(TransformedEnv):
+    """A transformed env that writes the traceback of its own failure to a file.
+
+    Args:
+        env: The batched environment of this worker.
+        transform: Its transforms.
+        report: File for the traceback.
+    """
+
+    def __init__(self, env: EnvBase, transform: Transform, report: Path) -> None:
+        super().__init__(env, transform)
+        self._report = report
+
+    def step_and_maybe_reset(
+        self, tensordict: TensorDictBase
+    ) -> tuple[TensorDictBase, TensorDictBase]:
+        """Return TorchRL's (step, next root) pair."""
+        with _reported(self._report):
+            return super().step_and_maybe_reset(tensordict)
+
+    def reset(
+        self, tensordict: TensorDictBase | None = None, **kwargs: object
+    ) -> TensorDictBase:
+        """Return the reset tensordict."""
+        with _reported(self._report):
+            return super().reset(tensordict, **kwargs)
+
+    def answer(self, method: str, *args: object) -> object:
+        """Return what a method of the base environment returns."""
+        with _reported(self._report):
+            return getattr(self.base_env, method)(*args)
+
+
+@contextmanager
+def _reported(report: Path) -> Iterator[None]:
+    try:
+        yield
+    except Exception:
+        report.write_text(traceback.format_exc())
+        raise
+
+
+class _Build:
+    """Builds the env of one worker; picklable for the worker's process."""
+
+    def __init__(self, build: Callable[[], WorkerEnv | EnvBase], report: Path) -> None:
+        self._build, self._report = build, report
+        self._parent = os.getpid()
+        # A worker has those of the server that forks it, which may be older.
+        self._settings = _settings()
+
+    def __call__(self) -> WorkerEnv:
+        # TorchRL also builds one in the parent, to read its specs.
+        in_worker = os.getpid() != self._parent
+        if in_worker:
+            keep_freed_memory()
+            for name in _settings():
+                del os.environ[name]
+            os.environ.update(self._settings)
+            Thread(target=_end_with_parent, daemon=True).start()
+            # It ends with its parent, not after 10,000 s without a command.
+            torchrl._utils.BATCHED_PIPE_TIMEOUT = None
+        with _reported(self._report):
+            env = self._build()
+            assert isinstance(env, TransformedEnv)
+            base, transform = env.base_env, env.transform.clone()
+            built = WorkerEnv(base, transform, self._report)
+        if in_worker:
+            _ready(self._report).touch()
+        return built
+
+
+def _settings() -> dict[str, str]:
+    """Return the package's own environment variables."""
+    return {k: v for k, v in os.environ.items() if k.startswith("EGOSKIN_")}
+
+
+def _end_with_parent() -> None:
+    """End as soon as the parent has, which may have got a SIGKILL."""
+    parent = parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+def start_server() -> None:
+    """Start what forks the workers, if it does not run; it imports on its own time.
+
+    Workers are forked from a clean server that has imported everything once: no thread
+    of this process is copied, and no import is paid for per worker.
+    """
+    _check_guarded()
+    _temporary_folder()
+    set_forkserver_preload(["egoskin.preload"])
+    # Ctrl-C, a batch system's SIGTERM and a closed terminal reach the whole group, but
+    # when to end is the parent's decision. All others inherit the signal mask. The
+    # tracker comes first: its own start unblocks what it ignores.
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP})
+    try:
+        resource_tracker.ensure_running()
+        signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
+        forkserver.ensure_running()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+
+
+def _check_guarded() -> None:
+    """End a worker that imports its parent's script and meets what starts workers."""
+    # The attribute is there while multiprocessing imports.
+    if hasattr(current_process(), "_inheriting"):
+        os._exit(_UNGUARDED)
+
+
+@functools.cache
+def _temporary_folder() -> str:
+    """Return a folder that is removed when this process ends, however it does.
+
+    It is multiprocessing's own, with the socket of the server that forks the workers.
+    A process that is killed removes nothing, so a shell waits for its end: for a line
+    if multiprocessing has removed the folder, for the end of file if nobody has. Then
+    it removes the semaphores, too, unless multiprocessing's tracker still has.
+    """
+    folder = util.get_temp_dir()
+    # Of multiprocessing: what the names of this process's semaphores begin with.
+    name = Path(folder).name
+    current_process()._config["semprefix"] = f"/{name}"
+    script = """trap "" INT TERM HUP
+        read -r line || { rm -rf -- "$0"; sleep 2; rm -f /dev/shm/sem."$1"-*; }"""
+    shell = subprocess.Popen(
+        ["/bin/sh", "-c", script, folder, name],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        # A SIGKILL may go to the whole group.
+        start_new_session=True,
+    )
+    # After multiprocessing has removed the folder.
+    after = _REMOVES_FOLDER - 1
+    util.Finalize(None, shell.communicate, [b"\n"], exitpriority=after)
+    # Before multiprocessing waits for them.
+    atexit.register(_kill, _processes)
+    return folder
+
+
+def _kill(processes: Iterable[BaseProcess]) -> None:
+    """End workers that nobody waits for any more."""
+    for process in processes:
+        if process.is_alive():
+            process.kill()
+
+
+def _ready(report: Path) -> Path:
+    """File that says that the worker of a report has built its env."""
+    return report.with_suffix(".ready")
+
+
+class WorkerPool(ParallelEnv):
+    """A ParallelEnv of batched environments, one process each.
+
+    Args:
+        builders: What builds the transformed environment of each worker.
+    """
+
+    def __init__(self, builders: Sequence[Callable[[], EnvBase]]) -> None:
+        _check_guarded()
+        self._reports = Path(tempfile.mkdtemp(dir=_temporary_folder()))
+        self._num_all, self._last_step = len(builders), 0.0
+        self._halves: list[WorkerPool] = []
+        keep_freed_memory()
+        threads = torch.get_num_threads()
+        super().__init__(
+            len(builders),
+            [_Build(b, self._report(i)) for i, b in enumerate(builders)],
+            mp_start_method="forkserver",
+        )
+        # TorchRL lowers the parent's threads for good when the workers start.
+        self.num_threads = threads
+
+    def halves(self) -> list[WorkerPool]:
+        """Return what may be stepped at the same time, in the order of the workers.
+
+        That is each half of the workers, or this where they are odd in number.
+        """
+        if self.num_workers % 2:
+            return [self]
+        if not self._halves:
+            middle = self.num_workers // 2
+            self._halves = [self._part(p) for p in (slice(middle), slice(middle, None))]
+        return self._halves
+
+    def _part(self, workers: slice) -> WorkerPool:
+        """Return TorchRL's view of some workers, without its lazy stacks.
+
+        Those take an operation for each row.
+        """
+        part = self[workers]
+        assert isinstance(part, WorkerPool)
+        shared = part.shared_tensordict_parent = self.shared_tensordict_parent[workers]
+        part._shared_tensordict_parent_next = shared.get("next")
+        part._shared_tensordict_parent_root = shared.exclude("next", *part.reset_keys)
+        return part
+
+    def simulation_state(self) -> dict[str, Tensor]:
+        """Return the state of all rows, in the order of the workers."""
+        states = self._ask("simulation_state")
+        return {k: torch.cat([s[k] for s in states]) for k in states[0]}
+
+    def load_simulation_state(self, state: dict[str, Tensor]) -> None:
+        """Give every worker the state of all rows; each takes its own."""
+        self._ask("load_simulation_state", state)
+
+    def step_and_maybe_reset(
+        self, tensordict: TensorDictBase
+    ) -> tuple[TensorDictBase, TensorDictBase]:
+        """Return TorchRL's (step, next root) pair."""
+        with self._death_explained():
+            return super().step_and_maybe_reset(tensordict)
+
+    def reset(
+        self, tensordict: TensorDictBase | None = None, **kwargs: object
+    ) -> TensorDictBase:
+        """Return the reset tensordict."""
+        with self._death_explained():
+            return super().reset(tensordict, **kwargs)
+
+    def _ask(self, method: str, *args: object) -> list:
+        """Return what a method of every worker's environment answers."""
+        if self.is_closed:
+            self.start()
+        channels = self.parent_channels
+        with self._death_explained():
+            # Tensors travel in shared memory: a message never fills the channel.
+            for channel in channels:
+                channel.send(("answer", ((method, *args), {})))
+            self._wait(range(len(channels)), lambda worker: channels[worker].poll())
+            return [channel.recv()[1] for channel in channels]
+
+    def _report(self, worker: int) -> Path:
+        return self._reports / f"worker-{worker}.txt"
+
+    def _start_workers(self) -> None:
+        """Start the workers; raise if one cannot."""
+        start_server()
+        self._reports.mkdir(exist_ok=True)
+        started = Event()
+        self._workers, self._hung, self._halves = [], set[int](), []
+        # The halves share this list.
+        self._failures: list[str] = []
+        others = set(active_children())
+        watch = Thread(target=self._watch_start, args=(started,), daemon=True)
+        watch.start()
+        try:
+            super()._start_workers()
+            _processes.update(self._workers)
+        except BaseException as error:
+            # Ctrl-C, too: nobody else knows of them.
+            _kill(set(active_children()) - others)
+            if not isinstance(error, (EOFError, ConnectionError)):
+                raise
+            raise WorkerError(
+                "a worker, or the server that forks them, ended before it was given "
+                "its environment"
+            ) from None
+        finally:
+            started.set()
+            watch.join()
+
+    def _watch_start(self, started: Event) -> None:
+        """Kill workers that hang while they start: the parent blocks on a channel."""
+        looks = 0
+        while not started.wait(_LOOK):
+            looks += 1
+            if looks * _LOOK > HANG_LIMIT:
+                for worker, process in enumerate(list(self._workers)):
+                    if not _ready(self._report(worker)).exists():
+                        self._hung.add(worker)
+                        process.kill()
+
+    def _cleanup_failed_worker_startup(self) -> None:
+        """Raise; TorchRL calls this when a worker has ended while it was started."""
+        self._explain_death()
+
+    def _wait_for_workers(self, workers_range: Iterable[int]) -> None:
+        """Sleep until the workers have set their flags; raise if one cannot."""
+        workers, flags = list(workers_range), self._shm_done_flags
+        indices, begin = self._worker_indices, time.monotonic()
+        time.sleep(min(_SURE_SHARE * self._last_step, _LOOK))
+        self._wait(workers, lambda worker: bool(flags[indices[worker]]))
+        self._last_step = time.monotonic() - begin
+        for worker in workers:
+            flags[indices[worker]] = 0
+
+    def _wait(self, workers: Iterable[int], answered: Callable[[int], bool]) -> None:
+        """Sleep until the workers have answered a command; raise if one cannot."""
+        waiting, looks = list(workers), 0
+        begin = looked = time.monotonic()
+        while waiting := [worker for worker in waiting if not answered(worker)]:
+            if self._failures:
+                raise WorkerError(self._failures[0])
+            now = time.monotonic()
+            if now - looked > _LOOK:
+                looked, looks = now, looks + 1
+                for worker in waiting:
+                    if not self._workers[worker].is_alive() and not answered(worker):
+                        self._fail(worker, self._death(worker))
+                if looks * _LOOK > HANG_LIMIT:
+                    self._fail(waiting[0], f"hung: no answer in {HANG_LIMIT:g} s")
+            time.sleep(min(max(_POLL, _POLL_SHARE * (now - begin)), _LOOK))
+
+    @contextmanager
+    def _death_explained(self) -> Iterator[None]:
+        """Say how a worker ended, where TorchRL or a channel only say that one did."""
+        if not self.is_closed:
+            for worker, process in enumerate(self._workers):
+                if not process.is_alive():
+                    self._fail(worker, self._death(worker))
+        try:
+            yield
+        except (EOFError, ConnectionError):
+            self._explain_death()
+
+    def _explain_death(self) -> NoReturn:
+        """Raise, saying which worker ended and how."""
+        deadline = time.monotonic() + _DEATH_NOTICE
+        while time.monotonic() < deadline:
+            for worker, process in enumerate(self._workers):
+                if not process.is_alive():
+                    self._fail(worker, self._death(worker))
+            time.sleep(_POLL)
+        self._end()
+        raise WorkerError("the channel to a worker broke; all were ended")
+
+    def _death(self, worker: int) -> str:
+        number = self._worker_indices[worker]
+        if number in self._hung:
+            return f"hung while it started: no answer in {HANG_LIMIT:g} s"
+        report = self._report(number)
+        if report.exists():
+            return f"raised\n{report.read_text()}"
+        code = self._workers[worker].exitcode
+        if code == _UNGUARDED:
+            self._end()
+            raise SystemExit(_GUARD)
+        if code is not None and code < 0:
+            return f"was killed by {signal.Signals(-code).name}"
+        return f"ended with exit status {code}"
+
+    def _fail(self, worker: int, reason: str) -> NoReturn:
+        """End the workers and raise; the other half then does, too."""
+        number = self._worker_indices[worker]
+        self._failures.append(f"worker {number} of {self._num_all} {reason}")
+        self._end()
+        raise WorkerError(self._failures[0])
+
+    def _end(self) -> None:
+        """Kill all workers."""
+        for process in self._workers:
+            process.kill()
+        for process in self._workers:
+            process.join()
+        for channel in self.parent_channels:
+            channel.close()
+        # Nothing is left to close; TorchRL would wait for answers that never come.
+        self.is_closed = True
+        if self._owns_workers:
+            shutil.rmtree(self._reports, ignore_errors=True)
+
+    def close(self, *, raise_if_closed: bool = False) -> None:
+        """End the workers; closing twice is allowed."""
+        if not self.is_closed:
+            if all(process.is_alive() for process in self._workers):
+                super().close(raise_if_closed=raise_if_closed)
+            else:
+                self._end()
+        shutil.rmtree(self._reports, ignore_errors=True)
+
+
+def in_halves(
+    env: EnvBase,
+    root: TensorDictBase,
+    run: Callable[[EnvBase, TensorDictBase, slice], T],
+) -> list[T]:
+    """Let both halves of an environment's workers go on at the same time.
+
+    Each half is stepped while another thread reads what the other half gave: no core
+    is idle between two steps, and no worker waits for a slower one.
+
+    Args:
+        env: Batched environment; all of it is one half if it has no two.
+        root: Tensordict to start from.
+        run: Is given a half, what of ``root`` is that half's, and its rows.
+
+    Returns:
+        What was returned for each half.
+    """
+    halves = env.halves() if isinstance(env, WorkerPool) else [env]
+    roots = root.chunk(len(halves))
+    ends = [(i + 1) * root.numel() // len(halves) for i in range(len(halves))]
+    rows = map(slice, [0, *ends], ends)
+    # As many of PyTorch's threads for each, be there two halves or one: with more, the
+    # last bits of a sum may differ.
+    threads = max(torch.get_num_threads() // 2, 1)
+    with ThreadPoolExecutor(
+        len(halves), "collector", torch.set_num_threads, (threads,)
+    ) as pool:
+        try:
+            return list(pool.map(run, halves, roots, rows))
+        except BaseException:
+            # Ctrl-C, too: the other half is not waited for to its end.
+            for half in halves:
+                if isinstance(half, WorkerPool):
+                    half._failures.append("it was interrupted: start anew")
+            raise

@@ -1,0 +1,394 @@
+"""Trained policies as self-contained files, for people who never train.
+
+A policy file holds weights, normaliser, skin, sensor and task. A checkpoint of a run
+holds the same and more, and is read alike. Some policies come with the package.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, dispatch
+from torch import Tensor, nn
+from torchrl.data import Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from egoskin.agents.networks import Agent, NetworkConfig
+from egoskin.make import EnvConfig
+from egoskin.sensors import Skin
+from egoskin.sparse import SparseSource
+from egoskin.storage.serialization import from_plain, to_plain
+from egoskin.storage.tensor_file import load_tensors, part, prefixed, save_tensors
+
+CHECKPOINT_NAME = "checkpoint.safetensors"
+"""Name of the latest checkpoint in a run folder."""
+# Names of what a policy file leaves out start with it.
+_CRITIC = "critic."
+# Signals that are not normalised are metres, or shares of their range.
+_LARGEST_SIGNAL = 1e6
+_SHIPPED = Path(__file__).parents[1] / "assets" / "policies"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class PolicySpec:
+    """Everything needed to build an agent and the environment it was made for."""
+
+    env: EnvConfig
+    """Robot, task, sensors."""
+    skin: Skin
+    """The sensors of the skin."""
+    network: NetworkConfig
+    """Size of the networks."""
+    sizes: Mapping[str, int]
+    """Number of features of each key read."""
+    num_actions: int
+    """Number of actions ``J``."""
+    frames: int = 0
+    """Environment steps it was trained for."""
+
+    @classmethod
+    def of(
+        cls,
+        config: EnvConfig,
+        skin: Skin,
+        network: NetworkConfig,
+        env: EnvBase,
+        sources: Mapping[str, SparseSource],
+    ) -> PolicySpec:
+        """Return the specification for an environment.
+
+        Args:
+            config: What the environment was made of.
+            skin: Its skin.
+            network: Size of the networks.
+            env: The environment.
+            sources: What computes the keys that it does not give.
+        """
+        spec = env.observation_spec
+        return cls(
+            env=config,
+            skin=skin,
+            network=network,
+            sizes={
+                key: sources[key].size if key in sources else spec[key].shape[-1]
+                for key in config.critic_keys
+            },
+            num_actions=env.action_spec.shape[-1],
+        )
+
+    def build_agent(self, sources: Mapping[str, SparseSource] | None = None) -> Agent:
+        """Return a fresh agent.
+
+        Args:
+            sources: What computes keys that its environment does not give.
+        """
+        return Agent(
+            self.sizes,
+            self.env.actor_keys,
+            self.env.critic_keys,
+            self.num_actions,
+            self.network,
+            sources,
+        )
+
+    def check_claims(self, tensors: Mapping[str, Tensor], what: str) -> None:
+        """Raise ValueError unless tensors are those of an agent of these sizes.
+
+        It takes no memory for the agent, however large it claims to be.
+
+        Args:
+            tensors: Those of the file that the specification is from.
+            what: Name of the file.
+        """
+        hidden = self.network.hidden
+        claims = [*self.sizes.values(), self.num_actions, *hidden, len(hidden)]
+        held = sum(value.numel() for value in tensors.values())
+        for claim in claims:
+            if not 0 < claim <= held:
+                raise ValueError(
+                    f"{what} is damaged: its header claims a size of {claim}, and it "
+                    f"holds {held} numbers"
+                )
+        with torch.device("meta"):
+            check_agent_tensors(agent_tensors(self.build_agent()), tensors, what)
+
+    def header(self) -> dict[str, Any]:
+        """Return the specification as JSON values."""
+        return {
+            "standard": self.env.standard,
+            "env": to_plain(self.env),
+            "skin": self.skin.to_dict(),
+            "network": to_plain(self.network),
+            "sizes": dict(self.sizes),
+            "num_actions": self.num_actions,
+            "frames": self.frames,
+        }
+
+    @classmethod
+    def from_header(cls, header: Mapping[str, Any], what: str) -> PolicySpec:
+        """Return the specification that `header` described.
+
+        Raises:
+            ValueError: If it is no such description.
+        """
+        if not isinstance(header, Mapping):
+            raise ValueError(f"{what} holds no policy: it must be an object")
+        missing = [f.name for f in dataclasses.fields(cls) if f.name not in header]
+        if missing:
+            raise ValueError(f"{what} holds no policy: {missing[0]!r} is missing")
+        sizes = header["sizes"]
+        numbers = sizes.values() if isinstance(sizes, dict) else [None]
+        numbers = [*numbers, header["num_actions"], header["frames"]]
+        if not all(isinstance(number, int) for number in numbers):
+            raise ValueError(
+                f"{what} holds no policy: sizes, num_actions and frames must be numbers"
+            )
+        env = from_plain(EnvConfig, header["env"], what)
+        if lacking := set(env.critic_keys) - sizes.keys():
+            raise ValueError(f"{what} holds no policy: no size of {min(lacking)!r}")
+        try:
+            skin = Skin.from_dict(header["skin"])
+        except ValueError as error:
+            raise ValueError(f"{what} holds no policy: {error}") from error
+        return cls(
+            env=env,
+            skin=skin,
+            network=from_plain(NetworkConfig, header["network"], what),
+            sizes=sizes,
+            num_actions=header["num_actions"],
+            frames=header["frames"],
+        )
+
+
+def sparse_sources(config: EnvConfig, skin: Skin) -> dict[str, SparseSource]:
+    """Return what computes the keys that are better learnt from as sparse rows.
+
+    Args:
+        config: What the environment is made of.
+        skin: The sensors.
+    """
+    if config.history > 1:
+        return {}
+    balls = config.task.throws.balls
+    robot = config.robot_config
+    rays = config.sensor.sparse_rays(robot, skin, balls)
+    return {} if rays is None else {"signal": rays}
+
+
+def agent_tensors(agent: Agent) -> dict[str, Tensor]:
+    """Return all parameters and buffers of an agent by name, each once."""
+    return {**dict(agent.named_parameters()), **dict(agent.named_buffers())}
+
+
+def check_agent_tensors(
+    own: Mapping[str, Tensor], tensors: Mapping[str, Tensor], what: str
+) -> None:
+    """Raise ValueError unless tensors are those of an agent, or of one without critic.
+
+    Args:
+        own: What `agent_tensors` returned for the agent.
+        tensors: What is to be loaded.
+        what: Where it came from, for the error text, which names the tensor.
+    """
+    missing = own.keys() - tensors.keys()
+    if not any(name.startswith(_CRITIC) for name in tensors):
+        missing = {name for name in missing if not name.startswith(_CRITIC)}
+    if missing:
+        raise ValueError(f"{what}: tensor {min(missing)!r} of the networks is missing")
+    check_like(own, tensors, what)
+
+
+def check_like(
+    own: Mapping[str, Tensor], tensors: Mapping[str, Tensor], what: str
+) -> None:
+    """Raise ValueError if a tensor is unknown or of another shape or type than ours."""
+    for name, value in tensors.items():
+        if name not in own:
+            raise ValueError(f"{what}: tensor {name!r} is none that is known here")
+        if (own[name].shape, own[name].dtype) != (value.shape, value.dtype):
+            raise ValueError(
+                f"{what}: tensor {name!r} does not fit: expected {_kind(own[name])}, "
+                f"got {_kind(value)}"
+            )
+
+
+def _kind(value: Tensor) -> str:
+    return f"{list(value.shape)} of {str(value.dtype).removeprefix('torch.')}"
+
+
+@torch.no_grad()
+def load_agent_tensors(agent: Agent, tensors: Mapping[str, Tensor], what: str) -> None:
+    """Copy tensors into an agent; without any of its critic, that stays as it is.
+
+    Raises:
+        ValueError: If a name, shape or type does not fit, or a tensor is missing; the
+            agent is then as it was.
+    """
+    own = agent_tensors(agent)
+    check_agent_tensors(own, tensors, what)
+    for name, value in tensors.items():
+        own[name].copy_(value)
+
+
+@torch.no_grad()
+def check_finite(agent: Agent, what: str) -> None:
+    """Raise ValueError if an agent can give an action that is not finite.
+
+    Args:
+        agent: The agent, loaded.
+        what: Where it came from, for the error text.
+    """
+    for name, value in agent_tensors(agent).items():
+        # All is computed in float32, however it is kept.
+        if not value.float().isfinite().all():
+            raise ValueError(f"{what} is damaged: tensor {name!r} is not finite")
+        if name.endswith(".var") and (value < 0).any():
+            raise ValueError(f"{what} is damaged: tensor {name!r} is negative")
+    # No sum is larger than that of the magnitudes, with all inputs at their largest.
+    body = copy.deepcopy(agent.head.body)
+    for weight in body.parameters():
+        weight.abs_()
+    largest = []
+    for key, layer in zip(agent.actor_keys, body.inputs, strict=True):
+        assert isinstance(layer, nn.Linear)
+        x = layer.weight.new_full((1, layer.in_features), _LARGEST_SIGNAL)
+        if key in agent.norms:
+            x = agent.norms[key](x.fill_(torch.finfo(x.dtype).max))
+        largest.append(x)
+    scale = agent.head.log_std.exp()
+    if not (body(*largest).isfinite().all() and scale.isfinite().all()):
+        raise ValueError(
+            f"{what} is damaged: with weights as large as its own, actions need not be "
+            "finite"
+        )
+
+
+def save_policy(path: Path, agent: Agent, spec: PolicySpec) -> None:
+    """Write the actor of an agent as a self-contained policy file."""
+    tensors = {
+        name: value
+        for name, value in agent_tensors(agent).items()
+        if not name.startswith(_CRITIC)
+    }
+    save_tensors(path, prefixed("agent", tensors), {"policy": spec.header()})
+
+
+class Policy(TensorDictModuleBase):
+    """A trained actor that writes its mean action.
+
+    A TensorDict module like any other: for ``env.rollout``, a TorchRL collector,
+    ``TensorDictSequential``, `torch.compile`, `torch.vmap`. Called with the tensors of
+    ``in_keys`` in their order, it returns the action.
+
+    Args:
+        agent: Agent whose actor is used; its parameters no longer require gradients.
+        policy_spec: What it was made for.
+    """
+
+    def __init__(self, agent: Agent, policy_spec: PolicySpec) -> None:
+        super().__init__()
+        self.policy_spec = policy_spec
+        self.in_keys, self.out_keys = agent.actor_keys, ["action"]
+        self._head = agent.head.requires_grad_(False)
+        self._norms = nn.ModuleDict(
+            {key: agent.norms[key] for key in agent.actor_keys if key in agent.norms}
+        )
+
+    @property
+    def env_config(self) -> EnvConfig:
+        """Robot, task and sensors the policy was trained with."""
+        return self.policy_spec.env
+
+    @property
+    def skin(self) -> Skin:
+        """The skin it was trained with."""
+        return self.policy_spec.skin
+
+    @property
+    def spec(self) -> Composite:
+        """TorchRL's spec of what it writes."""
+        weight = self._head.log_std
+        return Composite(
+            action=Unbounded(weight.shape, device=weight.device, dtype=weight.dtype)
+        )
+
+    @dispatch(auto_batch_size=False)
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``action [*B, J]`` from ``in_keys``, ``[*B, F]`` of any float dtype.
+
+        The batch may have any number of dimensions, or none. The action has the dtype
+        of the policy's parameters.
+
+        Raises:
+            KeyError: If a key is missing; the text names what is needed.
+            ValueError: If a key holds another number of features than it was trained
+                with.
+        """
+        return tensordict.set("action", self._mean(tensordict))
+
+    def _mean(self, tensordict: TensorDictBase) -> Tensor:
+        """Return the mean action, ``[*B, J]``."""
+        keys, inputs = self.env_config.actor_keys, []
+        for key in keys:
+            value, size = tensordict.get(key, None), self.policy_spec.sizes[key]
+            if value is None:
+                raise KeyError(
+                    f"the policy reads {', '.join(keys)}; {key!r} is missing"
+                )
+            if value.shape[-1:] != (size,):
+                raise ValueError(
+                    f"the policy was trained with {key!r} [*B, {size}], got "
+                    f"{list(value.shape)}: is it the environment of "
+                    "make_env(policy.env_config, policy.skin)?"
+                )
+            value = value.to(self._head.log_std.dtype)
+            inputs.append(self._norms[key](value) if key in self._norms else value)
+        return self._head(*inputs)[0]
+
+
+def shipped_policies() -> list[str]:
+    """Return the names of the policies that come with the package."""
+    return sorted(path.stem for path in _SHIPPED.glob("*.safetensors"))
+
+
+def load_policy(path: str | Path) -> Policy:
+    """Return the policy of a policy file, a checkpoint, a run folder or a name.
+
+    Args:
+        path: The file, or a run folder (its latest checkpoint); or, where there is no
+            such file, one of `shipped_policies`.
+
+    Returns:
+        A module that reads `Policy.in_keys` of a TensorDict and writes the mean
+        ``action``; `Policy.env_config` and `Policy.skin` say what it was made for.
+
+    Raises:
+        ValueError: If there is no policy; the text says why.
+    """
+    path = Path(path)
+    if not path.exists():
+        names = shipped_policies()
+        if str(path) not in names:
+            raise ValueError(
+                f"no policy {path}: neither a file, nor a folder, nor one that comes "
+                f"with the package ({', '.join(names)})"
+            )
+        path = _SHIPPED / f"{path}.safetensors"
+    if path.is_dir():
+        if not (path / CHECKPOINT_NAME).is_file():
+            raise ValueError(f"{path} is no run folder: it has no {CHECKPOINT_NAME}")
+        path = path / CHECKPOINT_NAME
+    tensors, header = load_tensors(path)
+    spec = PolicySpec.from_header(header.get("policy", {}), str(path))
+    own = part("agent", tensors)
+    spec.check_claims(own, str(path))
+    agent = spec.build_agent()
+    load_agent_tensors(agent, own, str(path))
+    check_finite(agent, str(path))
+    return Policy(agent, spec)

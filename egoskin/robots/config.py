@@ -1,0 +1,430 @@
+"""Robots: model file and the facts that no model file holds.
+
+Adding a robot is adding a `RobotConfig` here and its MJCF to ``assets/``; to place
+sensors on one elsewhere, make its `RobotConfig` there. Names are resolved to indices
+once, in the properties of the configuration.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+import glob
+import re
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
+
+import mujoco
+import numpy as np
+import pytorch_kinematics as pk
+
+from egoskin.robots.chains import (
+    JOINT_TYPES,
+    body_id,
+    body_name,
+    build_chain,
+    joint_name,
+)
+from egoskin.storage.files import check_regular, read_regular
+
+ASSETS = Path(__file__).parents[1] / "assets"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gain:
+    """PD gain of one joint: torque = kp (q* - q) - kd qdot."""
+
+    kp: float
+    """Stiffness [N m/rad]."""
+    kd: float
+    """Damping [N m s/rad]."""
+
+
+def resolve(table: Mapping[str, object], names: tuple[str, ...], what: str) -> list:
+    """Return the value of each name from a table keyed by name patterns.
+
+    Args:
+        table: Values by shell pattern (``*_knee_joint``).
+        names: Names to look up.
+        what: What the table holds, for the error text.
+
+    Returns:
+        One value for each name.
+
+    Raises:
+        ValueError: If a name matches no pattern or several, or a pattern matches
+            nothing.
+    """
+    values = []
+    for name in names:
+        matches = [p for p in table if fnmatch.fnmatchcase(name, p)]
+        if len(matches) != 1:
+            raise ValueError(
+                f"{what}: {name!r} must match exactly one of the patterns "
+                f"{', '.join(table)}; it matches {matches or 'none'}"
+            )
+        values.append(table[matches[0]])
+    for pattern in table:
+        if not fnmatch.filter(names, pattern):
+            raise ValueError(f"{what}: {pattern!r} matches none of {', '.join(names)}")
+    return values
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Primitive:
+    """A sphere, capsule or box fixed to a link."""
+
+    link: str
+    """Body that carries it."""
+    kind: str
+    """"sphere", "capsule" or "box"."""
+    size: np.ndarray
+    """MuJoCo's sizes [m], ``[3]``: radius; radius, half length; half extents."""
+    position: np.ndarray
+    """Centre in the link frame [m], ``[3]``."""
+    rotation: np.ndarray
+    """Orientation in the link frame (a capsule's axis is z), ``[3, 3]``."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RobotConfig:
+    """A robot: a base, and the hinges and slides below it.
+
+    Sensors can be placed on any. The task wants a floating base, hinges alone, gains
+    and the file of the robot alone: no floor, no actuators, no sensors.
+    """
+
+    name: str
+    """Name by which configurations refer to the robot."""
+    model_path: Path
+    """MJCF or URDF; only what hangs on the base counts. Of a URDF links on fixed joints
+    are links, too, and meshes, which seldom lie where it says, are left out."""
+    base: str
+    """Root of `chain`, the *robot's centre frame*: the body with the free joint or, of
+    a robot that stands fixed, one that is welded to the world, or ``"world"``."""
+    skin_links: tuple[str, ...]
+    """Links that carry the proximity skin (the upper body)."""
+    default_pose: Mapping[str, float] = field(default_factory=dict)
+    """Joint positions [rad], of slides [m], of the default pose by joint name pattern;
+    else 0."""
+    gains: Mapping[str, Mapping[str, Gain]] = field(default_factory=dict)
+    """Named sets of PD gains by joint name pattern."""
+    feet: tuple[str, ...] = ()
+    """Links that may touch the ground."""
+    untargeted_links: tuple[str, ...] = ()
+    """Links that throws are not aimed at."""
+
+    @cached_property
+    def model(self) -> mujoco.MjModel:
+        """The robot alone, compiled."""
+        spec = self.spec()
+        try:
+            return spec.compile()
+        except ValueError as error:
+            raise _unreadable(self.model_path, error) from error
+
+    def spec(self) -> mujoco.MjSpec:
+        """Return a fresh, editable specification of the robot.
+
+        Raises:
+            ValueError: If the file is no MJCF or URDF that MuJoCo can read.
+            OSError: If there is no such file.
+        """
+        path = self.model_path
+        is_urdf = _root_tag(read_regular(path)) == "robot"
+        try:
+            spec = mujoco.MjSpec.from_file(str(path))
+        except ValueError as error:
+            raise _unreadable(path, error) from error
+        if is_urdf:
+            for element in (*_mesh_geoms(spec), *spec.meshes):
+                spec.delete(element)
+            spec.compiler.fusestatic = False
+            # A URDF may leave out masses, and MuJoCo wants them where joints move.
+            spec.compiler.boundmass = spec.compiler.boundinertia = 1e-6
+            spec.compiler.balanceinertia = True
+        return spec
+
+    @cached_property
+    def _bodies(self) -> list[int]:
+        """The base, be it the world, and all that hangs on it, in MuJoCo's order."""
+        bodies = [body_id(self.model, self.base)]
+        for body in range(bodies[0] + 1, self.model.nbody):
+            if self.model.body_parentid[body] in bodies:
+                bodies.append(body)
+        return bodies
+
+    @cached_property
+    def links(self) -> tuple[str, ...]:
+        """The base and the bodies below it in MuJoCo's order (without the world).
+
+        Those without a name are named as in `build_chain`.
+        """
+        return tuple(body_name(self.model, body) for body in self._bodies if body)
+
+    @cached_property
+    def _joint_ids(self) -> np.ndarray:
+        """Which of the model's joints are the robot's, ``[J]``."""
+        model = self.model
+        below = np.isin(model.jnt_bodyid, self._bodies[1:])
+        return np.flatnonzero(below & np.isin(model.jnt_type, list(JOINT_TYPES)))
+
+    @cached_property
+    def joints(self) -> tuple[str, ...]:
+        """Hinges and slides below the base, in MuJoCo's order, as `build_chain`'s."""
+        return tuple(joint_name(self.model, joint) for joint in self._joint_ids)
+
+    def check_floating_base(self) -> None:
+        """Raise ValueError unless the base floats and all other joints are hinges."""
+        model, kinds = self.model, self.model.jnt_type
+        free = model.njnt > 0 and kinds[0] == mujoco.mjtJoint.mjJNT_FREE
+        if not free or model.jnt_bodyid[0] != self._bodies[0]:
+            raise ValueError(
+                f"{self.name}: the first joint must be the free joint of its base "
+                f"{self.base!r} (sensors can be placed without, but no balls thrown)"
+            )
+        hinges = kinds[self._joint_ids] == mujoco.mjtJoint.mjJNT_HINGE
+        if hinges.sum() != model.njnt - 1:
+            raise ValueError(
+                f"{self.name}: all joints but the first must be hinges below its base"
+            )
+
+    @cached_property
+    def default_joint_pos(self) -> np.ndarray:
+        """Joint positions of the default pose [rad], of slides [m], ``[J]``."""
+        rest = {
+            glob.escape(name): 0.0
+            for name in self.joints
+            if not any(fnmatch.fnmatchcase(name, p) for p in self.default_pose)
+        }
+        table = {**self.default_pose, **rest}
+        return np.array(resolve(table, self.joints, "default_pose"))
+
+    @cached_property
+    def torque_limit(self) -> np.ndarray:
+        """Largest torque of each joint [N m], ``[J]`` (``actuatorfrcrange``).
+
+        Of a slide, the largest force [N].
+        """
+        return self.model.jnt_actfrcrange[self._joint_ids, 1]
+
+    @cached_property
+    def joint_range(self) -> np.ndarray:
+        """Lower and upper end of each joint's range [rad], [m], ``[2, J]``."""
+        return self.model.jnt_range[self._joint_ids].T.copy()
+
+    def joint_gains(self, gain_set: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return (kp [N m/rad], kd [N m s/rad]) of a named gain set, ``[J]`` each.
+
+        Raises:
+            ValueError: If the robot has no gain set of that name.
+        """
+        if gain_set not in self.gains:
+            raise ValueError(
+                f"{self.name} has no gain set {gain_set!r}; it has "
+                f"{', '.join(self.gains)}"
+            )
+        gains = resolve(self.gains[gain_set], self.joints, f"gains[{gain_set!r}]")
+        return np.array([g.kp for g in gains]), np.array([g.kd for g in gains])
+
+    @cached_property
+    def default_base_height(self) -> float:
+        """Height of the base when the default pose stands on the ground [m]."""
+        model, data = self.model, mujoco.MjData(self.model)
+        data.qpos[model.jnt_qposadr[self._joint_ids]] = self.default_joint_pos
+        mujoco.mj_kinematics(model, data)
+        geoms = self._collision_geoms(self.links)
+        lowest = min(_lowest_point(model, data, geom) for geom in geoms)
+        return float(data.xpos[self._bodies[0], 2] - lowest)
+
+    @cached_property
+    def primitives(self) -> tuple[Primitive, ...]:
+        """The collision shapes, with their poses in the frames of their links."""
+        return self.primitives_on(self.links)
+
+    def _collision_geoms(self, links: Collection[str]) -> list[int]:
+        """Return the geoms of links that touch something, not those to look at."""
+        model = self.model
+        wanted = [b for b in self._bodies if b and body_name(model, b) in links]
+        touching = (model.geom_contype | model.geom_conaffinity) != 0
+        touching[[*model.pair_geom1, *model.pair_geom2]] = True
+        on_links = np.isin(model.geom_bodyid, wanted)
+        return np.flatnonzero(on_links & touching).tolist()
+
+    def primitives_on(self, links: Collection[str]) -> tuple[Primitive, ...]:
+        """Return the collision shapes of some links, with their poses in their frames.
+
+        Args:
+            links: Names of the links; the shapes of others are not looked at.
+
+        Raises:
+            ValueError: If a shape is no sphere, capsule or box.
+        """
+        model, shapes = self.model, []
+        for geom in self._collision_geoms(links):
+            rotation = np.zeros(9)
+            mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
+            shapes.append(
+                Primitive(
+                    link=body_name(model, int(model.geom_bodyid[geom])),
+                    kind=_primitive_kind(model, geom),
+                    size=model.geom_size[geom].copy(),
+                    position=model.geom_pos[geom].copy(),
+                    rotation=rotation.reshape(3, 3),
+                )
+            )
+        return tuple(shapes)
+
+    @cached_property
+    def chain(self) -> pk.Chain:
+        """Kinematic chain from the base, for pytorch-kinematics."""
+        return build_chain(self.model, self.base)
+
+
+def read_robot(path: Path | str) -> RobotConfig:
+    """Return the robot of an MJCF or URDF file, to place or import sensors on.
+
+    Its base is the one body that stands in the world, or the world itself where several
+    do; all its links may carry skin. Its name is the model's, or else the file's.
+
+    Raises:
+        ValueError: If the file is no MJCF or URDF that MuJoCo can read.
+        OSError: If there is no such file.
+    """
+    path = Path(path)
+    # Elsewhere MuJoCo does not know the format, and logs a warning.
+    if path.suffix.lower() not in (".xml", ".urdf"):
+        check_regular(path)
+        raise ValueError(f"{path} must be an MJCF (.xml) or a URDF (.urdf, .xml)")
+    whole = RobotConfig(name=path.stem, model_path=path, base="world", skin_links=())
+    model, name = whole.model, whole.spec().modelname
+    in_world = np.flatnonzero(model.body_parentid[1:] == 0) + 1
+    one = len(in_world) == 1
+    return replace(
+        whole,
+        # That of a model without a name.
+        name=whole.name if name in ("", "MuJoCo Model") else name,
+        base=body_name(model, int(in_world[0])) if one else "world",
+        skin_links=whole.links,
+    )
+
+
+def _root_tag(content: bytes) -> str:
+    """Name of the outermost element of an XML file, "" if there is none."""
+    content = re.sub(rb"<!--.*?-->", b"", content, flags=re.DOTALL)
+    tag = re.search(rb"<([A-Za-z][\w:.-]*)", content)
+    return "" if tag is None else tag[1].decode()
+
+
+def _mesh_geoms(spec: mujoco.MjSpec) -> list[mujoco.MjsGeom]:
+    """Return the geoms that are meshes."""
+    return [g for g in spec.geoms if g.type == mujoco.mjtGeom.mjGEOM_MESH]
+
+
+def _unreadable(path: Path, error: ValueError) -> ValueError:
+    """The error for a file that MuJoCo refuses, on one line."""
+    return ValueError(
+        f"{path} is no robot that MuJoCo can read: {' '.join(str(error).split())}"
+    )
+
+
+def _primitive_kind(model: mujoco.MjModel, geom: int) -> str:
+    """Return "sphere", "capsule" or "box".
+
+    Raises:
+        ValueError: If the geom is none of these.
+    """
+    kind = mujoco.mjtGeom(int(model.geom_type[geom])).name
+    kind = kind.removeprefix("mjGEOM_").lower()
+    if kind not in ("sphere", "capsule", "box"):
+        link = body_name(model, int(model.geom_bodyid[geom]))
+        name = model.geom(geom).name or geom
+        raise ValueError(
+            f"link {link!r} has a collision shape, geom {name!r}, of kind {kind}, not "
+            "sphere, capsule or box: place sensors with that link's meshes instead, "
+            f"meshes={{{link!r}: [...]}}, or put one of those three in its place"
+        )
+    return kind
+
+
+def _lowest_point(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
+    """Height of the lowest point of a primitive geom [m]."""
+    size, kind = model.geom_size[geom], _primitive_kind(model, geom)
+    z_row = data.geom_xmat[geom].reshape(3, 3)[2]
+    if kind == "sphere":
+        reach = size[0]
+    elif kind == "capsule":
+        reach = size[0] + size[1] * abs(z_row[2])
+    else:
+        reach = float(np.abs(z_row) @ size)
+    return float(data.geom_xpos[geom, 2] - reach)
+
+
+_ARMS = tuple(
+    f"{side}_{part}_link"
+    for side in ("left", "right")
+    for part in (
+        "shoulder_pitch",
+        "shoulder_roll",
+        "shoulder_yaw",
+        "elbow",
+        "wrist_roll",
+        "wrist_pitch",
+        "wrist_yaw",
+    )
+)
+_SHINS_AND_FEET = tuple(
+    f"{side}_{part}_link"
+    for side in ("left", "right")
+    for part in ("knee", "ankle_pitch", "ankle_roll")
+)
+
+H1_2 = RobotConfig(
+    name="h1_2",
+    model_path=ASSETS / "h1_2.xml",
+    base="pelvis",
+    # Stance of Unitree's training code for the H1-2.
+    default_pose={
+        "*_hip_pitch_joint": -0.16,
+        "*_knee_joint": 0.36,
+        "*_ankle_pitch_joint": -0.2,
+        "*_shoulder_pitch_joint": 0.4,
+        "*_elbow_joint": 0.3,
+    },
+    gains={
+        # Unitree's figures for the real robot.
+        "real": {
+            "*_hip_*_joint": Gain(kp=200.0, kd=2.5),
+            "*_knee_joint": Gain(kp=300.0, kd=4.0),
+            "*_ankle_*_joint": Gain(kp=40.0, kd=2.0),
+            "torso_joint": Gain(kp=300.0, kd=3.0),
+            "*_shoulder_*_joint": Gain(kp=120.0, kd=2.0),
+            "*_elbow_joint": Gain(kp=80.0, kd=1.0),
+        },
+        # kp = I w^2, kd = 2 zeta I w with the reflected rotor inertia I, w = 10 Hz
+        # and damping ratio zeta = 2.
+        "rotor_inertia": {
+            "*_hip_*_joint": Gain(kp=98.7, kd=6.3),
+            "*_knee_joint": Gain(kp=157.7, kd=10.1),
+            "*_ankle_*_joint": Gain(kp=19.7, kd=1.3),
+            "torso_joint": Gain(kp=98.7, kd=6.3),
+            "*_shoulder_pitch_joint": Gain(kp=19.7, kd=1.3),
+            "*_shoulder_roll_joint": Gain(kp=19.7, kd=1.3),
+            "*_shoulder_yaw_joint": Gain(kp=7.9, kd=0.5),
+            "*_elbow_joint": Gain(kp=7.9, kd=0.5),
+        },
+    },
+    feet=tuple(
+        f"{s}_ankle_{a}_link" for s in ("left", "right") for a in ("pitch", "roll")
+    ),
+    skin_links=("torso_link", *_ARMS),
+    untargeted_links=_SHINS_AND_FEET,
+)
+"""Unitree H1-2 without hands, wrists locked: 21 joints."""
+
+RobotName = Literal["h1_2"]
+"""Robots that can be chosen by name."""
+ROBOTS = {H1_2.name: H1_2}
+"""Robots by name, for configurations and policy files."""

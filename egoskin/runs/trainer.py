@@ -1,0 +1,337 @@
+"""Training: rollouts, updates, checkpoints, and how to go on from one.
+
+Contract: a run of 2n rollouts equals n and a resumed n, bit for bit, in everything a
+checkpoint holds and in the metrics but for times; and nothing that is not finite ever
+replaces a checkpoint.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from egoskin.agents.networks import Agent
+from egoskin.agents.ppo import PPO, NonFiniteError
+from egoskin.agents.rollout import collect
+from egoskin.envs.rewards import TERMS
+from egoskin.make import load_env_state, make_env, save_env_state
+from egoskin.parallel import WorkerPool, start_server
+from egoskin.policies.policy import (
+    PolicySpec,
+    agent_tensors,
+    check_agent_tensors,
+    check_finite,
+    check_like,
+    load_agent_tensors,
+    save_policy,
+    sparse_sources,
+)
+from egoskin.runs.run import Run
+from egoskin.runs.survival import SurvivalCurve
+from egoskin.sensors import Skin
+from egoskin.sparse import SparseSource
+from egoskin.storage.serialization import from_plain, to_plain
+from egoskin.storage.tensor_file import part, prefixed, save_tensors
+
+# What the metrics of an episode are made of.
+METRIC_KEYS = (
+    "diverged",
+    "episode_step",
+    "fallen",
+    "first_throw_step",
+    "hit",
+    "reward",
+    "reward_terms",
+    "self_contact",
+    "terminated",
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Progress:
+    """How far a training has come: what a checkpoint holds beside tensors."""
+
+    frames: int
+    """Environment steps learnt from."""
+    wall_s: float
+    """Time that took [s]."""
+    learning_rate: float
+    """Present learning rate."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for numbers that no training comes to."""
+        if self.frames < 0 or not 0 <= self.wall_s < math.inf:
+            raise ValueError(f"frames or wall_s cannot be, in {self}")
+        if not 0 < self.learning_rate < math.inf:
+            raise ValueError(f"learning_rate cannot be, in {self}")
+
+
+class Trainer:
+    """Everything that a checkpoint holds, and how to go on from it.
+
+    Args:
+        run: The run to train, with its configuration.
+        env: What `make_env` returned for it.
+        skin: The run's skin.
+        sources: What computes the keys that the environment does not give.
+    """
+
+    def __init__(
+        self,
+        run: Run,
+        env: WorkerPool,
+        skin: Skin,
+        sources: Mapping[str, SparseSource],
+    ) -> None:
+        self.config, self.run, self.env = run.config, run, env
+        self.device = self.config.learner_device()
+        config = self.config
+        self.spec = PolicySpec.of(config.env, skin, config.ppo.network, env, sources)
+        torch.manual_seed(self.config.seed)
+        self.agent: Agent = self.spec.build_agent(sources).to(self.device)
+        self.ppo = PPO(self.agent, config.ppo, config.num_learner_threads)
+        self.survival = SurvivalCurve(self.config.env.task.episode_steps)
+        self.frames = 0
+        self.wall_s = 0.0
+        self.root: TensorDictBase = TensorDict()
+
+    def start(self) -> None:
+        """Begin a new run: first observations, first policy, first checkpoint."""
+        self.root = self.env.reset()
+        self.keep_policy()
+        self.save()
+
+    def iterate(self) -> dict[str, float]:
+        """Collect a rollout, improve the agent on it; return the metrics.
+
+        Raises:
+            NonFiniteError: If the update is not finite; the text says how to replay it.
+            WorkerError: If a worker ends.
+        """
+        start = time.perf_counter()
+        rollout, self.root, infos = collect(
+            self.env,
+            self.agent,
+            self.root,
+            self.config.ppo.rollout_steps,
+            METRIC_KEYS,
+            self.config.ppo.noise_correlation_at(self.frames),
+        )
+        collected = time.perf_counter()
+        try:
+            learned = self.ppo.update(rollout, self.frames)
+        except NonFiniteError as error:
+            path = self.dump(error)
+            error.args = (f"{error}\nreplay it with: python scripts/replay.py {path}",)
+            raise
+        end = time.perf_counter()
+        self.frames += self.config.frames_per_batch
+        self.wall_s += end - start
+        return {
+            "frames": self.frames,
+            "time/wall_s": self.wall_s,
+            "time/steps_per_s": self.config.frames_per_batch / (end - start),
+            "time/collect_share": (collected - start) / (end - start),
+            **self._episode_metrics(TensorDict.maybe_dense_stack(infos)),
+            **{f"ppo/{name}": value for name, value in learned.items()},
+        }
+
+    def _episode_metrics(self, infos: TensorDictBase) -> dict[str, float]:
+        """What the environment said during a rollout, ``[T, N]``."""
+        self.survival.decay()
+        for info in infos:
+            age = info["episode_step"] - info["first_throw_step"]
+            self.survival.update(age[:, 0], info["terminated"][:, 0])
+        task = self.config.env.task
+        hz = task.physics.control_hz
+        ended = float(infos["terminated"].sum())
+        terms = infos["reward_terms"].mean(0).mean(0).tolist()
+        # A ball that hits may throw the robot over: each end has one cause.
+        hit = infos["hit"]
+        fallen = infos["fallen"] & ~hit
+
+        def share_of_ends(cause: Tensor) -> float:
+            return float(cause.sum()) / ended if ended else float("nan")
+
+        return {
+            "episode/survival_s": self.survival.mean() / hz,
+            "episode/success": self.survival.probability(
+                round(min(task.success_s, task.episode_length_s) * hz)
+            ),
+            "episode/ended_by_ball": share_of_ends(hit),
+            "episode/ended_by_fall": share_of_ends(fallen),
+            "episode/diverged": float(infos["diverged"].sum()),
+            "episode/self_contact": float(infos["self_contact"].float().mean()),
+            "reward/mean": float(infos["reward"].mean()),
+            "reward/negative_share": float((infos["reward"] < 0).float().mean()),
+            **{f"reward/{n}": v for n, v in zip(TERMS, terms, strict=True)},
+        }
+
+    def keep_policy(self) -> None:
+        """Keep the present policy for learning curves."""
+        save_policy(self.run.policy_path(self.frames), self.agent, self._spec_now())
+
+    def save(self) -> None:
+        """Write a checkpoint from which `load` continues bit for bit."""
+        progress = Progress(
+            frames=self.frames,
+            wall_s=self.wall_s,
+            learning_rate=self.ppo.learning_rate,
+        )
+        self.run.save_checkpoint(
+            {**self._learner_tensors(), **self._other_tensors()},
+            {"policy": self._spec_now().header(), **to_plain(progress)},
+        )
+
+    def load(self, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:
+        """Continue from a checkpoint of the run.
+
+        Raises:
+            ValueError: If it is that of another agent or environment, then nothing is
+                loaded; or if it holds numbers with which no policy acts.
+        """
+        what = str(self.run.checkpoint_path)
+        names = [field.name for field in dataclasses.fields(Progress)]
+        known = {name: header[name] for name in names if name in header}
+        progress = from_plain(Progress, known, what)
+        self.root = self.env.reset()
+        own = self._other_tensors()
+        if missing := own.keys() - tensors.keys():
+            raise ValueError(f"{what}: tensor {min(missing)!r} is missing")
+        check_like(own, {name: tensors[name] for name in own}, what)
+        agent = part("agent", tensors)
+        check_agent_tensors(agent_tensors(self.agent), agent, what)
+        self.ppo.load_state(part("optimizer", tensors), progress.learning_rate)
+        load_agent_tensors(self.agent, agent, what)
+        check_finite(self.agent, what)
+        self.root = load_env_state(self.env, part("env", tensors))
+        self.survival.at_risk.copy_(tensors["survival/at_risk"])
+        self.survival.ended.copy_(tensors["survival/ended"])
+        self.frames, self.wall_s = progress.frames, progress.wall_s
+        torch.set_rng_state(tensors["random_state"])
+
+    def dump(self, error: NonFiniteError) -> Path:
+        """Write what `scripts/replay.py` needs to meet an error again; return where."""
+        path = self.run.dump_path(self.frames)
+        ppo = self.config.ppo
+        now = ppo.entropy_coeff_at(self.frames)
+        ppo = dataclasses.replace(ppo, entropy_coeff=now, entropy_frames=None)
+        save_tensors(
+            path,
+            {**self._learner_tensors(), **prefixed("batch", error.batch)},
+            {
+                "policy": self._spec_now().header(),
+                "ppo": to_plain(ppo),
+                "learning_rate": self.ppo.learning_rate,
+                "error": str(error),
+            },
+        )
+        return path
+
+    def _learner_tensors(self) -> dict[str, Tensor]:
+        """Agent and optimiser."""
+        return {
+            **prefixed("agent", agent_tensors(self.agent)),
+            **prefixed("optimizer", self.ppo.state()),
+        }
+
+    def _other_tensors(self) -> dict[str, Tensor]:
+        """What else a checkpoint holds: environment, survival, random state."""
+        return {
+            **prefixed("env", save_env_state(self.env, self.root)),
+            "survival/at_risk": self.survival.at_risk,
+            "survival/ended": self.survival.ended,
+            # Noise and minibatches are drawn on the CPU, whatever the device.
+            "random_state": torch.get_rng_state(),
+        }
+
+    def _spec_now(self) -> PolicySpec:
+        return dataclasses.replace(self.spec, frames=self.frames)
+
+
+@contextmanager
+def open_trainer(run: Run, num_threads: int = 1) -> Iterator[Trainer]:
+    """Yield the trainer of a run, at its start or its checkpoint; close all after.
+
+    PyTorch itself then uses one thread, so that nothing depends on the machine's cores;
+    the learner has threads of its own, see `egoskin.agents.ppo.PPO`.
+
+    Args:
+        run: A new run or one to go on with.
+        num_threads: Physics threads of each worker; results do not depend on it.
+
+    Raises:
+        ValueError: If the run is being trained already, or cannot be gone on with.
+    """
+    config = run.config
+    torch.set_num_threads(1)
+    with run.locked():
+        # What cannot be read is told of before the workers start.
+        skin = run.load_skin()
+        checkpoint = None if run.is_new() else run.load_checkpoint()
+        # It imports while the rest is made.
+        start_server()
+        sources = sparse_sources(config.env, skin)
+        env = make_env(
+            config.env,
+            skin,
+            num_envs=config.num_envs,
+            seed=config.seed,
+            num_workers=config.num_workers,
+            num_threads=num_threads,
+            sparse=bool(sources),
+        )
+        try:
+            trainer = Trainer(run, env, skin, sources)
+            if checkpoint is None:
+                trainer.start()
+            else:
+                trainer.load(*checkpoint)
+            run.write_config()
+            run.record_start()
+            run.start_metrics(trainer.frames)
+            yield trainer
+        finally:
+            run.close()
+            env.close()
+
+
+def train(
+    trainer: Trainer,
+    stop: Callable[[], bool] = lambda: False,
+    show: Callable[[dict[str, float]], None] = lambda metrics: None,
+) -> None:
+    """Iterate to the end or to a stop, with checkpoints, kept policies and metrics.
+
+    Args:
+        trainer: What is trained, to the end that its run plans.
+        stop: Whether to stop after the present rollout.
+        show: What to do with the metrics of each rollout.
+    """
+    config, run = trainer.config, trainer.run
+    saved_at = time.monotonic()
+    while trainer.frames < config.total_frames and not stop():
+        start = time.monotonic()
+        before = trainer.frames
+        metrics = trainer.iterate()
+        run.log(metrics)
+        show(metrics)
+        if before // config.snapshot_frames < trainer.frames // config.snapshot_frames:
+            trainer.keep_policy()
+        now = time.monotonic()
+        # The next rollout must fit in as well.
+        if now - saved_at + 1.5 * (now - start) > config.checkpoint_interval:
+            trainer.save()
+            saved_at = now
+    trainer.save()
+    trainer.keep_policy()

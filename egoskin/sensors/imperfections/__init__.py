@@ -1,0 +1,1 @@
+"""What makes real readings of true distances: noise, rate, latency, drop-out."""

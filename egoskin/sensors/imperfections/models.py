@@ -1,0 +1,389 @@
+"""Imperfections of sensors, one dataclass each, for `Corruption` to put in sequence.
+
+Each holds its own parameters: metres, seconds, Hz, radians, and standard deviations
+where it says ``std``.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from egoskin.rng import halfwords, standard_normal
+from egoskin.sensors.imperfections.corruption import (
+    FrameModel,
+    Moment,
+    Places,
+    PointModel,
+    State,
+    find,
+    put,
+)
+
+# Phases and rates of a sampling clock count in this part of a control step.
+_TICKS = 1 << 16
+
+
+def _hide(distance: Tensor, half: Tensor, probability: Tensor | float) -> Tensor:
+    """Return the distances, infinite with a probability, from a 16-bit number each."""
+    return distance.masked_fill((half + 0.5) * 2.0**-16 < probability, torch.inf)
+
+
+def _check_not_negative(model: object, *names: str) -> None:
+    for name in names:
+        value = getattr(model, name)
+        if not 0 <= value < math.inf:
+            wrong = "infinite" if value == math.inf else "negative"
+            raise ValueError(
+                f"{type(model).__name__}.{name} must not be {wrong}, got {value}"
+            )
+
+
+def _check_probability(model: object, name: str) -> None:
+    if not 0 <= getattr(model, name) <= 1:
+        raise ValueError(
+            f"{type(model).__name__}.{name} must be in [0, 1], "
+            f"got {getattr(model, name)}"
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bias(PointModel):
+    """Calibration error: d becomes d + offset + gain d, with errors of each sensor."""
+
+    offset: float = 0.0
+    """Mean offset over all sensors [m]."""
+    offset_std: float = 0.0
+    """Standard deviation of the offset from sensor to sensor [m]."""
+    gain: float = 0.0
+    """Mean gain error over all sensors [1]."""
+    gain_std: float = 0.0
+    """Standard deviation of the gain error from sensor to sensor [1]."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a negative spread, or what is not finite."""
+        _check_not_negative(self, "offset_std", "gain_std")
+        if not (math.isfinite(self.offset) and math.isfinite(self.gain)):
+            raise ValueError(
+                f"Bias.offset and gain must be finite, got {self.offset} and "
+                f"{self.gain}"
+            )
+
+    def change(self, distance: Tensor, places: Places, moment: Moment) -> Tensor:
+        """Return the distances with the errors of their sensors [m], ``[n]``."""
+
+        def error(mean: float, std: float, purpose: int) -> Tensor | float:
+            if not std:
+                return mean
+            half = places.draw_trait(moment, purpose)
+            return mean + std * standard_normal(half, distance.dtype)
+
+        offset = error(self.offset, self.offset_std, 0)
+        gain = error(self.gain, self.gain_std, 1)
+        return distance + offset + gain * distance
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Spread:
+    """A standard deviation that depends on the distance d.
+
+    The largest of constant, linear x d and quadratic x d squared. A capacitive
+    sensor has d = alpha / C, so that constant noise of C is quadratic in d.
+    """
+
+    constant: float = 0.0
+    """[m]"""
+    linear: float = 0.0
+    """[1]"""
+    quadratic: float = 0.0
+    """[1/m]"""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a negative parameter."""
+        _check_not_negative(self, "constant", "linear", "quadratic")
+
+    def std(self, distance: Tensor) -> Tensor:
+        """Return the standard deviation at some distances [m]."""
+        far = (self.linear * distance).maximum(self.quadratic * distance * distance)
+        return far.clamp(min=self.constant)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Noise(_Spread, PointModel):
+    """Gaussian noise, anew in every reading; see `_Spread` for how it depends on d."""
+
+    per_speed: float = 0.0
+    """Ego noise: relative rise with the speed of the fastest joint [s/rad]."""
+    common: bool = False
+    """Whether all sensors of a robot share one draw (hum, supply)."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a negative parameter."""
+        super().__post_init__()
+        _check_not_negative(self, "per_speed")
+
+    def change(self, distance: Tensor, places: Places, moment: Moment) -> Tensor:
+        """Return the distances with noise [m], ``[n]``."""
+        draw = places.draw_common if self.common else places.draw
+        half = draw(moment)
+        noise = self.std(distance) * standard_normal(half, distance.dtype)
+        if self.per_speed:
+            speed = moment.speed.to(distance.dtype).take(places.row)
+            noise *= 1 + self.per_speed * speed
+        return distance + noise
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drift(_Spread, FrameModel):
+    """A baseline that walks at random from 0, by one step before the first reading.
+
+    The spread after t seconds is sqrt(t) times the one given, which may depend on
+    the distance (`_Spread`). All beams of a sensor share its walk.
+    """
+
+    def start(self, reading: Tensor, moment: Moment) -> State:
+        """Return the walk at its start, ``[B, S]``."""
+        return {"walk": torch.zeros_like(reading[:, :, 0])}
+
+    def apply(
+        self, reading: Tensor, state: State, moment: Moment
+    ) -> tuple[Tensor, State]:
+        """Return the readings with the walk after one more step."""
+        rows, sensors = reading.shape[:2]
+        # A step to either side by the toss of a coin; their sum is Gaussian soon. A
+        # call of the generator gives 128 coins.
+        calls = -(-sensors // 128)
+        half = halfwords(
+            moment.words(
+                torch.arange(rows, device=reading.device).repeat_interleave(calls),
+                torch.arange(calls, device=reading.device).repeat(rows),
+            )
+        ).to(torch.int32)
+        half = half.reshape(rows, -1)[:, : -(-sensors // 16), None]
+        coin = (half >> torch.arange(16, dtype=half.dtype, device=half.device)) & 1
+        coin = coin.reshape(rows, -1)[:, :sensors].to(reading.dtype)
+        walk = state["walk"] + math.sqrt(moment.dt) * (2 * coin - 1)
+        distance, places = find(reading)
+        drift = self.std(distance) * walk.take(
+            places.row * walk.shape[1] + places.sensor
+        )
+        return put(reading, places, distance + drift), {"walk": walk}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dropout(PointModel):
+    """Readings that see nothing, each with a probability of its own moment."""
+
+    probability: float = 0.0
+    """At distance 0 and at rest."""
+    per_metre: float = 0.0
+    """Rise with the distance [1/m]."""
+    per_speed: float = 0.0
+    """Rise with the speed of the fastest joint [s/rad]."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for what is no probability or falls."""
+        _check_probability(self, "probability")
+        _check_not_negative(self, "per_metre", "per_speed")
+
+    def change(self, distance: Tensor, places: Places, moment: Moment) -> Tensor:
+        """Return the distances, infinite where dropped [m], ``[n]``."""
+        chance = self.probability + self.per_metre * distance
+        if self.per_speed:
+            speed = moment.speed.to(distance.dtype).take(places.row)
+            chance += self.per_speed * speed
+            # At a speed of NaN nobody knows: 0 NaN = NaN.
+            distance = distance + 0.0 * speed
+        return _hide(distance, places.draw(moment), chance)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeadSensors(PointModel):
+    """Sensors that never see anything."""
+
+    probability: float
+    """Probability that a sensor is dead."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for what is no probability."""
+        _check_probability(self, "probability")
+
+    def change(self, distance: Tensor, places: Places, moment: Moment) -> Tensor:
+        """Return the distances, infinite where the sensor is dead [m], ``[n]``."""
+        return _hide(distance, places.draw_trait(moment), self.probability)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FalsePositives(FrameModel):
+    """Readings of something where nothing is, at any distance alike."""
+
+    probability: float
+    """Probability that a reading of nothing reads something."""
+    max_range: float
+    """False distances are uniform from 0 to this [m]."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for what is no probability or no range."""
+        _check_probability(self, "probability")
+        if not 0 < self.max_range < math.inf:
+            raise ValueError(
+                f"FalsePositives.max_range must be positive and finite, got "
+                f"{self.max_range}"
+            )
+
+    def apply(
+        self, reading: Tensor, state: State, moment: Moment
+    ) -> tuple[Tensor, State]:
+        """Return the readings with false ones, ``[B, S, K]``."""
+        rows, sensors, beams = reading.shape
+        row, place = self._strikes(rows, sensors * beams, moment)
+        nothing = reading.flatten(1)[row, place] == torch.inf
+        places = Places(row[nothing], place[nothing], beams)
+        half = places.draw(moment, purpose=1).to(reading.dtype)
+        false = (half + 0.5) * (2.0**-16 * self.max_range)
+        return put(reading, places, false), state
+
+    def _strikes(self, rows: int, size: int, moment: Moment) -> tuple[Tensor, ...]:
+        """Return which elements of ``[rows, size]`` a rare event strikes.
+
+        Each is struck with the probability, independently. Drawn are the gaps from
+        one to the next, so that the cost goes with the events, not the readings.
+        """
+        struck = torch.zeros(rows, size, dtype=torch.bool, device=moment.row.device)
+        # P(gap <= g) = 1 - (1 - p)^(g + 1)
+        gaps = torch.arange(1, size + 1, dtype=torch.float64, device=struck.device)
+        chance = 1 - (1 - self.probability) ** gaps
+        row = torch.arange(rows, device=struck.device)
+        last, block = torch.full_like(row, -1), 0
+        while len(row):
+            words = moment.words(row, torch.full_like(row, block)).t().contiguous()
+            gap = torch.searchsorted(chance, words.double() * 2.0**-32, right=True)
+            place = last[:, None] + (gap + 1).cumsum(1)
+            hit = place < size
+            struck[row[:, None].expand_as(place)[hit], place[hit]] = True
+            more = hit[:, -1]
+            row, last, block = row[more], place[more, -1], block + 1
+        return struck.nonzero(as_tuple=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RangeLimits(PointModel):
+    """The nearest and the farthest distance that a sensor can read."""
+
+    minimum: float = 0.0
+    """Minimum range [m]."""
+    maximum: float = math.inf
+    """A reading beyond this is nothing [m]."""
+    below: Literal["nothing", "minimum"] = "minimum"
+    """What is read of something nearer than the minimum."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for limits that leave no range, or an unknown word."""
+        if self.below not in ("nothing", "minimum"):
+            raise ValueError(
+                f"RangeLimits.below must be nothing or minimum, got {self.below!r}"
+            )
+        if not 0 <= self.minimum < self.maximum:
+            raise ValueError(
+                "RangeLimits must have 0 <= minimum < maximum, got "
+                f"{self.minimum} and {self.maximum}"
+            )
+
+    def change(self, distance: Tensor, places: Places, moment: Moment) -> Tensor:
+        """Return the distances within the limits, or infinite [m], ``[n]``."""
+        near = torch.inf if self.below == "nothing" else self.minimum
+        limited = distance.masked_fill(distance < self.minimum, near)
+        return limited.masked_fill(distance > self.maximum, torch.inf)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Quantisation(PointModel):
+    """Readings are whole multiples of a step."""
+
+    step: float
+    """Distance between two neighbouring readings [m]."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a step that is not positive and finite."""
+        if not 0 < self.step < math.inf:
+            raise ValueError(
+                f"Quantisation.step must be positive and finite, got {self.step}"
+            )
+
+    def change(self, distance: Tensor, places: Places, moment: Moment) -> Tensor:
+        """Return the nearest multiples [m], ``[n]``."""
+        return (distance / self.step).round() * self.step
+
+
+@dataclass(frozen=True, kw_only=True)
+class SampleAndHold(FrameModel):
+    """Each sensor measures at a rate, at its own phase, and holds what it measured.
+
+    The first reading of an episode is measured, whatever the phase. Measurements fall
+    on control steps: a rate at or above theirs measures at each.
+    """
+
+    rate_hz: float
+    """Measurements of a sensor in a second [Hz]."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a rate that is not positive and finite."""
+        if not 0 < self.rate_hz < math.inf:
+            raise ValueError(
+                f"SampleAndHold.rate_hz must be positive and finite, got {self.rate_hz}"
+            )
+
+    def start(self, reading: Tensor, moment: Moment) -> State:
+        """Return the held reading ``[B, S, K]`` and the phases ``[B, S]`` [ticks]."""
+        rows, sensors = reading.shape[:2]
+        everywhere = torch.ones(rows, sensors, device=reading.device)
+        all_sensors = Places(*everywhere.nonzero(as_tuple=True), beams=1)
+        phase = all_sensors.draw_trait(moment).reshape(rows, sensors)
+        return {"held": reading, "phase": phase.to(torch.int32)}
+
+    def apply(
+        self, reading: Tensor, state: State, moment: Moment
+    ) -> tuple[Tensor, State]:
+        """Return the new readings where one is due, the held ones elsewhere."""
+        # Whole numbers, so that no measurement is lost to rounding.
+        rate = round(self.rate_hz * moment.dt * _TICKS)
+        ticks = (moment.step * rate % _TICKS).to(torch.int32)
+        due = ((ticks[:, None] + state["phase"]) & (_TICKS - 1)) < rate
+        held = torch.where(due[..., None], reading, state["held"])
+        return held, {"held": held, "phase": state["phase"]}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Latency(FrameModel):
+    """Readings come late, by a whole number of control steps.
+
+    Until the first one arrives, an episode reads its first.
+    """
+
+    seconds: float
+    """Delay [s], rounded to control steps: less than half of one is none."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a negative delay."""
+        _check_not_negative(self, "seconds")
+
+    def start(self, reading: Tensor, moment: Moment) -> State:
+        """Return the readings on their way, oldest first, ``[B, steps, S, K]``."""
+        steps = round(self.seconds / moment.dt)
+        if not steps:
+            return {}
+        return {"queue": reading[:, None].repeat(1, steps, 1, 1)}
+
+    def apply(
+        self, reading: Tensor, state: State, moment: Moment
+    ) -> tuple[Tensor, State]:
+        """Return the oldest reading on its way, and those behind it."""
+        if not state:
+            return reading, state
+        queue = state["queue"]
+        later = torch.cat((queue[:, 1:], reading[:, None]), 1)
+        return queue[:, 0], {"queue": later}

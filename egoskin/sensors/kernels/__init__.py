@@ -1,0 +1,1 @@
+"""The sensors' C++ kernels: their source, how it is compiled and called."""

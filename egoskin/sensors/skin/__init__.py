@@ -1,0 +1,1 @@
+"""Where sensors sit: skins, placing them, importing and exporting them."""

@@ -1,0 +1,259 @@
+"""GenTact's tables: the CSV of every version and the 3-D print export."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from egoskin.sensors.skin.gentact.source import (
+    NO_RADIUS,
+    Export,
+    Links,
+    Problems,
+    Sensor,
+    SensorError,
+    number,
+    read_radius,
+)
+from egoskin.sensors.skin.skin import Skin
+
+_HEADER = "Index,X,Y,Z,NormX,NormY,NormZ,Radius,Parent,Object Name in Blender"
+_HEADERS = (
+    _HEADER,
+    "Index,X,Y,Z,NormX,NormY,NormZ,Radius,Parent",
+    "Index,X,Y,Z,Radius,Parent",
+    "SensorNum,RelX,RelY,RelZ,Radius,path",
+    "Sensor Name,X Offset,Y Offset,Z Offset,Radius,Parent Path",
+    "Index,X,Y,Z,Stem X,Stem Y,Stem Z,Radius,Parent",
+)
+_PLACE = ("x", "y", "z")
+_NORMAL = tuple(f"norm{axis}" for axis in _PLACE)
+_STEM = tuple(f"stem{axis}" for axis in _PLACE)
+# What the columns are called, without case, spaces and the like. A sensor's own name
+# is a number ("index") or any text ("name").
+_COLUMNS = {
+    "index": "index sensor num number id sensornum sensornumber sensorindex sensorid",
+    "name": "name sensorname",
+    **{a: f"{a} rel{a} {a}offset offset{a} pos{a} position{a} {a}pos" for a in _PLACE},
+    **{f"norm{a}": f"norm{a} {a}norm normal{a} {a}normal n{a}" for a in _PLACE},
+    **{f"stem{a}": f"stem{a} {a}stem" for a in _PLACE},
+    "radius": "radius radii sensorradius",
+    "parent": "parent parents path parentpath parentlink link linkname",
+    "object": "object objectname objectnameinblender",
+}
+_COLUMN_OF = {word: name for name, words in _COLUMNS.items() for word in words.split()}
+_UNITS = {
+    **dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 1.0),
+    **dict.fromkeys(("cm", "centimetres", "centimeters"), 1e-2),
+    **dict.fromkeys(("mm", "millimetres", "millimeters"), 1e-3),
+}
+_HEADING = re.compile(r"(?P<name>[^()\[\]]*)([(\[](?P<unit>[^()\[\]]*)[)\]])?")
+_DECIMAL_COMMA = re.compile(r"^([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)$")
+
+
+def save_gentact(skin: Skin, path: Path | str) -> tuple[str, ...]:
+    """Write the skin as GenTact's current CSV; return what that cannot hold.
+
+    Args:
+        skin: The skin. An unknown radius is written as GenTact's 0.1 m.
+        path: File to write.
+
+    Returns:
+        Names of the fields of the skin that are lost, of ``coverage``, ``range`` and
+        ``roll_deg``.
+
+    Raises:
+        ValueError: If a link's name holds a slash, which divides GenTact's paths.
+    """
+    slashed = [name for name in (*skin.links, skin.robot) if "/" in name]
+    if slashed:
+        raise ValueError(f"{slashed[0]!r} holds '/', which divides GenTact's paths")
+    with open(path, "w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(_HEADER.split(","))
+        radius = np.where(np.isnan(skin.radius), NO_RADIUS, skin.radius)
+        for i, link in enumerate(skin.links):
+            numbers = (*skin.position[i], *skin.normal[i], radius[i])
+            # repr, the shortest text that reads as the same number
+            row = [repr(float(v)) for v in numbers]
+            writer.writerow([i, *row, f"/{skin.robot}/{link}/visuals", "visuals"])
+    lost = {
+        "coverage": any(c is not None for c in skin.coverage),
+        "range": bool((~np.isnan(skin.range)).any()),
+        "roll_deg": bool(skin.roll_deg.any()),
+    }
+    return tuple(name for name, is_lost in lost.items() if is_lost)
+
+
+def _rows(text: str, path: Path) -> Iterator[tuple[str, list[str]]]:
+    """Rows that are neither blank nor comments (#), as (where, stripped cells).
+
+    A spreadsheet may have put semicolons or tabs between the cells, and then decimal
+    commas into them.
+    """
+    lines = (line for line in text.splitlines() if line.strip())
+    header = next((line for line in lines if not line.lstrip().startswith("#")), "")
+    delimiter = max(",;\t", key=header.count)
+    reader = csv.reader(
+        io.StringIO(text, newline=""), delimiter=delimiter, skipinitialspace=True
+    )
+    while True:
+        where = f"{path}:{reader.line_num + 1}"
+        try:
+            row = next(reader, None)
+        except csv.Error as error:
+            raise ValueError(f"{where}: {error}") from None
+        if row is None:
+            return
+        # A quote that is never closed would swallow the rows that follow.
+        if any("\n" in cell or "\r" in cell for cell in row):
+            raise ValueError(f"{where}: a quoted value must end on its line")
+        cells = [cell.strip() for cell in row]
+        if delimiter != ",":
+            cells = [_DECIMAL_COMMA.sub(r"\1.\2", cell) for cell in cells]
+        if any(cells) and not cells[0].startswith("#"):
+            yield where, cells
+
+
+def read_table(text: str, path: Path, names: Links, problems: Problems) -> Export:
+    """Sensors of a table of any dialect."""
+    rows = list(_rows(text, path))
+    if not rows:
+        raise ValueError(f"{path}: the file is empty")
+    where, header = rows.pop(0)
+    while header and not header[-1]:
+        header.pop()
+    columns, units = _read_header(header, where)
+    # The 3-D print export has, besides sensors, clips and the names of objects.
+    kinds = Counter(_kind(cells) for _, cells in rows)
+    plain = ["index", *_PLACE, "radius", "parent"]
+    is_print = columns[0] == "index" and (
+        _STEM[0] in columns or (columns == plain and bool(kinds.keys() - {"sensors"}))
+    )
+    if is_print:
+        rows = [(w, cells) for w, cells in rows if _kind(cells) == "sensors"]
+    if not rows:
+        raise ValueError(f"{path}: there is no sensor in it")
+    # Without the column, one link holds for all.
+    link = None if "parent" in columns else names.default(where)
+    sensors = []
+    for where, cells in rows:
+        with problems.collect():
+            record = _record(cells, columns, where, is_print)
+            sensors.append(_read_sensor(record, names, link, where))
+    # Before it had stems the print export came in one unit or another.
+    unit = 1.0 if not is_print else 1e-3 if _STEM[0] in columns else None
+    told = units.get("x")
+    radius_unit = units.get("radius")
+    # Since it writes headings, its positions have a unit of their own.
+    if radius_unit is None and is_print and (unit is not None or kinds["headings"]):
+        radius_unit = 1.0
+    return Export(
+        dialect=",".join(header),
+        sensors=sensors,
+        unit=unit if told is None else told,
+        unit_is_told=told is not None,
+        radius_unit=radius_unit,
+        skipped={k: n for k, n in kinds.items() if k != "sensors"} if is_print else {},
+    )
+
+
+def _read_header(
+    header: Sequence[str], where: str
+) -> tuple[list[str], dict[str, float]]:
+    """Names of the columns, and metres of the units that stand in brackets.
+
+    Raises:
+        ValueError: If a column is unknown, there twice or missing.
+    """
+    columns, units = [], {}
+    for cell in header:
+        heading = _HEADING.fullmatch(cell)
+        word = re.sub(r"[\s_.-]+", "", heading["name"] if heading else cell).casefold()
+        column = _COLUMN_OF.get(word)
+        if heading is None or column is None:
+            raise ValueError(
+                f"{where}: unknown header {','.join(header)!r}; GenTact's are "
+                + "; ".join(map(repr, _HEADERS))
+                + f"; rename or take out the column {cell!r}"
+            )
+        if column in columns:
+            raise ValueError(
+                f"{where}: {header[columns.index(column)]!r} and {cell!r} are both the "
+                f"sensor's {column}; take one out"
+            )
+        if heading["unit"] is not None and column in (*_PLACE, *_STEM, "radius"):
+            unit = _UNITS.get(heading["unit"].strip().casefold())
+            if unit is None:
+                raise ValueError(
+                    f"{where}: the unit of {cell!r} must be one of m, cm, mm"
+                )
+            units[column] = unit
+        columns.append(column)
+    if not {"parent", "radius", *_NORMAL} & set(columns):
+        raise ValueError(
+            f"{where}: these are vertices of a mesh, not sensors; export the sensors"
+        )
+    wanted = [_PLACE, *(v for v in (_NORMAL, _STEM) if set(v) & set(columns))]
+    for vector in wanted:
+        missing = [name for name in vector if name not in columns]
+        if missing:
+            raise ValueError(f"{where}: there is no column {', '.join(missing)}")
+    if len({units.get(axis) for axis in _PLACE}) > 1:
+        raise ValueError(f"{where}: x, y and z must have one unit")
+    return columns, units
+
+
+def _read_sensor(
+    record: Mapping[str, str], names: Links, link: str | None, where: str
+) -> Sensor:
+    """The sensor of a row; ``link`` is the one of all rows, None if each names it."""
+    if "index" in record:
+        number(record["index"], where, "index")
+    if link is None and record["parent"]:
+        link = names.of_path(record["parent"], where)
+    return Sensor(
+        where=where,
+        name=record.get("index", record.get("name", where)),
+        link=link or names.default(where),
+        position=_vector(record, _PLACE, where),
+        normal=_vector(record, _NORMAL, where) if _NORMAL[0] in record else None,
+        radius=read_radius(record.get("radius", ""), where),
+    )
+
+
+def _kind(cells: Sequence[str]) -> str:
+    """What a row describes: a sensor, or in the print export a clip or an object."""
+    if cells[0] == "CLIP":
+        return "clips"
+    # An object's name stands alone.
+    return "sensors" if any(cells[1:]) or cells[0].isdigit() else "headings"
+
+
+def _record(
+    cells: list[str], columns: Sequence[str], where: str, is_print: bool
+) -> dict[str, str]:
+    """A row by its columns; the print export leaves cells at the end out."""
+    while len(cells) > len(columns) and not cells[-1]:
+        cells = cells[:-1]
+    if is_print:
+        cells = cells + [""] * (len(columns) - len(cells))
+    if len(cells) != len(columns):
+        raise SensorError(
+            f"{where}: expected {len(columns)} values ({', '.join(columns)}), got "
+            f"{len(cells)}"
+        )
+    return dict(zip(columns, cells, strict=True))
+
+
+def _vector(
+    record: Mapping[str, str], columns: Sequence[str], where: str
+) -> np.ndarray:
+    """Three numbers of a row."""
+    return np.array([number(record[c], where, c) for c in columns])

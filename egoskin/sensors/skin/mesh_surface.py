@@ -1,0 +1,282 @@
+"""The outer surface of a robot's meshes, for skins that sit where the real covers are.
+
+Meshes are `trimesh.Trimesh` objects in the frames of their links [m], by link: load,
+scale and pose them with trimesh, or use `meshes_in_folder` and `meshes_of_mjcf`.
+Meshes of real parts are full of inner faces, so a point counts as outer only if it sees
+enough of the world around the robot, in the default pose.
+
+trimesh and embreex are optional dependencies: ``pip install 'egoskin[design]'``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+
+from egoskin.robots.chains import body_name
+from egoskin.robots.config import RobotConfig
+from egoskin.robots.surface import (
+    Patch,
+    Surface,
+    default_frames,
+    outside_primitives,
+    primitive_patch,
+)
+from egoskin.storage.files import check_regular
+
+if TYPE_CHECKING:
+    from trimesh import Trimesh
+
+Meshes = Mapping[str, Sequence["Trimesh"]]
+"""Meshes by link, in the frames of the links [m]."""
+
+# Largest file of a mesh [bytes].
+_LARGEST = 2**30
+# Rays over the hemisphere of each point, and the share of them that must escape: 0.15
+# rejects the floor of a round pit deeper than 1.2 diameters.
+_NUM_RAYS = 48
+_MIN_OPENNESS = 0.15
+# Rays start this far off the face that they leave [m].
+_CLEARANCE = 1e-4
+# Points whose rays are cast at once.
+_CHUNK = 4096
+
+
+def _trimesh() -> ModuleType:
+    """Return the module trimesh, which casts rays with embreex.
+
+    Raises:
+        ImportError: If one of the two is not installed; the text says how to.
+    """
+    try:
+        # Without it trimesh casts rays in Python, for hours and in all the memory.
+        import embreex  # noqa: F401
+        import trimesh
+    except ImportError as error:
+        raise ImportError(
+            "meshes need trimesh and embreex: pip install 'egoskin[design]'"
+        ) from error
+    return trimesh
+
+
+def meshes_in_folder(folder: Path, links: Sequence[str]) -> dict[str, list[Trimesh]]:
+    """Return the meshes of a folder whose files are named after links.
+
+    Args:
+        folder: Folder of files such as ``torso_link.STL``, each in the frame of its
+            link, in metres; files named otherwise are left alone.
+        links: Names of the links, usually ``RobotConfig.links``.
+
+    Returns:
+        Meshes by link; links without a file are missing.
+
+    Raises:
+        FileNotFoundError: If there is no such folder, or no file is named after a link.
+        ValueError: If two files are named after one link, or one cannot be read.
+    """
+    trimesh = _trimesh()
+    formats = {f".{name}" for name in trimesh.available_formats()}
+    meshes: dict[str, list[Trimesh]] = {}
+    for path in sorted(Path(folder).iterdir()):
+        if path.stem in links and path.suffix.lower() in formats:
+            if path.stem in meshes:
+                raise ValueError(
+                    f"{folder} holds two meshes of {path.stem}: "
+                    f"{meshes[path.stem][0].metadata['name']} and {path.name}"
+                )
+            check_regular(path, _LARGEST)
+            try:
+                mesh = trimesh.load_mesh(path)
+            except Exception as error:  # of any kind, for a damaged file
+                raise ValueError(
+                    f"{path} is no mesh that trimesh can read: {error}"
+                ) from error
+            if len(mesh.faces) == 0:
+                raise ValueError(f"{path} holds no triangles")
+            mesh.metadata["name"] = path.name
+            meshes[path.stem] = [mesh]
+    if not meshes:
+        raise FileNotFoundError(
+            f"no mesh in {folder} is named after a link, such as {links[0]}.STL"
+        )
+    return meshes
+
+
+def meshes_of_mjcf(path: Path, group: int | None = None) -> dict[str, list[Trimesh]]:
+    """Return the meshes that a MuJoCo model shows, by body.
+
+    Args:
+        path: MJCF file.
+        group: Take only geoms of this group (visual ones have their own by custom);
+            None takes all. What is there twice is taken once.
+
+    Returns:
+        Meshes in the frames of the bodies [m], scaled and posed as the model says.
+
+    Raises:
+        ValueError: If MuJoCo cannot load the file, or no geom is a mesh.
+    """
+    trimesh = _trimesh()
+    check_regular(path)
+    try:
+        model = mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        text = " ".join(str(error).split())
+        raise ValueError(f"{path} is no MuJoCo model: {text}") from error
+    meshes: dict[str, list[Trimesh]] = {}
+    seen = set()
+    for geom in np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH):
+        asset, body = model.geom_dataid[geom], model.geom_bodyid[geom]
+        position, quat = model.geom_pos[geom], model.geom_quat[geom]
+        placed = (asset, body, *position, *quat)
+        if placed in seen or group not in (None, model.geom_group[geom]):
+            continue
+        seen.add(placed)
+        vertex, face = model.mesh_vertadr[asset], model.mesh_faceadr[asset]
+        turn = np.empty(9)
+        mujoco.mju_quat2Mat(turn, quat)
+        local = model.mesh_vert[vertex : vertex + model.mesh_vertnum[asset]]
+        mesh = trimesh.Trimesh(
+            local @ turn.reshape(3, 3).T + position,
+            model.mesh_face[face : face + model.mesh_facenum[asset]],
+            metadata={"name": _asset_name(model, asset)},
+        )
+        meshes.setdefault(body_name(model, body), []).append(mesh)
+    if not meshes:
+        where = "" if group is None else f" in group {group}"
+        raise ValueError(f"{path} has no mesh geoms{where}")
+    return meshes
+
+
+def _asset_name(model: mujoco.MjModel, mesh: int) -> str:
+    """File name of a mesh asset; its own name if it comes from no file."""
+    start = model.mesh_pathadr[mesh]
+    if start < 0:
+        return model.mesh(mesh).name
+    return Path(model.paths[start:].split(b"\0")[0].decode()).name
+
+
+def triangle_patch(link: str, triangles: np.ndarray) -> Patch:
+    """Return the surface of triangles on a link.
+
+    Args:
+        link: Name of the link.
+        triangles: Corners in the frame of the link [m], ``[F, 3, 3]``; normals follow
+            the right-hand rule.
+
+    Raises:
+        ValueError: If the triangles have no area.
+    """
+    origin, along, across = (
+        triangles[:, 0],
+        triangles[:, 1] - triangles[:, 0],
+        triangles[:, 2] - triangles[:, 0],
+    )
+    cross = np.cross(along, across)
+    double_area = np.linalg.norm(cross, axis=-1)
+    if not double_area.any():
+        raise ValueError(f"the meshes of {link} have no area")
+
+    def sample(n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        face = rng.choice(len(triangles), n, p=double_area / double_area.sum())
+        # A point of the parallelogram beyond the diagonal is mirrored at its centre.
+        u, v = rng.random((2, n, 1))
+        u, v = np.where(u + v > 1, (1 - u, 1 - v), (u, v))
+        points = origin[face] + u * along[face] + v * across[face]
+        return points, cross[face] / double_area[face, None]
+
+    return Patch(link=link, area=float(double_area.sum() / 2), sample=sample)
+
+
+def openness(mesh: Trimesh, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Return how much of the world around a mesh is seen from points on it.
+
+    Args:
+        mesh: What blocks the view.
+        points: Points in the frame of the mesh [m], ``[n, 3]``.
+        normals: Unit normals there, ``[n, 3]``.
+
+    Returns:
+        Share of the cosine-weighted rays over the hemisphere of the normal that meet
+        no face, 0 to 1, ``[n]``.
+    """
+    _trimesh()
+    # Even spread over the unit sphere along a golden-angle spiral.
+    k = np.arange(_NUM_RAYS) + 0.5
+    z, angle = 1.0 - 2.0 * k / _NUM_RAYS, k * math.pi * (3.0 - math.sqrt(5.0))
+    ring = np.sqrt(1.0 - z**2)
+    sphere = np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=-1)
+    share = np.empty(len(points))
+    for first in range(0, len(points), _CHUNK):
+        chunk = slice(first, first + _CHUNK)
+        # Lambert: normal + uniform unit vector points along a cosine-weighted ray.
+        rays = normals[chunk, None] + sphere
+        start = (points[chunk] + _CLEARANCE * normals[chunk])[:, None]
+        start = np.broadcast_to(start, rays.shape)
+        hit = mesh.ray.intersects_any(start.reshape(-1, 3), rays.reshape(-1, 3))
+        share[chunk] = 1.0 - hit.reshape(-1, _NUM_RAYS).mean(-1)
+    return share
+
+
+def mesh_surface(robot: RobotConfig, links: Sequence[str], meshes: Meshes) -> Surface:
+    """Return the outer surface of the meshes of some links, in the default pose.
+
+    A link without meshes keeps its primitives. A point of any shape is outer if it is
+    inside none of those, and at least 15 % of the cosine-weighted rays over the
+    hemisphere of its normal meet no mesh of the robot. The normal is that of the side
+    that sees more, however the face is wound.
+
+    Args:
+        robot: The robot.
+        links: Names of the links to sample.
+        meshes: Meshes of the robot; those of other links hide what they cover.
+
+    Raises:
+        ValueError: If a mesh's link or a link is not the robot's, the links carry no
+            shape, or a link without meshes has a collision shape that is no primitive.
+    """
+    for link, on_link in meshes.items():
+        if not on_link:
+            raise ValueError(f"meshes: none for {link!r}: leave it out")
+        if link not in robot.links:
+            raise ValueError(
+                f"{robot.name} has no link {link!r} to carry a mesh; its links are "
+                f"{', '.join(robot.links)}"
+            )
+    frames = {
+        link: (turn, shift)
+        for link, shift, turn in zip(robot.links, *default_frames(robot), strict=True)
+    }
+    corners = {
+        link: np.concatenate([np.asarray(m.vertices)[m.faces] for m in on_link])
+        for link, on_link in meshes.items()
+    }
+    base = np.concatenate(
+        [c @ frames[k][0].T + frames[k][1] for k, c in corners.items()]
+    )
+    faces = np.arange(base.size // 3).reshape(-1, 3)
+    whole = _trimesh().Trimesh(base.reshape(-1, 3), faces, process=False)
+    rest = robot.primitives_on([link for link in robot.links if link not in meshes])
+    outside = outside_primitives(robot, rest)
+
+    def sees(points: np.ndarray, normals: np.ndarray, stand_off: float) -> np.ndarray:
+        share = openness(whole, points, normals)
+        if stand_off:
+            at = points + stand_off * normals
+            share = np.minimum(share, openness(whole, at, normals))
+        return share * outside(points, normals, stand_off)
+
+    def side(points: np.ndarray, normals: np.ndarray, stand_off: float) -> np.ndarray:
+        front = sees(points, normals, stand_off)
+        back = sees(points, -normals, stand_off)
+        outer = np.maximum(front, back) >= _MIN_OPENNESS
+        return outer * np.where(front >= back, 1.0, -1.0)
+
+    patches = [triangle_patch(link, triangles) for link, triangles in corners.items()]
+    return Surface(robot, links, patches + [primitive_patch(s) for s in rest], side)

@@ -1,0 +1,364 @@
+"""Placing sensors on a robot: a skin from a method, a seed and a few wishes.
+
+Contract: a sensor sits on the outer surface of the robot in its default pose, its
+normal pointing out, and the same arguments give the same skin.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+import glob
+import heapq
+import math
+from collections.abc import Mapping, Sequence
+from typing import Literal
+
+import numpy as np
+
+from egoskin.robots.config import RobotConfig, resolve
+from egoskin.robots.surface import primitive_surface
+from egoskin.sensors.skin.mesh_surface import Meshes, mesh_surface
+from egoskin.sensors.skin.skin import FARTHEST, Skin
+
+# Candidates for each sensor that sample elimination chooses (Yuksel 2015, section 4).
+_CANDIDATES = 5
+# Darts thrown at each square of the spacing. A full cover has 0.70 sensors in each, and
+# then less than 1 % of the surface is farther than the spacing from a sensor.
+_DARTS_PER_SQUARE = 40
+# As many as fit are found among this many darts at most: some minutes on meshes. More
+# are thrown only for a number of sensors, so many at once.
+_MAX_DARTS = 2_000_000
+# Of more the candidates alone would fill the memory.
+_MAX_SENSORS = _MAX_DARTS // _CANDIDATES
+# Points that measure the outer area and the rejected shares.
+_AREA_POINTS = 4000
+
+
+# Points whose neighbours are looked up at once, and cells along an axis at most.
+_CHUNK = 4096
+_MOST_CELLS = 1_000_000
+
+
+class _Cells:
+    """Points sorted into cubes, to find those near a point.
+
+    Args:
+        points: Points [m], ``[n, 3]``.
+        edge: Edge of a cube [m]; all that is nearer than this is found.
+    """
+
+    def __init__(self, points: np.ndarray, edge: float) -> None:
+        edge = max(edge, float(np.ptp(points, axis=0).max()) / _MOST_CELLS)
+        cell = ((points - points.min(axis=0)) // edge).astype(np.int64) + 1
+        across = cell.max(axis=0) + 2
+        # Cubes that follow each other along z have numbers that do.
+        key = (cell[:, 0] * across[1] + cell[:, 1]) * across[2] + cell[:, 2]
+        self._order = np.argsort(key, kind="stable")
+        self._key, self._sorted = key, key[self._order]
+        x, y = np.meshgrid([-1, 0, 1], [-1, 0, 1], indexing="ij")
+        self._rows = ((x * across[1] + y) * across[2]).ravel()
+
+    def near(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return (which of some points, point in or beside its cube) for all pairs.
+
+        Args:
+            index: Indices of points, ``[m]``.
+
+        Returns:
+            Positions in ``index``, ascending, and indices of points, ``[pairs]`` each.
+        """
+        # Three cubes in a row along z, in each of nine rows.
+        middle = self._key[index][:, None] + self._rows
+        low = np.searchsorted(self._sorted, middle.ravel() - 1, "left")
+        number = np.searchsorted(self._sorted, middle.ravel() + 1, "right") - low
+        # Ranges low, low + 1, ... of so many numbers, one after the other.
+        before = np.cumsum(number) - number
+        place = np.arange(number.sum()) + np.repeat(low - before, number)
+        which = np.repeat(np.repeat(np.arange(len(index)), 9), number)
+        return which, self._order[place]
+
+
+def throw_darts(points: np.ndarray, radius: np.ndarray, most: int) -> np.ndarray:
+    """Return a subset of points whose discs are disjoint, as large as the order allows.
+
+    Each point in turn is taken unless its disc meets that of one taken before.
+
+    Args:
+        points: Points in random order [m], ``[n, 3]``.
+        radius: Radius of the disc around each, half of its spacing [m], ``[n]``.
+        most: Stop at this many.
+
+    Returns:
+        Indices of the points taken, in order.
+    """
+    cells = _Cells(points, 2 * radius.max())
+    free = np.ones(len(points), dtype=bool)
+    taken: list[int] = []
+    for i in range(len(points)):
+        if len(taken) == most:
+            break
+        if not free[i]:
+            continue
+        taken.append(i)
+        _, near = cells.near(np.array([i]))
+        distance = np.linalg.norm(points[near] - points[i], axis=-1)
+        free[near] &= distance >= radius[near] + radius[i]
+    return np.array(taken)
+
+
+def eliminate(
+    points: np.ndarray, scale: np.ndarray, count: int, area: float
+) -> np.ndarray:
+    """Return a well-spread subset of points: the most crowded ones go, one by one.
+
+    Args:
+        points: Points in random order [m], ``[n, 3]``.
+        scale: Spacing wanted around each point, relative to the others, ``[n]``.
+        count: How many to leave, at most n.
+        area: Area that the points cover, each part over its squared scale [m^2].
+
+    Returns:
+        Indices of the points left, ascending, ``[count]``.
+
+    Source: Yuksel, "Sample Elimination for Generating Poisson Disk Sample Sets",
+        Computer Graphics Forum 34(2), 2015.
+    """
+    # Largest spacing of count discs in the plane: r_max^2 = A / (2 sqrt(3) N).
+    widest = 2 * math.sqrt(area / (2 * math.sqrt(3) * count))
+    # r_min = r_max (1 - (N / M)^gamma) beta with gamma = 1.5 and beta = 0.65.
+    closest = widest * (1 - (count / len(points)) ** 1.5) * 0.65
+
+    total = np.zeros(len(points))
+    cells = _Cells(points, widest * scale.max())
+    neighbours: list[np.ndarray] = []
+    crowding: list[np.ndarray] = []
+    for first in range(0, len(points), _CHUNK):
+        index = np.arange(first, min(first + _CHUNK, len(points)))
+        which, near = cells.near(index)
+        point = index[which]
+        distance = np.linalg.norm(points[near] - points[point], axis=-1)
+        distance = distance * 2 / (scale[near] + scale[point])
+        close = distance < widest
+        which, near, distance = which[close], near[close], distance[close]
+        # w_ij = (1 - d_ij / (2 r_max))^alpha with alpha = 8.
+        weight = (1 - distance.clip(closest, widest) / widest) ** 8
+        # One after the other: sums in another order round otherwise.
+        np.add.at(total, near, weight)
+        ends = np.searchsorted(which, np.arange(1, len(index)))
+        neighbours += np.split(near.astype(np.int32), ends)
+        crowding += np.split(weight, ends)
+
+    # Mutual neighbours tie: rounding, which differs by machine, must not decide.
+    heap = [(-value, i) for i, value in enumerate(total.round(12).tolist())]
+    heapq.heapify(heap)
+    for _ in range(len(points) - count):
+        # Totals only fall, so that one that is out of date stands too far in front.
+        while -heap[0][0] > (value := float(total[heap[0][1]].round(12))):
+            heapq.heapreplace(heap, (-value, heap[0][1]))
+        _, worst = heapq.heappop(heap)
+        total[neighbours[worst]] -= crowding[worst]
+        total[worst] = -np.inf
+    return np.flatnonzero(total > -np.inf)
+
+
+def _link_weights(
+    links: Sequence[str], density: Mapping[str, float]
+) -> dict[str, float]:
+    """Return the weight of each link from weights by shell pattern, 1 if none matches.
+
+    Raises:
+        ValueError: If a weight is negative or not finite, a pattern matches no link, or
+            a link matches several.
+    """
+    for pattern, weight in density.items():
+        if not 0 <= weight < math.inf:
+            raise ValueError(
+                f"density: the weight of {pattern!r} must be finite and not negative, "
+                f"got {weight}"
+            )
+    plain = {
+        glob.escape(link): 1.0
+        for link in links
+        if not any(fnmatch.fnmatchcase(link, pattern) for pattern in density)
+    }
+    weights = resolve({**density, **plain}, tuple(links), "density")
+    return dict(zip(links, weights, strict=True))
+
+
+def _num_darts(area: float, spacing: float, num_sensors: int | None) -> int:
+    """Return how many darts fill an area [m^2], or find the sensors asked for.
+
+    Raises:
+        ValueError: If they are too many.
+    """
+    darts = math.ceil(_DARTS_PER_SQUARE * area / spacing**2)
+    if num_sensors is not None:
+        # Where this is fewer, the sensors take little more than half of what fits.
+        return min(darts, 100 * num_sensors)
+    if darts > _MAX_DARTS:
+        finest = math.sqrt(_DARTS_PER_SQUARE * area / _MAX_DARTS)
+        raise ValueError(
+            f"a spacing of {spacing:g} m lets in too many sensors to find them all: "
+            f"take at least {finest:.2g} m on these links, or give num_sensors"
+        )
+    return darts
+
+
+def _check(
+    num_sensors: int | None,
+    seed: int,
+    method: str,
+    spacing: float | None,
+    stand_off: float,
+) -> None:
+    """Raise ValueError for arguments that are out of range or contradict each other."""
+    if method not in ("area_uniform", "poisson_disk"):
+        raise ValueError(
+            f"method must be 'area_uniform' or 'poisson_disk', got {method!r}"
+        )
+    if spacing is not None and (method != "poisson_disk" or not 0 < spacing < math.inf):
+        raise ValueError(
+            "spacing must be positive and goes with method='poisson_disk', got "
+            f"{spacing} with {method!r}"
+        )
+    if num_sensors is None and spacing is None:
+        raise ValueError("num_sensors=None needs a spacing to decide the number")
+    if num_sensors is not None and num_sensors < 1:
+        raise ValueError(f"the number of sensors must be positive, got {num_sensors}")
+    if num_sensors is not None and num_sensors > _MAX_SENSORS:
+        raise ValueError(
+            f"the number of sensors must be at most {_MAX_SENSORS:,}, got {num_sensors}"
+        )
+    if seed < 0:
+        raise ValueError(f"the seed of a placement must not be negative, got {seed}")
+    if not 0 <= stand_off < math.inf:
+        raise ValueError(f"stand_off must be finite and not negative, got {stand_off}")
+
+
+def _check_metres(
+    robot: RobotConfig, link: np.ndarray, position: np.ndarray, meshes: Meshes
+) -> None:
+    """Raise ValueError if a sensor would lie where none is on a robot."""
+    away = np.linalg.norm(position, axis=-1)
+    if away.max() > FARTHEST:
+        name = robot.links[link[away.argmax()]]
+        hint = f": are the meshes of {name} in metres?" if name in meshes else ""
+        raise ValueError(
+            f"a sensor would lie {away.max():.3g} m from the origin of {name}, farther "
+            f"than any on a robot ({FARTHEST:g} m){hint}"
+        )
+
+
+def place_sensors(
+    robot: RobotConfig,
+    num_sensors: int | None = 64,
+    seed: int = 0,
+    *,
+    method: Literal["area_uniform", "poisson_disk"] = "area_uniform",
+    links: Sequence[str] | None = None,
+    density: Mapping[str, float] | None = None,
+    spacing: float | None = None,
+    stand_off: float = 0.0,
+    meshes: Meshes | None = None,
+) -> Skin:
+    """Return a skin of sensors placed on the outer surface of a robot.
+
+    ``area_uniform`` places every sensor at random, whatever the others. With
+    ``poisson_disk`` they keep apart: by ``spacing``, or without one as far as so many
+    go (sample elimination). Distances are straight lines in the default pose.
+
+    Args:
+        robot: The robot.
+        num_sensors: Number of sensors ``S``; None takes as many as the spacing lets in.
+        seed: Seed of the placement.
+        method: How sensors are spread.
+        links: Links to cover; the robot's ``skin_links`` (upper body) by default.
+        density: Sensors per area, relative to the other links, by link or shell pattern
+            (``*_wrist_*``); 1 for links not named, 0 leaves a link bare.
+        spacing: Least distance between sensors [m] (``poisson_disk``). A link of
+            density w has spacing / sqrt(w); between two links, their mean holds.
+        stand_off: Distance of the sensors from the surface along the normal [m].
+        meshes: Meshes to place on instead of the robot's primitives, by link
+            (`mesh_surface`); links without any keep their primitives.
+
+    Returns:
+        Sensors with z along the outward normal. Their provenance holds the arguments
+        and the share of each link's samples rejected for lying inside the robot.
+
+    Raises:
+        ValueError: If an argument is out of its range, a link or pattern is not the
+            robot's, the links show no surface, a link without meshes has a collision
+            shape that is no primitive, or the sensors do not fit.
+    """
+    _check(num_sensors, seed, method, spacing, stand_off)
+    covered = tuple(robot.skin_links if links is None else links)
+    if not covered:
+        raise ValueError("place_sensors needs at least one link to cover")
+    weights = _link_weights(covered, density or {})
+    if meshes is None:
+        surface = primitive_surface(robot, covered)
+    else:
+        surface = mesh_surface(robot, covered, meshes)
+
+    measured = surface.sample(_AREA_POINTS, seed, weights, stand_off)
+    # Where spacing goes as 1 / sqrt(w), an area counts w-fold.
+    area = sum(weights[link] * size for link, size in measured.area.items())
+    if spacing is not None:
+        number = _num_darts(area, spacing, num_sensors)
+        wanted = number if num_sensors is None else num_sensors
+    else:
+        assert num_sensors is not None
+        number = num_sensors * (_CANDIDATES if method == "poisson_disk" else 1)
+        wanted = num_sensors
+
+    link, position, normal = np.empty(0, int), np.empty((0, 3)), np.empty((0, 3))
+    for first in range(0, number, _MAX_DARTS):
+        if first and len(link) == wanted:
+            break
+        points = surface.sample(
+            min(_MAX_DARTS, number - first),
+            # Another stream for each lot, whatever the seed.
+            seed + (first << 64),
+            weights,
+            stand_off,
+        )
+        # Six decimals are what the file holds: a saved skin is the same skin.
+        at = (points.position + stand_off * points.normal).round(6)
+        _check_metres(robot, points.link, at, meshes or {})
+        link = np.concatenate((link, points.link))
+        position = np.concatenate((position, at))
+        normal = np.concatenate((normal, points.normal.round(6)))
+        if method == "poisson_disk":
+            places = surface.points_b(link, position)
+            scale = np.array([weights[robot.links[i]] for i in link]) ** -0.5
+            if spacing is None:
+                chosen = eliminate(places, scale, wanted, area)
+            else:
+                # What was taken before comes first, and is taken again.
+                chosen = throw_darts(places, scale * spacing / 2, wanted)
+            link, position, normal = link[chosen], position[chosen], normal[chosen]
+    if num_sensors is not None and len(link) < num_sensors:
+        raise ValueError(
+            f"only {len(link)} sensors fit at a spacing of {spacing:g} m, not "
+            f"{num_sensors}: lower the spacing or num_sensors, or cover more links"
+        )
+    return Skin(
+        robot=robot.name,
+        links=tuple(robot.links[i] for i in link),
+        position=position,
+        normal=normal,
+        provenance={
+            "method": method,
+            "num_sensors": num_sensors,
+            "seed": seed,
+            "links": list(covered),
+            "density": dict(density or {}),
+            "spacing": spacing,
+            "stand_off": stand_off,
+            "rejected": {k: round(share, 4) for k, share in measured.rejected.items()},
+            "meshes": {
+                link: [mesh.metadata.get("name", "unnamed") for mesh in on_link]
+                for link, on_link in (meshes or {}).items()
+            },
+        },
+    )

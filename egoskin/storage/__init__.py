@@ -1,0 +1,1 @@
+"""Files: configurations, tensors, their formats, and reading what others have made."""

@@ -1,0 +1,122 @@
+"""Configurations as plain values, and JSON files of them."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any, TypeVar
+
+import dacite
+
+from egoskin.storage.files import read_regular
+
+T = TypeVar("T")
+
+
+def read_json(path: Path) -> Any:
+    """Return the content of a JSON file.
+
+    Raises:
+        ValueError: If it is none; the text names it.
+        OSError: If it cannot be read.
+    """
+    content = read_regular(path)
+    try:
+        return json.loads(content)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is not JSON: {error}") from error
+
+
+def to_plain(value: Any) -> Any:
+    """Return a configuration as JSON values: dicts, lists, strings, numbers, None.
+
+    Infinite numbers become "inf", which JSON lacks.
+    """
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = dataclasses.fields(value)
+        return {f.name: to_plain(getattr(value, f.name)) for f in fields}
+    if isinstance(value, (tuple, list)):
+        return [to_plain(item) for item in value]
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, float) and math.isinf(value):
+        return str(value)
+    return value
+
+
+def check_numbers(
+    content: Any, may_be_infinite: Collection[str] = (), name: str = ""
+) -> None:
+    """Raise ValueError if a configuration holds a number that is not finite.
+
+    Args:
+        content: A dataclass, or what is in one.
+        may_be_infinite: Dotted names of fields that may be infinite, but not NaN.
+        name: Dotted name of the content, for the error text.
+    """
+    if dataclasses.is_dataclass(content):
+        for field in dataclasses.fields(content):
+            inner = f"{name}.{field.name}".lstrip(".")
+            check_numbers(getattr(content, field.name), may_be_infinite, inner)
+    elif isinstance(content, (tuple, list)):
+        for value in content:
+            check_numbers(value, may_be_infinite, name)
+    elif isinstance(content, float) and not math.isfinite(content):
+        if name in may_be_infinite and not math.isnan(content):
+            return
+        raise ValueError(f"{name} must be a finite number, got {content}")
+
+
+def from_plain(kind: type[T], content: Any, what: str) -> T:
+    """Return a configuration from the values that `to_plain` gave.
+
+    Args:
+        kind: Dataclass to build.
+        content: Plain values.
+        what: Where they came from, for the error text.
+
+    Raises:
+        ValueError: If a field is unknown or of the wrong type; the text names it.
+    """
+    if not isinstance(content, dict):
+        raise ValueError(f"{what}: expected an object, got {type(content).__name__}")
+    hooks = {float: _float, Path: _path}
+    config = dacite.Config(type_hooks=hooks, strict=True)
+    try:
+        return dacite.from_dict(kind, _with_tuples(content), config)
+    # The last is what a configuration itself refuses.
+    except (dacite.DaciteError, ValueError) as error:
+        raise ValueError(f"{what}: {error}") from error
+
+
+def _with_tuples(content: Any) -> Any:
+    """Return plain values with tuples for lists, as configurations have them."""
+    if isinstance(content, dict):
+        return {key: _with_tuples(value) for key, value in content.items()}
+    if isinstance(content, list):
+        return tuple(map(_with_tuples, content))
+    return content
+
+
+def _float(value: Any) -> Any:
+    """Return a number as float, "inf" too; anything else is left to be refused."""
+    whole = isinstance(value, int) and not isinstance(value, bool)
+    return float(value) if whole or value in ("inf", "-inf") else value
+
+
+def _path(value: Any) -> Any:
+    """Return a text as path; anything else is left to be refused."""
+    return Path(value) if isinstance(value, str) else value
+
+
+def changed_fields(old: Any, new: Any, prefix: str = "") -> list[str]:
+    """Return the dotted names of the fields in which two plain values differ."""
+    if not (isinstance(old, dict) and isinstance(new, dict)):
+        return [] if old == new else [prefix.rstrip(".")]
+    names = []
+    for key in sorted(old.keys() | new.keys()):
+        names += changed_fields(old.get(key), new.get(key), f"{prefix}{key}.")
+    return names

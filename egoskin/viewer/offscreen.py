@@ -1,0 +1,615 @@
+"""Pictures of an episode: the robot, its sensors, the balls, and what is detected.
+
+Headless: on Linux the OpenGL context is EGL's unless ``MUJOCO_GL`` asks for another, so
+neither a display nor an environment variable is needed, whatever was imported first.
+
+Contract: the picture is drawn from the keys of the environment alone (``base_pose``,
+``joint_pos``, ``object_pose``, ``object_active``, ``distance``, ``balls_avoided``),
+never from live simulation; a stored tensordict with these keys can be drawn as well.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import nn
+
+from egoskin.evaluation.throw_set import play_bank
+from egoskin.make import EnvConfig
+from egoskin.robots.config import RobotConfig
+from egoskin.sensors import Ray, Skin
+from egoskin.shapes import Shape
+from egoskin.viewer.film import Frame
+
+# Colours (r, g, b, a). A line has the colour of the kind of sensor that detects: blue
+# for fields; yellow, (1, 0.8, 0.1), is kept for rays.
+_IDLE_RGBA = (0.16, 0.2, 0.3, 1.0)
+_LIT_RGBA = (0.1, 0.95, 1.0, 1.0)
+_FIELD_LINE_RGB = (0.1, 0.35, 1.0)
+_RAY_LINE_RGB = (1.0, 0.8, 0.0)
+_BALL_RGBA = (0.95, 0.35, 0.08, 1.0)
+# Drawn radii [m]: a sensor at rest, one that detects, a line.
+_IDLE_RADIUS, _LIT_RADIUS, _LINE_RADIUS = 0.017, 0.03, 0.006
+# Lines fade with their length, from opaque at 0 to the faintest at this [m].
+_FADE_LENGTH, _FAINTEST = 2.5, 0.25
+# The camera's point of attention follows the base with this time constant [s] and
+# stays at this height [m].
+_FOLLOW_TIME, _LOOK_HEIGHT = 0.4, 1.0
+
+
+class RenderingError(ValueError):
+    """No OpenGL context can be made; the text says how to get one."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraConfig:
+    """Where the camera is, relative to the robot that it follows."""
+
+    distance: float = 3.4
+    """Distance to the robot [m]."""
+    azimuth_deg: float = 30.0
+    """Bearing of the camera, from the robot's heading at the start [deg]."""
+    elevation_deg: float = 10.0
+    """Angle by which the camera looks down [deg]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recording:
+    """The states of one episode, from its start to the step that ends it."""
+
+    row: int
+    """Row of the episode in its bank."""
+    states: list[TensorDictBase]
+    """State after each control step, the start first, raw keys kept."""
+    ending: str | None
+    """Why the episode ended ("hit", "fall", "time limit", ...)."""
+
+
+def record_episodes(
+    config: EnvConfig,
+    skin: Skin,
+    policy: nn.Module | TensorDictModuleBase | None,
+    *,
+    bank_seed: int = 0,
+    first: int = 0,
+    episodes: int = 1,
+    hold: bool = False,
+    on_step: Callable[[int, int], None] | None = None,
+) -> list[Recording]:
+    """Return recordings of some episodes of a bank of throws.
+
+    The starts and the throws are those of the bank's rows. (The motion is too, but for
+    rounding: a network's result depends on the batch size in its last bits.)
+
+    Args:
+        config: What the environment is made of.
+        skin: The sensors.
+        policy: Writes ``action``; None for action 0, the default pose as position
+            target.
+        bank_seed: Seed of the bank.
+        first: Row of the first episode.
+        episodes: Number of episodes.
+        hold: Whether the robot is held rigid in its default pose.
+        on_step: Called with (steps done, episodes still running).
+    """
+    states: list[list[TensorDictBase]] = [[] for _ in range(episodes)]
+
+    def watch(
+        before: TensorDictBase, after: TensorDictBase, running: torch.Tensor
+    ) -> None:
+        for i in running.nonzero()[:, 0].tolist():
+            if not states[i]:
+                states[i].append(before[i].clone())
+            states[i].append(after[i].clone())
+
+    play_bank(
+        policy,
+        config,
+        skin,
+        bank_seed=bank_seed,
+        first=first,
+        episodes=episodes,
+        hold=hold,
+        on_step=on_step,
+        watch=watch,
+    )
+    return [
+        Recording(row=first + i, states=seen, ending=_ending(seen[-1]))
+        for i, seen in enumerate(states)
+    ]
+
+
+def painter_of(
+    config: EnvConfig,
+    skin: Skin,
+    *,
+    size: tuple[int, int] = (960, 540),
+    camera: CameraConfig | None = None,
+) -> Painter:
+    """Return what draws the states of an environment, to be used in a ``with``.
+
+    Args:
+        config: What the environment is made of.
+        skin: The sensors.
+        size: Width and height of the pictures [px].
+        camera: Where the camera is.
+
+    Raises:
+        RenderingError: If no OpenGL context can be made.
+        ValueError: If the size is odd or below 16.
+    """
+    sensor = config.sensor
+    return Painter(
+        config.robot_config,
+        sensor.filled(skin) if sensor.uses_skin else None,
+        config.task.throws.balls,
+        size=size,
+        camera=camera,
+    )
+
+
+def render_recording(
+    painter: Painter,
+    config: EnvConfig,
+    skin: Skin,
+    recording: Recording,
+    *,
+    max_seconds: float | None = None,
+    fps: float = 30.0,
+    on_picture: Callable[[int, int], None] | None = None,
+) -> list[Frame]:
+    """Return the pictures of one episode.
+
+    Args:
+        painter: What `painter_of` returned.
+        config: What the environment was made of.
+        skin: The sensors.
+        recording: The episode.
+        max_seconds: Stop at this age at the latest [s]; None for the whole episode.
+        fps: Pictures for each second of simulated time, at most the control rate.
+        on_picture: Called with (pictures done, pictures in all).
+
+    Returns:
+        Frames in order of time: the start, then ``fps`` for each second, and always the
+        step that ends the episode.
+
+    Raises:
+        ValueError: If a number is out of range.
+    """
+    hz = config.task.physics.control_hz
+    check_film(hz, fps, max_seconds)
+    last = len(recording.states) - 1
+    steps = last if max_seconds is None else min(round(max_seconds * hz), last)
+    ending = recording.ending if steps == last else "cut"
+    due = [0]
+    for step in range(1, steps + 1):
+        if int(step * fps / hz) > int((step - 1) * fps / hz) or step == steps:
+            due.append(step)
+    frames = []
+    for step in due:
+        state = recording.states[step]
+        frame = painter.draw(
+            state,
+            config.sensor.detecting(skin, state),
+            time=step / hz,
+            num_avoided=int(state["balls_avoided"].sum()),
+            ending=ending if step == steps else None,
+        )
+        frames.append(frame)
+        if on_picture is not None:
+            on_picture(len(frames), len(due))
+    return frames
+
+
+def check_film(hz: float, fps: float, max_seconds: float | None) -> None:
+    """Raise ValueError for a film that cannot be made.
+
+    Args:
+        hz: Control rate [Hz].
+        fps: Pictures for each second.
+        max_seconds: Longest age shown [s]; None for all.
+    """
+    if not 0 < fps <= hz:
+        raise ValueError(f"fps must be in (0, {hz:g}], the control rate, got {fps:g}")
+    if max_seconds is not None and not max_seconds * hz >= 1:
+        raise ValueError(
+            f"max_seconds must be at least one control step, {1 / hz:.3g} s, "
+            f"got {max_seconds:g}"
+        )
+
+
+def _ending(state: TensorDictBase) -> str | None:
+    """Why the episode of a row is over; None if it is not."""
+    if state["truncated"].item():
+        return "time limit"
+    names = {"hit": "hit", "fallen": "fall", "diverged": "diverged"}
+    reasons = [name for key, name in names.items() if state[key].item()]
+    if not reasons and state["terminated"].item():
+        return "self-contact"
+    return " + ".join(reasons) or None
+
+
+class Painter:
+    """Draws states of one robot with its sensors and balls.
+
+    A context manager: it holds an OpenGL context.
+
+    Args:
+        robot: The robot.
+        skin: Sensors to draw; None for none.
+        objects: Shape of each object, ``O`` of them.
+        size: Width and height of the pictures [px].
+        camera: Where the camera is.
+
+    Raises:
+        RenderingError: If no OpenGL context can be made.
+        ValueError: If the size is odd or below 16.
+    """
+
+    def __init__(
+        self,
+        robot: RobotConfig,
+        skin: Skin | None,
+        objects: Sequence[Shape],
+        *,
+        size: tuple[int, int] = (960, 540),
+        camera: CameraConfig | None = None,
+    ) -> None:
+        if min(size) < 16 or size[0] % 2 or size[1] % 2:
+            # H.264 stores colour for blocks of 2 x 2 pixels; the text needs some room.
+            raise ValueError(f"size must be two even numbers from 16 on, got {size}")
+        self._skin, self._objects = skin, tuple(objects)
+        self._model = _build_model(robot, objects, size)
+        self._data = mujoco.MjData(self._model)
+        self._camera_config = camera or CameraConfig()
+        self._camera = mujoco.MjvCamera()
+        self._last_time: float | None = None
+        model = self._model
+        self._link_of_sensor = [
+            model.body(name).id for name in (skin.links if skin else ())
+        ]
+        self._object_geoms = [model.geom(f"object_{i}").id for i in range(len(objects))]
+        self._robot_geoms = [
+            geom
+            for geom in range(model.ngeom)
+            if model.body_rootid[model.geom_bodyid[geom]] == model.body(robot.base).id
+        ]
+        most = model.ngeom + 2 * len(self._link_of_sensor) + 100
+        self._canvas = _Canvas(model, size, most)
+
+    def __enter__(self) -> Painter:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._canvas.close()
+
+    def draw(
+        self,
+        state: TensorDictBase,
+        detecting: np.ndarray | None = None,
+        *,
+        time: float,
+        num_avoided: int = 0,
+        ending: str | None = None,
+    ) -> Frame:
+        """Return the picture of a state.
+
+        Args:
+            state: One row with ``base_pose [7]``, ``joint_pos [J]``,
+                ``object_pose [O, 7]`` and ``object_active [O]``.
+            detecting: Whether each sensor detects something, ``[S]`` bool.
+            time: Age of the episode [s]; the camera follows the base with time and
+                starts anew when time goes back.
+            num_avoided: Balls avoided so far, for the frame.
+            ending: Why the episode ends here, for the frame.
+        """
+        active = np.asarray(state["object_active"])
+        self._follow(np.asarray(state["base_pose"], float), time)
+        self._place(state, active)
+        self._canvas.update(self._data, self._camera)
+        if self._skin is None:
+            detecting = np.zeros(0, dtype=bool)
+        else:
+            if detecting is None:
+                detecting = np.zeros(len(self._skin), dtype=bool)
+            pose = np.asarray(state["object_pose"], float)
+            self._draw_sensors(detecting, pose[active], active)
+        return Frame(
+            image=self.image(),
+            time=time,
+            gap=self._gap(active),
+            num_detecting=int(detecting.sum()),
+            num_sensors=len(detecting),
+            num_avoided=num_avoided,
+            ending=ending,
+        )
+
+    def draw_line(
+        self, start: np.ndarray, end: np.ndarray, radius: float, rgba: Sequence[float]
+    ) -> None:
+        """Add a line to the state drawn last; it lasts until the next.
+
+        Args:
+            start: One end in the world [m], ``[3]``.
+            end: The other.
+            radius: Radius of the line [m].
+            rgba: Its colour and opacity.
+        """
+        self._canvas.add_line(start, end, radius, rgba)
+
+    def image(self) -> np.ndarray:
+        """Return the picture of the state drawn last, ``[H, W, 3]`` uint8."""
+        return self._canvas.read()
+
+    def _place(self, state: TensorDictBase, active: np.ndarray) -> None:
+        """Put the robot and the balls of the visual model where the state says."""
+        self._data.qpos[:] = np.concatenate((state["base_pose"], state["joint_pos"]))
+        pose = np.asarray(state["object_pose"], float)
+        lamp = np.array([*self._camera.lookat[:2], 0.0])
+        half = math.radians(self._camera.azimuth) / 2
+        turn = np.array([math.cos(half), 0.0, 0.0, math.sin(half)])
+        self._data.mocap_pos[:] = [*pose[:, :3], lamp]
+        self._data.mocap_quat[:] = [*pose[:, 3:], turn]
+        # What is transparent is not drawn.
+        self._model.geom_rgba[self._object_geoms, 3] = active
+        mujoco.mj_kinematics(self._model, self._data)
+        mujoco.mj_comPos(self._model, self._data)
+        mujoco.mj_camlight(self._model, self._data)
+
+    def _follow(self, base_pose: np.ndarray, time: float) -> None:
+        """Move the camera's point of attention towards the base."""
+        camera, config = self._camera, self._camera_config
+        goal = np.array([*base_pose[:2], _LOOK_HEIGHT])
+        if self._last_time is None or time < self._last_time:
+            w, _, _, z = base_pose[3:]
+            # An upright base: its heading is twice the angle of (w, z).
+            heading = math.degrees(2 * math.atan2(z, w))
+            camera.lookat[:] = goal
+            camera.distance = config.distance
+            # MuJoCo's azimuth is the direction in which the camera looks.
+            camera.azimuth = heading + config.azimuth_deg + 180.0
+            camera.elevation = -config.elevation_deg
+        else:
+            weight = 1 - math.exp((self._last_time - time) / _FOLLOW_TIME)
+            camera.lookat[:] += weight * (goal - camera.lookat)
+        self._last_time = time
+
+    def _draw_sensors(
+        self, detecting: np.ndarray, active_pose: np.ndarray, active: np.ndarray
+    ) -> None:
+        """Add the sensors, and a line from each that detects to the nearest ball."""
+        assert self._skin is not None
+        rotation = self._data.xmat[self._link_of_sensor].reshape(-1, 3, 3)
+        offset = (rotation @ self._skin.position[:, :, None])[..., 0]
+        points = self._data.xpos[self._link_of_sensor] + offset
+        for point, is_lit in zip(points, detecting, strict=True):
+            radius = _LIT_RADIUS if is_lit else _IDLE_RADIUS
+            rgba = _LIT_RGBA if is_lit else _IDLE_RGBA
+            self._canvas.add_sphere(point, radius, rgba, glows=bool(is_lit))
+        if not (detecting.any() and active.any()):
+            return
+        points = points[detecting]
+        shapes = [s for s, on in zip(self._objects, active, strict=True) if on]
+        found = zip(shapes, active_pose, strict=True)
+        ends = np.stack([closest_point(shape, pose, points) for shape, pose in found])
+        length = np.linalg.norm(ends - points, axis=-1)
+        nearest = length.argmin(0)
+        kinds = np.array([isinstance(own, Ray) for own in self._skin.coverage])
+        colours = [_RAY_LINE_RGB if k else _FIELD_LINE_RGB for k in kinds[detecting]]
+        for i, point in enumerate(points):
+            fade = max(1 - length[nearest[i], i] / _FADE_LENGTH, _FAINTEST)
+            self._canvas.add_line(
+                point, ends[nearest[i], i], _LINE_RADIUS, (*colours[i], fade)
+            )
+
+    def _gap(self, active: np.ndarray) -> float:
+        """Smallest distance between robot and balls in play [m], inf if none is."""
+        far = 100.0
+        gaps = [
+            mujoco.mj_geomDistance(self._model, self._data, ours, ball, far, None)
+            for ball, is_active in zip(self._object_geoms, active, strict=True)
+            if is_active
+            for ours in self._robot_geoms
+        ]
+        return min(gaps, default=math.inf)
+
+
+def closest_point(shape: Shape, pose: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return the closest points of an object's surface.
+
+    Args:
+        shape: The object's shape.
+        pose: Its pose in the world, position [m] and quaternion, ``[7]``.
+        points: Query points in the world [m], ``[n, 3]``.
+
+    Returns:
+        Points in the world [m], ``[n, 3]``; the query itself where it is inside.
+    """
+    rotation = np.zeros(9)
+    mujoco.mju_quat2Mat(rotation, pose[3:])
+    rotation = rotation.reshape(3, 3)
+    local = torch.from_numpy((points - pose[:3]) @ rotation)
+    closest = torch.stack(shape.closest_point(*local.unbind(-1)), -1).numpy()
+    return closest @ rotation.T + pose[:3]
+
+
+def _build_model(
+    robot: RobotConfig, objects: Sequence[Shape], size: tuple[int, int]
+) -> mujoco.MjModel:
+    """The robot in a studio: tiled floor, sky, light, balls that go where put."""
+    spec = robot.spec()
+    world = spec.worldbody
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = size
+    spec.visual.headlight.ambient = [0.38, 0.38, 0.4]
+    spec.visual.headlight.diffuse = [0.35, 0.35, 0.35]
+    spec.visual.headlight.specular = [0.05, 0.05, 0.05]
+    spec.visual.quality.shadowsize = 4096
+    spec.visual.rgba.haze = [0.86, 0.88, 0.91, 1]
+    # Extent scales near plane, fog and shadow of the scene [m].
+    spec.stat.extent, spec.stat.center = 3.0, [0, 0, 1]
+    spec.visual.map.znear, spec.visual.map.zfar = 0.02, 12.0
+    spec.visual.map.shadowclip = 3.0
+    spec.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=[0.72, 0.77, 0.84],
+        rgb2=[0.86, 0.88, 0.91],
+        width=256,
+        height=1536,
+    )
+    spec.add_texture(
+        name="tiles",
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        rgb1=[0.60, 0.62, 0.65],
+        rgb2=[0.68, 0.70, 0.73],
+        mark=mujoco.mjtMark.mjMARK_EDGE,
+        markrgb=[0.78, 0.79, 0.81],
+        width=512,
+        height=512,
+    )
+    # The texture of 2 x 2 tiles is 2 m wide: tiles of 1 m.
+    tiles = spec.add_material(name="tiles", texuniform=True, texrepeat=[1, 1])
+    tiles.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "tiles"
+    world.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.05], material="tiles"
+    )
+    for i, shape in enumerate(objects):
+        body = world.add_body(name=f"ball_{i}", mocap=True)
+        shape.add_geom(body, name=f"object_{i}", rgba=_BALL_RGBA)
+    # The light moves with the camera: its shadow map covers what is near the robot.
+    world.add_body(name="lamp", mocap=True).add_light(
+        pos=[-1.6, 1.2, 4.0],
+        dir=[0.4, -0.3, -1.0],
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        castshadow=True,
+        diffuse=[0.55, 0.55, 0.53],
+        specular=[0.2, 0.2, 0.2],
+    )
+    return spec.compile()
+
+
+class _Canvas:
+    """An off-screen picture of a MuJoCo model to which shapes can be added.
+
+    `mujoco.Renderer` is bound to the backend that ``MUJOCO_GL`` named when mujoco was
+    first imported; this one is not.
+    """
+
+    def __init__(
+        self, model: mujoco.MjModel, size: tuple[int, int], max_geoms: int
+    ) -> None:
+        self._model, self._size = model, size
+        self._gl = _gl_context(size)
+        self._scene = mujoco.MjvScene(model, max_geoms)
+        self._option, self._perturb = mujoco.MjvOption(), mujoco.MjvPerturb()
+        self._rect = mujoco.MjrRect(0, 0, *size)
+        scale = mujoco.mjtFontScale.mjFONTSCALE_100
+        try:
+            self._context = mujoco.MjrContext(model, scale.value)
+        except mujoco.FatalError as error:
+            self._gl.free()
+            raise ValueError(f"no picture of {size} pixels here: {error}") from error
+        offscreen = mujoco.mjtFramebuffer.mjFB_OFFSCREEN
+        mujoco.mjr_setBuffer(offscreen.value, self._context)
+
+    def close(self) -> None:
+        """Give the OpenGL context back."""
+        self._gl.make_current()
+        self._context.free()
+        self._gl.free()
+
+    def update(self, data: mujoco.MjData, camera: mujoco.MjvCamera) -> None:
+        """Set the scene from simulation data; shapes added before are gone."""
+        mujoco.mjv_updateScene(
+            self._model,
+            data,
+            self._option,
+            self._perturb,
+            camera,
+            mujoco.mjtCatBit.mjCAT_ALL.value,
+            self._scene,
+        )
+
+    def add_sphere(
+        self,
+        position: np.ndarray,
+        radius: float,
+        rgba: Sequence[float],
+        *,
+        glows: bool,
+    ) -> None:
+        """Add a sphere (metres, world)."""
+        geom = self._next_geom(mujoco.mjtGeom.mjGEOM_SPHERE, rgba, glows=glows)
+        geom.size[:] = radius
+        geom.pos[:] = position
+
+    def add_line(
+        self, start: np.ndarray, end: np.ndarray, radius: float, rgba: Sequence[float]
+    ) -> None:
+        """Add a thin capsule between two points (metres, world)."""
+        kind = mujoco.mjtGeom.mjGEOM_CAPSULE
+        geom = self._next_geom(kind, rgba, glows=True)
+        mujoco.mjv_connector(geom, kind, radius, start, end)
+
+    def _next_geom(
+        self, kind: mujoco.mjtGeom, rgba: Sequence[float], *, glows: bool
+    ) -> mujoco.MjvGeom:
+        scene = self._scene
+        assert scene.ngeom < scene.maxgeom
+        geom = scene.geoms[scene.ngeom]
+        colour = np.array(rgba, np.float32)
+        zero, identity = np.zeros(3), np.eye(3).ravel()
+        mujoco.mjv_initGeom(geom, kind, zero, zero, identity, colour)
+        geom.category = mujoco.mjtCatBit.mjCAT_DECOR
+        geom.emission = float(glows)
+        scene.ngeom += 1
+        return geom
+
+    def read(self) -> np.ndarray:
+        """Return the picture, ``[height, width, 3]`` uint8."""
+        self._gl.make_current()
+        width, height = self._size
+        image = np.empty((height, width, 3), np.uint8)
+        mujoco.mjr_render(self._rect, self._scene, self._context)
+        mujoco.mjr_readPixels(image, None, self._rect, self._context)
+        # OpenGL's first row is the lowest.
+        return image[::-1].copy()
+
+
+def _gl_context(size: tuple[int, int]) -> Any:
+    """A current OpenGL context; raises RenderingError if there is none to be had."""
+    backend = os.environ.get("MUJOCO_GL", "")
+    try:
+        if sys.platform == "linux" and not backend:
+            backend = "egl"
+            # Importing it fails where the system's library is missing.
+            from mujoco.egl import GLContext
+        else:
+            from mujoco import GLContext
+        context = GLContext(*size)
+        context.make_current()
+    # PyOpenGL reports a missing library as an attribute that None does not have.
+    except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
+        raise RenderingError(no_gl_text(backend)) from error
+    return context
+
+
+def no_gl_text(backend: str) -> str:
+    """Return what to tell a user for whom an OpenGL backend does not work."""
+    return (
+        f"cannot render: no OpenGL context from {backend or 'the default backend'!r}; "
+        "install one (Debian: `apt-get install libegl1`, or `apt-get install "
+        "libosmesa6` and set MUJOCO_GL=osmesa)"
+    )

@@ -1,0 +1,142 @@
+"""Versions of the standard throw: frozen, told apart, and version 2 is the default."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import replace
+from typing import get_args
+
+import pytest
+
+from egoskin.envs.dodgeball import DodgeballConfig
+from egoskin.envs.physics.mujoco import PhysicsConfig
+from egoskin.envs.rewards import RewardConfig
+from egoskin.envs.standards import (
+    CUSTOM,
+    Standard,
+    evaluation_task,
+    standard_of,
+    training_task,
+)
+from egoskin.envs.throws import ThrowConfig
+from egoskin.make import EnvConfig
+
+# Every value, once more: a standard never changes. A better throw is a new version.
+SHARED = {
+    "radius": 0.15,
+    "mass": 0.4,
+    "num_balls": 2,
+    "interval": (1.0, 2.0),
+    "height": (2.0, 3.0),
+    "distance": (4.0, 6.0),
+    "speed": (4.0, 8.0),
+    "speed_is": "horizontal",
+    "azimuth_deg": (-180.0, 180.0),
+    "box_half_width": 0.45,
+    "box_height": (0.3, 1.8),
+    "lead": 1.0,
+    "flight": "straight",
+    "on_ground": "inactive",
+}
+THROWS = {
+    "2": {**SHARED, "aim": "skin", "first_delay": (0.0, 2.0)},
+    "1": {**SHARED, "aim": "body", "first_delay": (0.0, 0.0)},
+    "paper": {**SHARED, "aim": "skin", "first_delay": (0.0, 0.0)},
+}
+ENDS = {
+    "start_joint_noise": 0.05,
+    "episode_length_s": 10.0,
+    "success_s": 3.0,
+    "self_contact_ends": False,
+}
+VERSIONS = list(THROWS)
+
+
+def test_these_are_all_versions():
+    assert set(get_args(Standard)) == set(VERSIONS)
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_a_version_never_changes(version):
+    task = training_task(version, DodgeballConfig())
+    assert dataclasses.asdict(task.throws) == THROWS[version]
+    assert {name: getattr(task, name) for name in ENDS} == ENDS
+    assert standard_of(task) == version
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_it_is_judged_with_the_first_ball_at_the_start(version):
+    task = evaluation_task(version, DodgeballConfig())
+    expected = {**THROWS[version], "first_delay": (0.0, 0.0)}
+    assert dataclasses.asdict(task.throws) == expected
+    assert {name: getattr(task, name) for name in ENDS} == ENDS
+
+
+def test_the_defaults_are_version_2():
+    assert DodgeballConfig() == training_task("2", DodgeballConfig())
+    assert EnvConfig().standard == "2"
+
+
+def test_a_version_leaves_the_rest_of_a_task_alone():
+    # How the robot is driven and rewarded belongs to no standard.
+    own = DodgeballConfig(
+        physics=PhysicsConfig(substeps=8),
+        reward=RewardConfig(energy=-1.0),
+        action_scale=0.5,
+        clip_targets=True,
+        # What it replaces.
+        throws=ThrowConfig(speed=(1.0, 2.0)),
+        success_s=1.0,
+    )
+    for make in (training_task, evaluation_task):
+        task = make("1", own)
+        for name in ("physics", "reward", "action_scale", "clip_targets"):
+            assert getattr(task, name) == getattr(own, name), name
+        assert task.throws.speed == (4.0, 8.0)
+    assert standard_of(training_task("1", own)) == "1"
+
+
+OTHER_THROWS = {
+    "radius": 0.14,
+    "mass": 0.5,
+    "num_balls": 3,
+    "first_delay": (0.0, 1.0),
+    "interval": (1.0, 1.9),
+    "height": (2.0, 2.9),
+    "distance": (4.0, 5.9),
+    "speed": (4.0, 8.1),
+    "azimuth_deg": (-180.0, 179.0),
+    "lead": 0.9,
+    "flight": "ballistic",
+    "on_ground": "bounce",
+    "aim": "box",
+}
+# They have no effect without another option.
+BOX = {"box_half_width": 0.4, "box_height": (0.3, 1.7)}
+OTHER_ENDS = {
+    "start_joint_noise": 0.04,
+    "episode_length_s": 9.0,
+    "success_s": 2.0,
+    "self_contact_ends": True,
+}
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+@pytest.mark.parametrize("name", OTHER_THROWS)
+def test_another_throw_is_custom(version, name):
+    task = training_task(version, DodgeballConfig())
+    throws = replace(task.throws, **{name: OTHER_THROWS[name]})
+    assert standard_of(replace(task, throws=throws)) == CUSTOM == "custom"
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+@pytest.mark.parametrize("name", OTHER_ENDS)
+def test_another_start_or_end_is_custom(version, name):
+    task = training_task(version, DodgeballConfig())
+    assert standard_of(replace(task, **{name: OTHER_ENDS[name]})) == "custom"
+
+
+def test_no_field_of_the_throws_is_forgotten_here():
+    fields = {field.name for field in dataclasses.fields(ThrowConfig)}
+    assert fields == SHARED.keys() | {"aim", "first_delay"}
+    assert fields - BOX.keys() - {"speed_is"} == OTHER_THROWS.keys()

@@ -1,0 +1,305 @@
+"""Evaluation: figures by hand, the same bank for all, intervals."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from egoskin.envs.dodgeball import DodgeballConfig
+from egoskin.envs.standards import training_task
+from egoskin.envs.throws import ThrowConfig, Thrower
+from egoskin.evaluation.throw_set import (
+    Episodes,
+    mean_estimate,
+    play_bank,
+    standard_task,
+    summarize,
+    throw_seed,
+    wilson,
+)
+from egoskin.make import EnvConfig
+from egoskin.sensors import Skin
+from egoskin.sensors.config import SensorConfig
+from throwing import TASK
+
+
+def test_wilson_interval_by_hand():
+    # n = 100, p = 0.1, z = 1.96: centre 0.1148, half-width 0.0596 (a table's values).
+    estimate = wilson(10, 100)
+    assert estimate.mean == 0.1
+    assert estimate.low == pytest.approx(0.0552, abs=1e-4)
+    assert estimate.high == pytest.approx(0.1744, abs=1e-4)
+    assert wilson(0, 50).low == 0.0
+    assert wilson(50, 50).high == 1.0
+
+
+def test_mean_interval_by_hand():
+    # Values 1, 2, 3: mean 2, deviation 1, half-width 1.96 / sqrt(3).
+    estimate = mean_estimate(torch.tensor([1.0, 2.0, 3.0]))
+    assert estimate.mean == 2.0
+    assert estimate.high - 2.0 == pytest.approx(1.959964 / math.sqrt(3))
+
+
+def flags(*values: int) -> torch.Tensor:
+    return torch.tensor(values) > 0
+
+
+def test_figures_of_six_episodes_by_hand():
+    # At 60 Hz 3 s are 180 steps: a ball at 100, a fall at 180, a ball at 181 (after
+    # the 3 s: a success), a divergence at 5, one that lasts the 10 s, and one that
+    # self-contact ends at 60.
+    played = Episodes(
+        steps=torch.tensor([100, 180, 181, 5, 600, 60]),
+        hit=flags(1, 0, 1, 0, 0, 0),
+        fallen=flags(0, 1, 0, 0, 0, 0),
+        diverged=flags(0, 0, 0, 1, 0, 0),
+        self_contact=flags(0, 0, 0, 0, 0, 1),
+        arrived=torch.tensor([[1.0, 0], [1, 0], [1, 1], [0, 0], [1, 5], [0, 0]]),
+        avoided=torch.tensor([[0.0, 0], [1, 0], [1, 0], [0, 0], [1, 5], [0, 0]]),
+    )
+    rigid = Episodes(
+        steps=torch.full((6,), 50),
+        hit=flags(1, 1, 1, 1, 0, 1),
+        fallen=flags(0, 0, 0, 0, 0, 0),
+        diverged=flags(0, 0, 0, 0, 0, 0),
+        self_contact=flags(0, 0, 0, 0, 0, 0),
+        arrived=torch.zeros(6, 2),
+        avoided=torch.zeros(6, 2),
+    )
+    result = summarize(played, rigid, DodgeballConfig())
+    assert result.success.mean == pytest.approx(2 / 6)
+    # 5 s are 300 steps: only the one that lasts.
+    assert result.success_5s.mean == pytest.approx(1 / 6)
+    shares = (
+        result.ended_by_ball,
+        result.ended_by_fall,
+        result.ended_by_self_contact,
+        result.diverged,
+    )
+    assert shares == pytest.approx([1 / 6] * 4)
+    assert result.success.mean + sum(shares) == pytest.approx(1.0)
+    assert result.rigid_success == pytest.approx(1 / 6)
+    mean = (100 + 180 + 181 + 5 + 600 + 60) / 6 / 60
+    assert result.survival_time.mean == pytest.approx(mean)
+    assert result.avoided.first_ball == pytest.approx(3 / 4)
+    assert result.avoided.later_balls == pytest.approx(5 / 6)
+
+
+def test_success_is_read_at_the_age_of_the_task():
+    # At 60 Hz 1 s are 60 steps: the ball at 60 comes in time to fail, that at 61 not.
+    played = Episodes(
+        steps=torch.tensor([60, 61]),
+        hit=flags(1, 1),
+        fallen=flags(0, 0),
+        diverged=flags(0, 0),
+        self_contact=flags(0, 0),
+        arrived=torch.zeros(2, 2),
+        avoided=torch.zeros(2, 2),
+    )
+    assert summarize(played, played, DodgeballConfig()).success.mean == 0
+    early = summarize(played, played, DodgeballConfig(success_s=1.0))
+    assert early.success.mean == early.ended_by_ball == 0.5
+
+
+def test_an_end_before_the_first_throw_is_a_failure_that_survived_nothing():
+    # 30 steps before the first throw, at it, and one step after.
+    played = Episodes(
+        steps=torch.tensor([-30, 0, 1, 600]),
+        hit=flags(0, 0, 0, 0),
+        fallen=flags(1, 1, 1, 0),
+        diverged=flags(0, 0, 0, 0),
+        self_contact=flags(0, 0, 0, 0),
+        arrived=torch.zeros(4, 2),
+        avoided=torch.zeros(4, 2),
+    )
+    result = summarize(played, played, DodgeballConfig())
+    assert result.success.mean == result.success_5s.mean == 1 / 4
+    assert result.ended_by_fall == 3 / 4
+    assert result.survival_time.mean == pytest.approx((0 + 0 + 1 + 600) / 4 / 60)
+
+
+def test_nothing_arrived_is_not_a_share():
+    none = torch.zeros(1, dtype=torch.bool)
+    empty = Episodes(
+        steps=torch.tensor([3]),
+        hit=none,
+        fallen=~none,
+        diverged=none,
+        self_contact=none,
+        arrived=torch.zeros(1, 2),
+        avoided=torch.zeros(1, 2),
+    )
+    assert summarize(empty, empty, DodgeballConfig()).avoided.first_ball is None
+
+
+@pytest.mark.parametrize(
+    ("version", "aim"), [("2", "skin"), ("1", "body"), ("paper", "skin")]
+)
+def test_the_standard_throw_replaces_the_throw_of_the_run(version, aim):
+    own = ThrowConfig(lead=0.0, flight="straight", speed=(1.0, 2.0))
+    task = DodgeballConfig(
+        throws=own,
+        action_scale=0.3,
+        self_contact_ends=True,
+        success_s=1.0,
+        start_joint_noise=0.5,
+    )
+    standard = standard_task(EnvConfig(task=task), version)
+    assert standard.task.success_s == 3.0
+    assert standard.task.start_joint_noise == DodgeballConfig().start_joint_noise
+    assert not standard.task.self_contact_ends
+    # The first ball comes at the start, in all of them.
+    assert standard.task.throws == ThrowConfig(first_delay=(0.0, 0.0), aim=aim)
+    assert standard.task.action_scale == 0.3
+    assert standard_task(EnvConfig(task=task)) == standard_task(EnvConfig(), "2")
+
+
+@pytest.mark.parametrize(
+    ("version", "expected"), [("2", 2**32 + 5), ("1", 5), ("paper", 2**32 + 5)]
+)
+def test_no_training_meets_the_throws_of_a_bank_but_those_of_version_1(
+    version, expected
+):
+    assert throw_seed(standard_task(EnvConfig(), version), 5) == expected
+    # Throws of a run's own are held out as well, unless they are version 1's.
+    trained = EnvConfig(task=training_task(version, DodgeballConfig()))
+    assert throw_seed(trained, 5) == expected
+    other = dataclasses.replace(trained.task, success_s=2.0)
+    assert throw_seed(EnvConfig(task=other), 5) == 2**32 + 5
+
+
+def skin_of(config: EnvConfig) -> Skin:
+    return config.skin.build(config.robot_config)
+
+
+def make_case(version="2") -> dict:
+    config = standard_task(EnvConfig(), version)
+    return {
+        "config": config,
+        "skin": config.skin.build(config.robot_config),
+        "episodes": 64,
+    }
+
+
+def test_a_bank_goes_the_same_way_with_1_2_and_4_workers():
+    case = make_case()
+    torch.manual_seed(0)
+    weights = 0.5 * torch.randn(64, 21)
+
+    def policy(td):
+        # Reads the signal, so that sensors take part.
+        return td.set("action", td["signal"] @ weights - weights.sum(0))
+
+    class Module(torch.nn.Module):
+        def forward(self, td):
+            return policy(td)
+
+    first, *others = (
+        play_bank(Module(), **case, bank_seed=3, num_workers=n) for n in (1, 2, 4)
+    )
+    for other in others:
+        for field in dataclasses.fields(Episodes):
+            one, two = getattr(first, field.name), getattr(other, field.name)
+            assert torch.equal(one, two), field.name
+    assert len(first.steps) == 64
+
+
+@pytest.mark.parametrize("version", ["2", "1"])
+def test_every_standard_throw_meets_a_robot_that_does_not_move(version):
+    case = make_case(version)
+    rigid = play_bank(None, **case, bank_seed=3, num_workers=1, hold=True)
+    assert summarize(rigid, rigid, DodgeballConfig()).rigid_success <= 0.01
+
+
+def delayed(delay: tuple[float, float], **throws) -> EnvConfig:
+    throws = ThrowConfig(first_delay=delay, **throws)
+    sensor = SensorConfig(coverage="none")
+    return EnvConfig(task=DodgeballConfig(throws=throws), sensor=sensor)
+
+
+@pytest.mark.parametrize("num_workers", [1, 2])
+def test_episodes_count_from_the_first_throw_whatever_the_delay(num_workers):
+    # The rigid robot stands where it stands, and meets the same throws.
+    bank = {"bank_seed": 3, "episodes": 64, "hold": True, "num_workers": num_workers}
+    at_once, late = (
+        play_bank(None, config, skin_of(config), **bank)
+        for config in (delayed((0.0, 0.0)), delayed((0.5, 1.5)))
+    )
+    for field in dataclasses.fields(Episodes):
+        one, other = getattr(at_once, field.name), getattr(late, field.name)
+        assert torch.equal(one, other), field.name
+    assert at_once.hit.all()
+
+
+def test_an_episode_lasts_its_whole_length_after_the_latest_first_throw():
+    # Balls to a point 50 m up.
+    config = delayed((0.1, 0.4), aim="box", box_height=(50.0, 50.0))
+    task = dataclasses.replace(config.task, episode_length_s=0.5)
+    config = dataclasses.replace(config, task=task)
+    bank = {"bank_seed": 0, "episodes": 16, "hold": True, "num_workers": 1}
+    played = play_bank(None, config, skin_of(config), **bank)
+    assert (played.steps == 30).all()
+    assert not (played.hit | played.fallen | played.diverged).any()
+
+
+class Still(torch.nn.Module):
+    """The same action at every step."""
+
+    def __init__(self, action: torch.Tensor) -> None:
+        super().__init__()
+        self.action = action
+
+    def forward(self, td):
+        return td.set("action", self.action.expand(len(td), -1))
+
+
+def test_a_fall_before_the_first_throw_is_a_failure():
+    config = delayed((4.0, 6.0))
+    # Hips and knees drive the robot to the ground.
+    action = torch.tensor(
+        [-2.0 * ("hip_pitch" in name) for name in config.robot_config.joints]
+    )
+    bank = {"bank_seed": 0, "episodes": 8, "num_workers": 1}
+    played = play_bank(Still(action), config, skin_of(config), **bank)
+    assert played.fallen.all()
+    assert not played.arrived.any()
+    row = torch.arange(8)
+    thrower = Thrower(config.task.throws, config.robot_config, 1 / 120)
+    delay = thrower.first_delay(throw_seed(config, 0), row, row * 0)
+    fell_at = played.steps / 60 + delay
+    assert (played.steps < 0).all()
+    assert ((fell_at > 0.2) & (fell_at < 2.5)).all()
+    result = summarize(played, played, config.task)
+    assert result.success.mean == 0
+    assert result.survival_time.mean == 0
+
+
+def test_ends_by_self_contact_are_told_apart():
+    config = EnvConfig(task=dataclasses.replace(TASK, self_contact_ends=True))
+    skin = config.skin.build(config.robot_config)
+    inwards = torch.zeros(32, 21)
+    inwards[:16, config.robot_config.joints.index("left_shoulder_roll_joint")] = -1.0
+
+    class Module(torch.nn.Module):
+        def forward(self, td):
+            return td.set("action", inwards)
+
+    played = play_bank(Module(), config, skin, bank_seed=0, episodes=32, num_workers=1)
+    assert played.self_contact[:16].all()
+    assert not played.self_contact[16:].any()
+    # Every episode has one cause of its end.
+    causes = (played.hit, played.fallen, played.diverged, played.self_contact)
+    assert (torch.stack(causes).sum(0) == 1).all()
+
+
+def test_another_bank_seed_is_another_bank():
+    case = make_case()
+    first, again, other = (
+        play_bank(None, **case, bank_seed=seed, num_workers=1, hold=True).steps
+        for seed in (0, 0, 1)
+    )
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)

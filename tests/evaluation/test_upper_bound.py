@@ -1,0 +1,191 @@
+"""What the body could still do: a search starts where the policy is, and only adds."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torchrl.envs import TransformedEnv
+
+from egoskin.evaluation.behaviour import Watcher
+from egoskin.evaluation.throw_set import play_bank, standard_task, throw_seed
+from egoskin.evaluation.upper_bound import (
+    Ceiling,
+    SearchConfig,
+    _play,
+    _until_in_reach,
+    find_ceiling,
+)
+from egoskin.make import EnvConfig, make_worker_env
+from egoskin.policies.policy import Policy, load_policy
+
+THROWS = 16
+SEARCH = SearchConfig(samples=24, iterations=3, stand_s=0.75)
+
+
+@pytest.fixture(scope="module")
+def policy() -> Policy:
+    return load_policy("field_proximity")
+
+
+def task(policy: Policy) -> EnvConfig:
+    """Version 1's task without a second ball; the first arrives within 2 s.
+
+    Of its first balls some hit, of version 2's hardly any.
+    """
+    config = standard_task(policy.env_config, "1")
+    throws = replace(config.task.throws, interval=(1e3, 1e3))
+    return replace(
+        config, task=replace(config.task, throws=throws, episode_length_s=2.0)
+    )
+
+
+def make(policy: Policy, config: EnvConfig, rows: int) -> TransformedEnv:
+    return make_worker_env(
+        config,
+        policy.skin,
+        num_envs=rows,
+        seed=throw_seed(config, 0),
+        num_threads=1,
+        keep_raw=True,
+    )
+
+
+def find(policy: Policy, search: SearchConfig = SEARCH) -> Ceiling:
+    return find_ceiling(
+        policy, task(policy), search, bank_seed=0, throws=THROWS, reach=2.0
+    )
+
+
+@pytest.fixture(scope="module")
+def ceiling(policy: Policy) -> Ceiling:
+    return find(policy)
+
+
+def test_the_empty_plan_is_the_policy(policy: Policy, ceiling: Ceiling):
+    config = task(policy)
+    watcher = Watcher(config, 0, THROWS)
+    play_bank(policy, config, policy.skin, bank_seed=0, episodes=THROWS, watch=watcher)
+    hit = watcher._hit[:, 0]
+    # All of them come into range; some hit, some do not.
+    assert torch.equal(ceiling.policy.avoided, ~hit)
+    assert 0 < int(hit.sum()) < THROWS
+
+
+def test_the_second_ball_comes_at_a_robot_that_has_dodged_the_first(policy: Policy):
+    config = standard_task(policy.env_config)
+    watcher = Watcher(config, 0, THROWS)
+    play_bank(policy, config, policy.skin, bank_seed=0, episodes=THROWS, watch=watcher)
+    env = make(policy, config, THROWS)
+    start = _until_in_reach(env, policy, config, reach=2.0, ball=2)
+    first, second = watcher._hit[start.throw, :2].T
+    assert 0 < len(start.throw) < THROWS
+    assert not first.any()
+    assert (start.simulation["throw"] == 2).all()
+    empty = torch.zeros(len(start.throw), 0, len(config.robot_config.joints))
+    env = make(policy, config, len(start.throw))
+    env.reset()
+    avoided, _ = _play(env, policy, start, empty, steps=75)
+    assert torch.equal(avoided, ~second)
+    assert 0 < int(second.sum()) < len(second)
+
+
+def test_no_ball_is_thrown_after_it(policy: Policy):
+    config = standard_task(policy.env_config)
+    # The next one would be thrown before the first comes into reach.
+    throws = replace(config.task.throws, interval=(0.1, 0.1))
+    config = replace(config, task=replace(config.task, throws=throws))
+    start = _until_in_reach(make(policy, config, THROWS), policy, config, reach=2.0)
+    assert len(start.throw) == THROWS
+    assert (start.simulation["step"] > 6).all()
+    assert (start.simulation["throw"] == 1).all()
+
+
+def test_a_search_finds_more_than_the_policy_does_and_loses_nothing(ceiling: Ceiling):
+    own, best = ceiling.policy, ceiling.best
+    assert not (own.avoided & ~best.avoided).any()
+    assert not (own.stood & ~best.stood).any()
+    for outcome in (own, best):
+        assert not (outcome.stood & ~outcome.avoided).any()
+    assert int(best.avoided.sum()) > int(own.avoided.sum())
+
+
+def test_the_step_of_a_hit_is_not_survived(policy: Policy):
+    config = task(policy)
+    env = make(policy, config, THROWS)
+    start = _until_in_reach(env, policy, config, reach=2.0)
+    empty = torch.zeros(THROWS, 0, len(config.robot_config.joints))
+    avoided, survived = _play(env, policy, start, empty, steps=60)
+    row = int((~avoided).nonzero()[0])
+    steps = int(survived[row])
+    assert _play(env, policy, start, empty, steps)[0][row]
+    assert not _play(env, policy, start, empty, steps + 1)[0][row]
+
+
+def test_an_age_limit_is_no_fall(policy: Policy, ceiling: Ceiling):
+    # Every plan crosses it: the balls come into reach from about 0.35 to 1 s on.
+    long = task(policy)
+    short = replace(long, task=replace(long.task, episode_length_s=1.05))
+    bank = {"bank_seed": 0, "throws": THROWS, "reach": 2.0}
+    found = find_ceiling(policy, short, SEARCH, **bank)
+    assert torch.equal(found.policy.stood, ceiling.policy.stood)
+    assert found.policy.stood.any()
+
+
+def test_plans_start_where_the_reach_says_whatever_the_sensors_own_range(
+    policy: Policy,
+):
+    config = task(policy)
+    skin = replace(policy.skin, range=np.full(len(policy.skin), 0.3))
+    other = copy.deepcopy(policy)
+    other.policy_spec = replace(policy.policy_spec, skin=skin)
+    steps = [
+        _until_in_reach(make(policy, config, 4), who, config, 2.0).simulation["step"]
+        for who in (policy, other)
+    ]
+    assert len(steps[0]) == 4
+    assert torch.equal(*steps)
+
+
+def test_corrupted_sensors_are_refused(policy: Policy):
+    config = task(policy)
+    sensor = replace(config.sensor, corruption="acoustic")
+    with pytest.raises(ValueError, match=r"ideal sensors.*acoustic"):
+        find_ceiling(
+            policy,
+            replace(config, sensor=sensor),
+            SEARCH,
+            bank_seed=0,
+            throws=1,
+            reach=2.0,
+        )
+
+
+def test_a_search_repeats(policy: Policy):
+    search = SearchConfig(samples=8, iterations=2, stand_s=0.5)
+    one, two = find(policy, search), find(policy, search)
+    assert torch.equal(one.best.avoided, two.best.avoided)
+    assert torch.equal(one.best.stood, two.best.stood)
+
+
+def test_balls_that_never_come_into_reach_are_an_error(policy: Policy):
+    # No episode lasts until the fiftieth.
+    with pytest.raises(ValueError, match="came within 2 m of a sensor"):
+        find_ceiling(
+            policy, task(policy), SEARCH, bank_seed=0, throws=4, reach=2.0, ball=50
+        )
+
+
+def test_a_plan_lasts_a_control_step_at_least(policy: Policy):
+    short = SearchConfig(stand_s=0.001)
+    with pytest.raises(ValueError, match="stand_s must be at least one control step"):
+        find_ceiling(policy, task(policy), short, bank_seed=0, throws=1, reach=2.0)
+
+
+@pytest.mark.parametrize("change", [{"samples": 3}, {"hold": 0}, {"stand_s": -1.0}])
+def test_searches_that_cannot_be_are_refused(change: dict):
+    with pytest.raises(ValueError, match=next(iter(change))):
+        SearchConfig(**change)

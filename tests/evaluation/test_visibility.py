@@ -1,0 +1,471 @@
+"""What a skin sees: by hand on a ball-shaped robot, by MuJoCo on the H1-2."""
+
+from __future__ import annotations
+
+import json
+import math
+import runpy
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from egoskin.envs.dodgeball import DodgeballEnv
+from egoskin.envs.throws import ThrowConfig
+from egoskin.evaluation.approaches import (
+    THROW_STEP,
+    StandingRobot,
+    Trace,
+    direction_grid,
+    direction_paths,
+    surface_paths,
+    throw_paths,
+    trace,
+    unit_vectors,
+)
+from egoskin.evaluation.visibility import Analysis, Cell, analyse
+from egoskin.robots.config import H1_2
+from egoskin.sensors import Field, Ray, Skin
+from egoskin.shapes import Sphere
+from throwing import TASK
+
+ROOT = Path(__file__).parents[2]
+BALL = Sphere(radius=0.15)
+FIELD = {"field": Field()}
+BOTH = {"field": Field(), "ray": Ray()}
+# Radius of the ball-shaped robot [m].
+RHO = 0.2
+
+
+@pytest.fixture
+def ball_robot(small_robot):
+    """A ball 3 m above ground, with a foot too small to matter."""
+    return small_robot(f"<geom size='{RHO}'/><geom size='0.01' pos='2 -2 -3'/>")
+
+
+def sensors(*poses, **options) -> Skin:
+    """Sensors on the ball-shaped robot: (position, normal) each."""
+    position, normal = (np.array(x, dtype=float) for x in zip(*poses, strict=True))
+    links = ("base",) * len(position)
+    return Skin(robot="small", links=links, position=position, normal=normal, **options)
+
+
+AHEAD, BEHIND = (1.0, 0, 0), (-1.0, 0, 0)
+
+
+# --- the body -------------------------------------------------------------------
+
+
+def test_distances_to_the_body_are_those_of_mujoco():
+    spec = H1_2.spec()
+    ball = spec.worldbody.add_body(name="ball", mocap=True)
+    ball.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.15, 0, 0], name="ball")
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    data.qpos[2], data.qpos[7:] = H1_2.default_base_height, H1_2.default_joint_pos
+    geom = model.geom("ball").id
+    body = StandingRobot(H1_2)
+    points = np.random.default_rng(0).uniform([-1, -1, 0], [1, 1, 2], (50, 3))
+    for point, ours in zip(points, body.distance(points), strict=True):
+        data.mocap_pos[0] = point
+        mujoco.mj_kinematics(model, data)
+        theirs = min(
+            mujoco.mj_geomDistance(model, data, g, geom, 10.0, np.zeros(6))
+            for g in range(model.ngeom)
+            if g != geom
+        )
+        assert ours - 0.15 == pytest.approx(theirs, abs=1e-6)
+    # A bound may stand for what is far, never for what is near.
+    bounded = body.distance(points, within=0.3)
+    near = body.distance(points) <= 0.3
+    assert near.any()
+    assert (bounded[near] == body.distance(points)[near]).all()
+    assert (bounded[~near] > 0.3).all()
+    assert (bounded <= body.distance(points)).all()
+
+
+def test_throws_fly_and_hit_as_they_do_in_the_simulation():
+    config, rows, seed = TASK, 24, 3
+    env = DodgeballEnv(H1_2, config, num_envs=rows, seed=seed, hold=True)
+    root, step = env.reset(), 0
+    hit_at = torch.full((rows,), -1)
+    while (hit_at < 0).any():
+        step += 1
+        root["action"] = torch.zeros(rows, len(H1_2.joints))
+        root = env.step(root)["next"]
+        if step == 20:
+            third = root["object_pose"][:, 0, :3]  # after a third of a second
+        # The second throw comes after a second at the earliest; all arrive by then.
+        hit_at[(hit_at < 0) & root["hit"][:, 0]] = step
+        assert step < 120
+    body = StandingRobot(H1_2)
+    dt = config.physics.timestep
+    paths, _ = throw_paths(body, config.throws, rows, seed, dt)
+    # Whatever the heading: height, and distance from the base at the origin.
+    index = round(1 / 3 / THROW_STEP)
+    way = paths[:, index] + (1 / 3 - index * THROW_STEP) * (
+        (paths[:, index + 1] - paths[:, index]) / THROW_STEP
+    )
+    torch.testing.assert_close(way[:, 2], third[:, 2], atol=1e-3, rtol=0)
+    away, theirs = way[:, :2].norm(dim=-1), third[:, :2].norm(dim=-1)
+    torch.testing.assert_close(away, theirs, atol=1e-3, rtol=0)
+    skin = Skin(
+        robot="h1_2",
+        links=("torso_link",),
+        position=np.zeros((1, 3)),
+        normal=np.array([[0, 0, 1.0]]),
+    )
+    traced = trace(body, paths, skin, FIELD, [1.0], BALL)
+    assert traced.touches.all()
+    late = hit_at / config.physics.control_hz - THROW_STEP * traced.contact
+    # The hit is reported at the end of the control step that it falls into.
+    assert late.min() > -THROW_STEP
+    assert late.max() < 1 / config.physics.control_hz + dt
+
+
+def test_no_part_of_the_body_is_beyond_its_reach(small_robot):
+    # A capsule ends at 0.1 + 0.5 from its middle.
+    capsule = StandingRobot(small_robot("<geom type='capsule' size='0.1 0.5'/>"))
+    assert capsule.reach == pytest.approx(0.6)
+    body = StandingRobot(H1_2)
+    # A ball of next to no size ends on the surface.
+    points = surface_paths(body, Sphere(radius=1e-6), 0.1, 0)[0][:, -1].numpy()
+    assert np.linalg.norm(points - body.origin, axis=-1).max() < body.reach
+
+
+# --- by hand --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("pose", "coverages", "max_range", "seconds"),
+    [
+        # 5 m/s straight at the robot's front: gap at the first detection / speed.
+        (((RHO, 0, 0), AHEAD), FIELD, 1.0, 1.0 / 5),
+        (((RHO, 0, 0), AHEAD), FIELD, 0.5, 0.5 / 5),
+        # On the far side, 0.4 m farther from the ball.
+        (((-RHO, 0, 0), BEHIND), FIELD, 1.0, 0.6 / 5),
+        (((-RHO, 0, 0), BEHIND), FIELD, 0.3, None),
+        # Standing 0.1 m off the surface.
+        (((RHO + 0.1, 0, 0), AHEAD), FIELD, 1.0, 1.1 / 5),
+        # One beam along the normal.
+        (((RHO, 0, 0), AHEAD), {"ray": Ray(grid=(1, 1))}, 1.0, 1.0 / 5),
+        (((RHO, 0, 0), BEHIND), {"ray": Ray()}, 1.0, None),
+    ],
+)
+def test_warning_is_the_way_left_over_the_speed(
+    ball_robot, pose, coverages, max_range, seconds
+):
+    body = StandingRobot(ball_robot)
+    height = (body.origin[2], body.origin[2])
+    throws = ThrowConfig(
+        flight="straight",
+        aim="box",
+        box_half_width=0.0,
+        box_height=height,
+        height=height,
+        azimuth_deg=(0.0, 0.0),
+        speed=(5.0, 5.0),
+    )
+    analysis = analyse(
+        ball_robot, sensors(pose), coverages, [max_range], throws, num_throws=3
+    )
+    assert analysis.throws.touches.all()
+    assert (analysis.throws.seen == (seconds is not None)).all()
+    expected = torch.full((1, 3), seconds or 0.0, dtype=torch.float64)
+    # Both ends are exact to a step.
+    torch.testing.assert_close(
+        analysis.warning, expected, atol=1.01 * THROW_STEP, rtol=0.0
+    )
+
+
+@pytest.mark.parametrize("max_range", [0.1, 0.25, 0.4])
+def test_share_of_directions_and_of_surface_is_that_of_the_cap(ball_robot, max_range):
+    # A field sensor on a ball of radius rho; the other ball's centre at D from the
+    # middle, theta from the sensor: its surface is sqrt(rho^2 + D^2 - 2 rho D cos
+    # theta) - r from the sensor. Seen if cos theta >= c; the cap has (1 - c) / 2 of
+    # the sphere.
+    outward = np.array([1.0, 2, 3]) / math.sqrt(14)
+    skin = sensors((RHO * outward, outward))
+    analysis = analyse(
+        ball_robot, skin, FIELD, [max_range], ThrowConfig(), num_throws=1
+    )
+    gap = analysis.directions.gap
+    last = gap.gather(1, analysis.directions.contact[:, None] - 1).max().item()
+    assert 0.001 < last < 0.01
+
+    def share(gap: float) -> float:
+        away = RHO + BALL.radius + gap
+        seen = RHO**2 + away**2 - (max_range + BALL.radius) ** 2
+        return (1 - seen / (2 * RHO * away)) / 2
+
+    (cell,) = analysis.report()["cells"]
+    assert cell["directions_seen"] == pytest.approx(share(last), abs=0.01)
+    assert cell["directions_seen_by_clearance"].keys() == {
+        f"{c:g}" for c in (0.05, 0.1, 0.2) if c < max_range
+    }
+    if max_range > 0.05:
+        by_then = cell["directions_seen_by_clearance"]["0.05"]
+        assert share(0.06) - 0.01 < by_then < share(0.05) + 0.01
+    # 1000 random points: standard deviation 1.6 %.
+    assert cell["surface_blind"] == pytest.approx(1 - share(last), abs=0.05)
+    # The middle of what it does not see lies opposite.
+    cone = cell["widest_blind_cone_deg"]
+    azimuth, elevation = np.radians(cone["azimuth"]), np.radians(cone["elevation"])
+    assert unit_vectors(azimuth, elevation) @ -outward > math.cos(math.radians(5))
+    border = math.degrees(math.acos(1 - 2 * share(last)))
+    assert cone["half_angle"] == pytest.approx(180 - border, abs=5)
+
+
+def test_a_ball_cannot_come_through_the_floor(small_robot):
+    robot = small_robot(f"<geom size='{RHO}'/>")  # stands on the floor
+    body = StandingRobot(robot)
+    skin = sensors(((0, 0, RHO), (0, 0, 1)))
+    paths = direction_paths(body, BALL, 1.0)
+    traced = trace(body, paths, skin, FIELD, [1.0], BALL)
+    # At a gap g the centre is at rho + (rho + r + g) sin(elevation) >= r.
+    sine = torch.from_numpy(np.sin(direction_grid()[1])).reshape(-1).float()
+    at_contact, far = (RHO + (0.35 + g) * sine - 0.15 for g in (0.0, 1.0))
+    assert torch.equal(at_contact > 0, traced.touches)
+    assert (traced.runway[~traced.touches] == 0).all()
+    assert torch.equal(traced.runway >= 1.0, far >= 0)
+    # Under the floor nothing is seen.
+    under = paths[..., 2] < 0.15
+    assert not traced.num_sensors[0][under].any()
+
+
+def test_a_skin_that_sees_nothing_has_figures_of_nothing(ball_robot):
+    # In the middle of the robot, with a range that ends inside it.
+    skin = sensors(((0, 0, 0), (0, 0, 1)), range=np.array([0.1]))
+    analysis = analyse(ball_robot, skin, FIELD, [2.0], ThrowConfig(), num_throws=20)
+    report = analysis.report()
+    (cell,) = report["cells"]
+    assert cell["directions_seen"] == 0
+    assert cell["surface_blind"] == 1
+    assert cell["widest_blind_cone_deg"]["half_angle"] == 180
+    assert cell["warning"]["seen"] == 0
+    assert cell["warning"]["95%"] == 0
+    assert cell["sensors_at_once"] == {"median": None, "one": None}
+    json.dumps(report, allow_nan=False)
+
+
+def test_throws_that_miss_have_no_warning(ball_robot):
+    # Over its head.
+    over = ThrowConfig(
+        flight="straight", aim="box", box_height=(6.0, 6.0), height=(6.0, 6.0)
+    )
+    skin = sensors(((0, 0, RHO), (0, 0, 1)))
+    report = analyse(ball_robot, skin, FIELD, [2.0], over, num_throws=20).report()
+    assert (report["throws"], report["hits"]) == (20, 0)
+    assert report["cells"][0]["warning"] == {"hits": 0}
+    assert report["differing_share"] is None
+    json.dumps(report, allow_nan=False)
+
+
+def test_points_behind_other_parts_are_not_reached(small_robot):
+    # Two balls close together: between them there is no room for a third.
+    robot = small_robot("<geom size='0.2'/><geom size='0.2' pos='0.5 0 0'/>")
+    body = StandingRobot(robot)
+    skin = sensors(((0, 0, RHO), (0, 0, 1)))
+    paths, _ = surface_paths(body, BALL, 0.5, seed=0)
+    analysis = analyse(robot, skin, FIELD, [0.5], ThrowConfig(), num_throws=1)
+    reached = analysis.reached
+    touch = paths[:, -1].double().numpy()
+    free = body.distance(touch) >= 0.15 - 1e-3
+    above = touch[:, 2] > 0.15
+    inside = reached.numpy()
+    assert inside.any()
+    assert (~inside).any()
+    assert (inside <= (free & above)).all()
+
+
+def hand_made(num_sensors, contact) -> Trace:
+    """Traces whose gap is the number of steps left, over 100."""
+    num_sensors, contact = torch.tensor(num_sensors), torch.tensor(contact)
+    steps = torch.arange(num_sensors.shape[-1])
+    gap = (contact[:, None] - steps) / 100
+    runway = torch.full((len(contact),), torch.inf)
+    return Trace(gap=gap, contact=contact, runway=runway, num_sensors=num_sensors)
+
+
+def test_first_sight_by_hand():
+    traced = hand_made([[[0, 0, 2, 0, 1, 0], [0] * 6]], [5, 4])
+    assert traced.first_seen.tolist() == [[2, 4]]
+    assert traced.seen.tolist() == [[True, False]]
+    torch.testing.assert_close(traced.clearance, torch.tensor([[0.03, 0.0]]))
+    missed = hand_made([[[0, 1, 1]]], [3])
+    assert not missed.touches.any()
+
+
+def test_cells_differ_by_more_than_a_control_step_or_not():
+    # First sight of two throws, in steps of 2 ms: cell 1 is 16 and 18 ms late.
+    seen = torch.zeros(2, 2, 20, dtype=torch.int16)
+    seen[0, :, 0:] = 1
+    seen[1, 0, 8:] = seen[1, 1, 9:] = 1
+    throws = hand_made(seen.tolist(), [15, 15])
+    analysis = Analysis(
+        cells=(Cell(coverage="a", range=1.0), Cell(coverage="b", range=1.0)),
+        directions=throws,
+        surface=throws,
+        surface_link=("base", "base"),
+        throws=throws,
+        throw_azimuth=torch.zeros(2),
+        contact_height=torch.ones(2),
+        control_period=1 / 60,
+    )
+    assert analysis.differing_share().tolist() == [[0, 0.5], [0.5, 0]]
+    torch.testing.assert_close(
+        analysis.warning.float(), torch.tensor([[0.03, 0.03], [0.014, 0.012]])
+    )
+
+
+# --- invariances on the H1-2 ----------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def body() -> StandingRobot:
+    return StandingRobot(H1_2)
+
+
+@pytest.fixture(scope="module")
+def thrown(body, skin) -> Trace:
+    """60 throws seen by 64 sensors: field and ray, 0.3, 1 and 2 m."""
+    paths, _ = throw_paths(body, ThrowConfig(), 60, 0, 1 / 120)
+    return trace(body, paths, skin, BOTH, [0.3, 1.0, 2.0], BALL)
+
+
+def test_a_longer_range_sees_no_less(thrown):
+    counts = thrown.num_sensors.unflatten(0, (2, 3))
+    assert (counts.diff(dim=1) >= 0).all()
+    assert (thrown.first_seen.unflatten(0, (2, 3)).diff(dim=1) <= 0).all()
+    assert (counts[:, 2] > counts[:, 1]).any()
+
+
+def test_a_body_in_the_way_hides_some_of_what_is_seen(body, skin, thrown):
+    paths, _ = throw_paths(body, ThrowConfig(), 60, 0, 1 / 120)
+    ranges = [0.3, 1.0, 2.0]
+    solid = trace(body, paths, skin, BOTH, ranges, BALL, occlusion=True)
+    assert (solid.num_sensors <= thrown.num_sensors).all()
+    assert (solid.num_sensors < thrown.num_sensors).any(-1).any(-1).all()
+    assert (solid.first_seen >= thrown.first_seen).all()
+
+
+def test_what_a_ray_hits_is_in_the_field(thrown):
+    field, ray = thrown.num_sensors.unflatten(0, (2, 3))
+    assert (field >= ray).all()
+    assert ray.any()
+
+
+def test_sensors_of_their_own_kind_and_range_keep_them(body, skin, thrown):
+    # Even sensors are rays of 1 m, odd ones fields of 2 m, whatever is asked.
+    paths, _ = throw_paths(body, ThrowConfig(), 60, 0, 1 / 120)
+    even, odd = skin.select(range(0, 64, 2)), skin.select(range(1, 64, 2))
+    own = np.where(np.arange(64) % 2, 2.0, 1.0)
+    mixed = replace(skin, coverage=(Ray(), Field()) * 32, range=own)
+    got = trace(body, paths, mixed, FIELD, [0.3], BALL).num_sensors[0]
+    rays = trace(body, paths, even, {"ray": Ray()}, [1.0], BALL).num_sensors[0]
+    fields = trace(body, paths, odd, FIELD, [2.0], BALL).num_sensors[0]
+    assert torch.equal(got, rays + fields)
+    assert rays.any()
+
+
+def test_what_a_cell_sees_does_not_depend_on_the_others(body, skin):
+    # A depth of 0.5 m at the corner of the view is 0.57 m away.
+    paths, _ = throw_paths(body, ThrowConfig(), 60, 0, 1 / 120)
+    depth = {"depth": Ray(measure="depth")}
+    alone = trace(body, paths, skin, depth, [0.5], BALL).num_sensors[0]
+    beside = trace(body, paths, skin, depth, [0.5, 1.0], BALL).num_sensors[0]
+    assert torch.equal(alone, beside)
+    assert alone.any()
+
+
+def test_nothing_is_seen_after_the_contact(thrown):
+    steps = torch.arange(thrown.gap.shape[1])
+    after = steps >= thrown.contact[:, None]
+    assert not thrown.num_sensors[:, after].any()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"ranges": [1.0, -1.0]}, "must be positive and finite"),
+        ({"ranges": [math.inf]}, "must be positive and finite"),
+        ({"ranges": [0.5, 1.0, 0.5]}, "a range is given twice"),
+        ({"ranges": []}, "at least one coverage and one range"),
+        ({"coverages": {}}, "at least one coverage and one range"),
+        ({"num_throws": 0}, "num_throws must be at least 1"),
+        ({"seed": -1}, r"seed must be in \[0, 2\*\*32\), got -1"),
+    ],
+)
+def test_what_cannot_be_analysed_is_refused(skin, changes, message):
+    arguments = {"coverages": FIELD, "ranges": [1.0], "throws": ThrowConfig()}
+    with pytest.raises(ValueError, match=message):
+        analyse(H1_2, skin, **(arguments | changes))
+
+
+# --- the command ----------------------------------------------------------------
+
+
+def run_script(monkeypatch, *args: str) -> None:
+    monkeypatch.setattr(sys, "argv", ["coverage.py", *args])
+    runpy.run_path(str(ROOT / "scripts" / "coverage.py"), run_name="__main__")
+
+
+def test_the_command_writes_a_picture_and_figures(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("matplotlib")
+    monkeypatch.chdir(tmp_path)
+    small = ("--skin.num-sensors", "8", "--num-throws", "16")
+    run_script(monkeypatch, *small, "--ranges", "0.4", "0.2", "--throws.radius", "0.1")
+    assert "16 of 16 throws hit" in capsys.readouterr().out
+    assert (tmp_path / "coverage.png").read_bytes()[:4] == b"\x89PNG"
+    result = json.loads((tmp_path / "coverage.json").read_text())
+    cells = [(cell["coverage"], cell["range"]) for cell in result["cells"]]
+    assert cells == [("field", 0.2), ("field", 0.4), ("ray", 0.2), ("ray", 0.4)]
+    assert result["config"]["throws"]["radius"] == 0.1
+    near, far = (cell["warning"]["median"] for cell in result["cells"][:2])
+    assert 0 <= near < far < 0.2
+    groups = result["cells"][0]["warning_by_azimuth"].values()
+    assert sum(group["hits"] for group in groups) == result["hits"] == 16
+
+
+def test_the_command_has_the_body_in_the_way_if_asked(tmp_path, monkeypatch):
+    pytest.importorskip("matplotlib")
+    monkeypatch.chdir(tmp_path)
+    small = ("--skin.num-sensors", "8", "--num-throws", "16", "--coverages", "field")
+    for name in ("clear", "solid"):
+        out = ("--out", f"{name}.png", "--json", f"{name}.json")
+        option = ("--occlusion",) if name == "solid" else ()
+        run_script(monkeypatch, *small, *out, *option, "--ranges", "1")
+    clear, solid = (
+        json.loads((tmp_path / f"{name}.json").read_text())
+        for name in ("clear", "solid")
+    )
+    assert solid["config"]["occlusion"]
+    (more,), (less,) = clear["cells"], solid["cells"]
+    assert less["directions_seen"] < more["directions_seen"]
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (["--ranges", "-1"], "ranges must be positive"),
+        (["--out", "coverage.mp4"], "coverage.mp4 must end in .png or .jpg"),
+        (["--json", "none/coverage.json"], "there is no folder none"),
+    ],
+)
+def test_bad_input_to_the_command_is_one_clear_message(
+    args, message, tmp_path, monkeypatch, capsys
+):
+    pytest.importorskip("matplotlib")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        run_script(monkeypatch, *args)
+    assert ended.value.code == 2
+    said = capsys.readouterr()
+    assert message in said.err
+    # Told before the analysis, not after it.
+    assert not said.out
+    assert not list(tmp_path.iterdir())

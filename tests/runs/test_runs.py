@@ -1,0 +1,420 @@
+"""A run as a library user starts it: threads, kept policies, the recorded commit."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensordict import TensorDict
+
+import egoskin
+from egoskin.agents.ppo import NonFiniteError
+from egoskin.envs.dodgeball import DodgeballConfig
+from egoskin.envs.rewards import TERMS
+from egoskin.envs.standards import training_task
+from egoskin.make import EnvConfig
+from egoskin.runs.events import EventFile
+from egoskin.runs.run import Run, TrainConfig, parse_config
+from egoskin.runs.trainer import METRIC_KEYS, Trainer, open_trainer, train
+from egoskin.sensors.config import SensorConfig
+from egoskin.storage.formats import read_sealed, sealed_json
+from egoskin.storage.tensor_file import PARTIAL, load_tensors, save_tensors
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> TrainConfig:
+    """Three rollouts of 64 frames."""
+    return TrainConfig(
+        env=EnvConfig(sensor=SensorConfig(coverage="none")),
+        run_dir=tmp_path / "run",
+        num_envs=4,
+        num_workers=1,
+        total_frames=192,
+    )
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory) -> Iterator[Trainer]:
+    """A trainer after one rollout of 64 frames."""
+    config = TrainConfig(
+        env=EnvConfig(sensor=SensorConfig(coverage="none")),
+        run_dir=tmp_path_factory.mktemp("trained") / "run",
+        num_envs=4,
+        num_workers=1,
+        total_frames=64,
+    )
+    with open_trainer(Run.create(config)) as trainer:
+        train(trainer)
+        yield trainer
+
+
+def test_a_run_learns_with_its_own_number_of_threads(config: TrainConfig):
+    before = torch.get_num_threads()
+    run = Run.create(replace(config, learner_threads=3))
+    try:
+        with open_trainer(run) as trainer:
+            trainer.iterate()
+            learners = [t for t in threading.enumerate() if "learner" in t.name]
+            assert len(learners) == 3
+            assert torch.get_num_threads() == 1
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_one_process_trains_a_run_at_a_time(config: TrainConfig):
+    run = Run.create(config)
+    with open_trainer(run):
+        again = Run.open(run.path)
+        with (
+            pytest.raises(ValueError, match="is being trained by another process"),
+            open_trainer(again),
+        ):
+            pass
+    with again.locked():
+        pass
+
+
+def test_a_damaged_checkpoint_is_told_of(config: TrainConfig):
+    run = Run.create(config)
+    with open_trainer(run):
+        pass
+    tensors, header = load_tensors(run.checkpoint_path)
+    tensors["agent/head.log_std"][3] = torch.nan
+    save_tensors(run.checkpoint_path, tensors, header)
+    message = "damaged: tensor 'head.log_std' is not finite"
+    with pytest.raises(ValueError, match=message), open_trainer(Run.open(run.path)):
+        pass
+    with pytest.raises(ValueError, match=message):
+        egoskin.load_policy(run.path)
+
+
+def test_a_run_of_another_version_is_not_gone_on_with(config: TrainConfig):
+    run = Run.create(config)
+    args = ["--resume", str(run.path)]
+    assert parse_config(args) == replace(run.config, run_dir=None, resume=run.path)
+    file = run.path / "config.json"
+    content, _ = read_sealed(file)
+    del content["env"]["task"]["throws"]["lead"]
+    file.write_bytes(sealed_json(content))
+    message = r"config\.json lacks env\.task\.throws\.lead: another version made it"
+    with pytest.raises(ValueError, match=message):
+        parse_config(args)
+
+
+STANDARDS = [([], "2"), (["--standard", "2"], "2"), (["--standard", "1"], "1")]
+STANDARDS += [(["--standard=paper"], "paper")]
+
+
+@pytest.mark.parametrize(("args", "version"), STANDARDS)
+def test_a_standard_sets_throws_and_ends(args, version):
+    config = parse_config([*args, "--seed", "3", "--sensor.range", "1"])
+    assert config.env.standard == version
+    assert config.env.task == training_task(version, DodgeballConfig())
+    # Nothing else.
+    env = replace(config.env, task=DodgeballConfig())
+    assert env == EnvConfig(sensor=SensorConfig(range=1.0))
+    assert config.seed == 3
+
+
+def test_a_throw_or_an_end_beside_a_standard_makes_it_custom():
+    lead = parse_config(["--standard", "1", "--task.throws.lead", "0.5"]).env
+    assert lead.standard == "custom"
+    throws = training_task("1", DodgeballConfig()).throws
+    assert lead.task.throws == replace(throws, lead=0.5)
+    end = parse_config(["--task.success-s", "2", "--standard", "paper"]).env
+    assert end.standard == "custom"
+    assert end.task.throws.first_delay == (0.0, 0.0)
+    # What belongs to no standard does not.
+    drive = ["--standard", "1", "--task.action-scale", "0.2"]
+    assert parse_config(drive).env.standard == "1"
+
+
+@pytest.mark.parametrize("name", ["3", "Paper", "run"])
+def test_a_standard_that_is_none_is_refused(name, capsys):
+    with pytest.raises(SystemExit) as ended:
+        parse_config(["--standard", name])
+    assert ended.value.code == 2
+    text = capsys.readouterr().err
+    assert "--standard" in text
+    assert "paper" in text
+
+
+def test_a_policy_says_what_standard_it_was_trained_on(config: TrainConfig):
+    args = ["--standard", "paper", "--run-dir", str(config.run_dir)]
+    args += ["--num-envs", "4", "--num-workers", "1", "--total-frames", "64"]
+    args += ["--sensor.coverage", "none", "--ppo.num-mini-batches", "1"]
+    run = Run.create(parse_config(args))
+    with open_trainer(run) as trainer:
+        train(trainer)
+    file = run.path / "policies" / "000000000064.safetensors"
+    assert load_tensors(file)[1]["policy"]["standard"] == "paper"
+    assert egoskin.load_policy(file).env_config.standard == "paper"
+    assert Run.open(run.path).config.env.standard == "paper"
+    # A resume has it already.
+    for version in ("paper", "2"):
+        with pytest.raises(ValueError, match="--standard cannot be changed on resume"):
+            parse_config(["--resume", str(run.path), "--standard", version])
+    assert parse_config(["--resume", str(run.path)]).env.standard == "paper"
+
+
+def test_policies_are_kept_at_the_start_in_between_and_at_the_end(config: TrainConfig):
+    # Of 64, 128 and 192 frames the second is the first past 65.
+    run = Run.create(replace(config, snapshot_frames=65))
+    with open_trainer(run) as trainer:
+        train(trainer)
+    found = sorted((run.path / "policies").iterdir())
+    assert [int(path.stem) for path in found] == [0, 128, 192]
+    assert egoskin.load_policy(found[-1]).policy_spec.frames == 192
+
+
+def test_a_commit_is_recorded_only_of_a_repository_that_holds_the_source(tmp_path):
+    # An installed copy in an ignored folder of somebody's own repository.
+    copy = tmp_path / "site" / "egoskin"
+    source = Path(egoskin.__file__).parent
+    shutil.copytree(source, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    git = ["git", "-c", "user.name=a", "-c", "user.email=a@b", "-C", str(tmp_path)]
+    code = "import json; from egoskin.runs.run import _git_state as state; "
+    code += "print(json.dumps(state()))"
+
+    def state() -> dict | None:
+        ran = subprocess.run(
+            [sys.executable, "-c", code],
+            cwd=copy.parent,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        return json.loads(ran.stdout)
+
+    (tmp_path / ".gitignore").write_text("site\n")
+    for command in (["init", "-q"], ["add", "."], ["commit", "-q", "-m", "mine"]):
+        subprocess.run([*git, *command], check=True)
+    assert state() is None
+    for command in (["add", "-f", "site"], ["commit", "-q", "-m", "with it"]):
+        subprocess.run([*git, *command], check=True)
+    assert not state()["changed"]
+    (copy / "py.typed").write_text("changed")
+    assert state()["changed"]
+
+
+# --- folders that somebody else prepared --------------------------------------------
+
+
+def test_nothing_is_written_through_a_link(config: TrainConfig, tmp_path: Path):
+    run = Run.create(config)
+    with open_trainer(run) as trainer:
+        train(trainer)
+    victim = tmp_path / "victim"
+    victim.write_text("mine")
+    # Which process will write is easily foreseen.
+    partial = f".checkpoint.safetensors.{os.getpid()}.partial"
+    for name in (partial, "metrics.csv", "versions.json"):
+        (run.path / name).unlink(missing_ok=True)
+        (run.path / name).symlink_to(victim)
+    longer = ["--resume", str(run.path), "--total-frames", "256"]
+    with open_trainer(Run(run.path, parse_config(longer))) as trainer:
+        train(trainer)
+    assert victim.read_text() == "mine"
+    assert len((run.path / "metrics.csv").read_text().splitlines()) == 5
+    assert not (run.path / "metrics.csv").is_symlink()
+    assert egoskin.load_policy(run.path).policy_spec.frames == 256
+
+
+@pytest.mark.parametrize("name", ["lock", "policies"])
+def test_a_link_that_cannot_be_replaced_is_refused(
+    name: str, config: TrainConfig, tmp_path: Path
+):
+    run = Run.create(config)
+    elsewhere = tmp_path / "elsewhere"
+    if name == "lock":
+        elsewhere.write_text("mine")
+    else:
+        (run.path / name).rmdir()
+        elsewhere.mkdir()
+    (run.path / name).symlink_to(elsewhere)
+    with (
+        pytest.raises(ValueError, match=f"{name} is a link, which is not followed"),
+        open_trainer(run),
+    ):
+        pass
+    assert elsewhere.is_dir() or elsewhere.read_text() == "mine"
+
+
+def test_a_metrics_file_turned_into_a_link_while_it_trains_is_not_followed(
+    config: TrainConfig, tmp_path: Path
+):
+    victim = tmp_path / "victim"
+    victim.write_text("mine")
+    run = Run.create(config)
+    with open_trainer(run) as trainer:
+        run.log(trainer.iterate())
+        (run.path / "metrics.csv").unlink()
+        (run.path / "metrics.csv").symlink_to(victim)
+        with pytest.raises(OSError, match=r"metrics\.csv"):
+            train(trainer)
+    assert victim.read_text() == "mine"
+
+
+# --- the disk -----------------------------------------------------------------------
+
+
+@contextmanager
+def full_disk() -> Iterator[None]:
+    """Let no file grow beyond some bytes."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (16, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.parametrize(
+    ("write", "name"),
+    [
+        (lambda t: t.run.log({"frames": 64}), "metrics.csv"),
+        (lambda t: t.run._events.log({"frames": 64, "x": 1.0}), "events.out.tfevents"),
+        (lambda t: EventFile(t.run.path, 0), "events.out.tfevents"),
+        (lambda t: t.run.write_config(), "config.json"),
+        (lambda t: t.run.record_start(), "versions.json"),
+        (lambda t: t.save(), "checkpoint.safetensors"),
+        (lambda t: t.keep_policy(), "000000000064.safetensors"),
+        (lambda t: t.dump(NonFiniteError("x", TensorDict())), "not-finite-"),
+        (lambda t: Run.create(replace(t.config, run_dir=t.run.path / "new")), "skin"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_a_full_disk_names_the_file(write, name: str, trained: Trainer):
+    with pytest.raises(OSError, match="File too large") as error, full_disk():
+        write(trained)
+    assert Path(str(error.value.filename)).name.startswith(name)
+    assert not list(trained.run.path.rglob(PARTIAL))
+
+
+def test_a_folder_renamed_while_it_trains_ends_with_one_clear_error(
+    config: TrainConfig,
+):
+    run = Run.create(config)
+    moved = run.path.with_name("moved")
+    with open_trainer(run) as trainer:
+        run.log(trainer.iterate())
+        trainer.save()
+        run.path.rename(moved)
+        with pytest.raises(OSError, match=r"No such file .*run/metrics\.csv"):
+            train(trainer)
+    assert not run.path.exists()
+    assert "--resume it by its new name" in run.how_to_go_on()
+    again = Run(moved, parse_config(["--resume", str(moved)]))
+    with open_trainer(again) as trainer:
+        assert trainer.frames == 64
+        train(trainer)
+
+
+# --- checkpoints that do not fit ----------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("optimizer/0/exp_avg", torch.zeros(3), "the optimiser is one of other"),
+        ("optimizer/1/step", torch.zeros(1), "the optimiser is one of other"),
+        ("optimizer/1/exp_avg_sq", None, "the optimiser is one of other"),
+        ("agent/head.log_std", torch.zeros(21, 1), r"expected \[21\] of float32, got"),
+        (
+            "agent/head.log_std",
+            torch.zeros(21, dtype=torch.float64),
+            r"got \[21\] of float64",
+        ),
+        ("agent/head.log_std", None, "'head.log_std' of the networks is missing"),
+        ("env/simulation/physics", torch.zeros(4, 3), "'env/simulation/physics' does"),
+        ("env/root/observation", None, "'env/root/observation' is missing"),
+        ("survival/ended", torch.zeros(3), "'survival/ended' does not fit"),
+        ("random_state", torch.zeros(5, dtype=torch.uint8), "'random_state' does not"),
+    ],
+)
+def test_a_tensor_that_does_not_fit_is_named_before_anything_is_loaded(
+    name, value, message, trained: Trainer
+):
+    tensors, header = trained.run.load_checkpoint()
+    before = trained.agent.head.log_std.detach().clone()
+    tensors["agent/head.log_std"] = before / 2
+    if value is None:
+        del tensors[name]
+    else:
+        tensors[name] = value
+    with pytest.raises(ValueError, match=message):
+        trained.load(tensors, header)
+    assert torch.equal(trained.agent.head.log_std, before)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("frames", None),
+        ("frames", -1),
+        ("frames", "many"),
+        ("wall_s", float("nan")),
+        ("learning_rate", 0.0),
+        ("learning_rate", [1]),
+    ],
+)
+def test_a_header_that_no_training_writes_is_refused(name, value, trained: Trainer):
+    tensors, header = trained.run.load_checkpoint()
+    if value is None:
+        del header[name]
+    else:
+        header[name] = value
+    with pytest.raises(ValueError, match=name):
+        trained.load(tensors, header)
+
+
+# --- what is logged -----------------------------------------------------------------
+
+
+def test_an_episode_ends_by_one_cause(trained: Trainer):
+    flags = {k: torch.zeros(4, dtype=torch.bool) for k in METRIC_KEYS}
+    # Of four: hit and thrown over; hit; fallen; and one that goes on.
+    flags["hit"][:2] = True
+    flags["fallen"][[0, 2]] = True
+    flags["terminated"][:3] = True
+    info = TensorDict({k: v[None, :, None] for k, v in flags.items()}, [1, 4])
+    for key in ("episode_step", "first_throw_step"):
+        info[key] = torch.zeros(1, 4, 1, dtype=torch.int64)
+    info["reward"] = torch.zeros(1, 4, 1)
+    info["reward_terms"] = torch.zeros(1, 4, len(TERMS))
+    metrics = trained._episode_metrics(info)
+    assert metrics["episode/ended_by_ball"] == pytest.approx(2 / 3)
+    assert metrics["episode/ended_by_fall"] == pytest.approx(1 / 3)
+
+
+@pytest.mark.parametrize("back", [False, True])
+def test_tensorboard_shows_each_point_once(
+    back: bool, config: TrainConfig, monkeypatch
+):
+    now = time.time_ns()
+    run = Run.create(config)
+    with open_trainer(run) as trainer:
+        # Logged after the checkpoint at frame 0, as if the process had been killed.
+        run.log(trainer.iterate())
+    if back:
+        monkeypatch.setattr(time, "time_ns", lambda: now - 10**15)
+    again = Run.open(run.path)
+    with open_trainer(again) as trainer:
+        train(trainer)
+    events = EventAccumulator(str(run.path))
+    events.Reload()
+    steps = [point.step for point in events.Scalars("reward/mean")]
+    assert steps == [64, 128, 192]

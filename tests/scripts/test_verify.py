@@ -1,0 +1,114 @@
+"""scripts/verify.py: exact training passes, inexact training is found."""
+
+from __future__ import annotations
+
+import runpy
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from egoskin.make import EnvConfig
+from egoskin.parallel import WorkerPool
+from egoskin.runs.run import Run, TrainConfig
+from egoskin.sensors.config import SensorConfig
+from egoskin.sensors.kernels.compilation import SETTING
+from egoskin.storage.tensor_file import load_tensors, save_tensors
+
+SCRIPT = str(Path(__file__).parents[2] / "scripts" / "verify.py")
+
+
+def verify(monkeypatch, *args: str) -> None:
+    monkeypatch.setattr(sys, "argv", ["verify.py", *args])
+    runpy.run_path(SCRIPT, run_name="__main__")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("sensor", "skins"),
+    [
+        ([], 2),
+        (["--sensor.coverage", "ray", "--sensor.signal", "closeness"], 2),
+        # Nothing that could be corrupted.
+        (["--sensor.signal", "localization"], 1),
+        (["--sensor.coverage", "none"], 1),
+    ],
+    ids=["field", "ray", "localization", "blind"],
+)
+def test_training_is_exact(sensor, skins, monkeypatch, capsys):
+    monkeypatch.delenv(SETTING)
+    # 6 rollouts: the first throws land, rows reset at different times.
+    verify(monkeypatch, "--num-envs", "64", "--iterations", "6", *sensor)
+    text = capsys.readouterr().out
+    assert "equal: training is exact" in text
+    # Of 64 and of 45 agents.
+    assert text.count("gone on with after 3 rollouts") == 2 * skins
+    assert text.count("compiled kernels") == 3 * skins
+    assert text.count("plain kernels") == 3 * skins
+    assert "5 workers, 2 physics threads, 4 learner threads, plain kernels" in text
+
+
+@pytest.mark.slow
+def test_training_is_exact_at_the_default_size(monkeypatch):
+    monkeypatch.delenv(SETTING)
+    verify(monkeypatch, "--iterations", "4")
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_a_difference_of_one_bit_is_found(exact, monkeypatch, tmp_path, capsys):
+    # One state of the environment is off by a bit, for two workers only.
+    state = WorkerPool.simulation_state
+
+    def off_by_a_bit(self: WorkerPool) -> dict[str, torch.Tensor]:
+        result = state(self)
+        if self.num_workers == 2:
+            next(iter(result.values())).view(torch.uint8).view(-1)[0] ^= 1
+        return result
+
+    if not exact:
+        monkeypatch.setattr(WorkerPool, "simulation_state", off_by_a_bit)
+    config = TrainConfig(num_envs=16, total_frames=2 * 16 * 16)
+    agree = runpy.run_path(SCRIPT)["agree"]
+    assert agree(config, tmp_path, "skin", 1) == exact
+    lines = capsys.readouterr().out.splitlines()[1:]
+    assert len(lines) == 4
+    assert (len({line.split()[0] for line in lines}) == 1) == exact
+
+
+def test_the_hash_is_of_values_alone(tmp_path):
+    script = runpy.run_path(SCRIPT)
+    blind = EnvConfig(sensor=SensorConfig(coverage="none"))
+    config = TrainConfig(env=blind, num_envs=16, total_frames=2 * 16 * 16)
+    run = Run.create(replace(config, num_workers=1, run_dir=tmp_path / "run"))
+    with script["open_trainer"](run) as trainer:
+        script["train"](trainer)
+    before = script["run_hash"](run)
+    tensors, header = load_tensors(run.checkpoint_path)
+    metrics = run.path / "metrics.csv"
+    lines = [line.split(",") for line in metrics.read_text().splitlines()]
+
+    # The order of fields and columns, times, and what describes the run do not count.
+    header["policy"], header["wall_s"] = {"other": 1}, -1.0
+    reversed_ = dict(reversed(list(tensors.items())))
+    save_tensors(run.checkpoint_path, reversed_, header)
+    metrics.write_text("\n".join(",".join(reversed(line)) for line in lines) + "\n")
+    assert script["run_hash"](run) == before
+
+    # Every value does.
+    key = "agent/head.log_std"
+    tensors[key] = tensors[key] + 1e-6
+    save_tensors(run.checkpoint_path, tensors, header)
+    other = script["run_hash"](run)
+    assert other != before
+    lines[-1][lines[0].index("reward/mean")] = "7.5"
+    metrics.write_text("\n".join(map(",".join, lines)) + "\n")
+    assert script["run_hash"](run) not in (before, other)
+
+
+def test_sizes_that_cannot_be_split_are_refused(monkeypatch, capsys):
+    with pytest.raises(SystemExit) as ended:
+        verify(monkeypatch, "--num-envs", "30")
+    assert ended.value.code == 2
+    assert "multiple of 4" in capsys.readouterr().err

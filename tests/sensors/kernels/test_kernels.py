@@ -1,0 +1,462 @@
+"""The C++ kernels: the bits of the PyTorch code, which is tested against MuJoCo."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import ctypes
+import io
+import math
+import multiprocessing
+import os
+import pickle
+import resource
+import signal
+import stat
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from egoskin.parallel import start_server
+from egoskin.robots.chains import build_chain
+from egoskin.robots.config import H1_2
+from egoskin.sensors import Field, FieldSensor, Ray, RaySensor, Skin
+from egoskin.sensors.kernels import compilation
+from egoskin.sensors.kernels.compilation import can_compile, load_library
+from egoskin.shapes import Box, Sphere
+from sensing import KEYS, SEED, assert_same_bits, measure
+
+BALLS = (Sphere(radius=0.15), Sphere(radius=0.4), Sphere(radius=0.02))
+DTYPES = st.sampled_from([torch.float32, torch.float64])
+
+needs_compiler = pytest.mark.skipif(not can_compile(), reason="needs a C++ compiler")
+
+
+@pytest.fixture(autouse=True)
+def compiling(monkeypatch) -> Iterator[None]:
+    """Compile, as users do and other tests do not."""
+    monkeypatch.delenv(compilation.SETTING)
+    yield
+    compilation._loaded.cache_clear()
+
+
+def pair(kind, *args, **options):
+    """The same sensor in PyTorch and in C++."""
+    plain, fast = (kind(*args, **options, compile=c) for c in (False, True))
+    assert plain._kernels is None
+    assert fast._kernels._library is not None
+    return plain, fast
+
+
+def assert_same(fast, plain) -> None:
+    """Equal; in float64 but for the last bit, which PyTorch's root does not round."""
+    for a, b in zip(fast, plain, strict=True):
+        atol = 1e-14 if a.dtype == torch.float64 else 0
+        torch.testing.assert_close(a, b, rtol=0, atol=atol, equal_nan=True)
+
+
+def draw(skin: Skin, coverages, rng) -> Skin:
+    """Some sensors, with ranges, rolls and coverages drawn for each."""
+    some = skin.select(rng.permutation(len(skin))[: rng.integers(1, 40)])
+    rolls, kinds = rng.uniform(-180, 180, len(some)), len(coverages)
+    return replace(
+        some,
+        coverage=tuple(coverages[i] for i in rng.integers(kinds, size=len(some))),
+        range=np.exp(rng.uniform(math.log(0.1), math.log(4), len(some))),
+        roll_deg=rolls,
+    )
+
+
+def draw_state(random_state, rng, dtype):
+    """(balls, state): one to three balls, near and far, some in play, some NaN."""
+    count, rows = rng.integers(1, 4), rng.integers(1, 50)
+    state = random_state(rows, int(rng.integers(1000)), dtype, objects=count)
+    state["object_pose"][::3, :, :3] *= 3
+    for key in ("base_pose", "joint_pos", "object_pose"):
+        if rng.random() < 0.3:
+            flat = state[key].view(rows, -1)
+            flat[rng.integers(rows), rng.integers(flat.shape[1])] = math.nan
+    return BALLS[:count], state
+
+
+@needs_compiler
+@given(SEED, DTYPES, st.booleans())
+def test_fields_have_the_same_bits(skin, random_state, seed, dtype, per_object):
+    rng = np.random.default_rng(seed)
+    wide, narrow = Field(), Field(half_angle_deg=rng.uniform(5, 175))
+    centre = Field(half_angle_deg=rng.uniform(5, 175), measure="centre")
+    coverages = ([wide], [wide, narrow], [wide, narrow, centre])[rng.integers(3)]
+    balls, state = draw_state(random_state, rng, dtype)
+    some = draw(skin, coverages, rng)
+    plain, fast = pair(FieldSensor, some, H1_2.chain, balls, 1.0, per_object=per_object)
+    assert_same(measure(fast, state), measure(plain, state))
+    joints = state["joint_pos"]
+    assert_same_bits(fast.poses_b(joints), plain.poses_b(joints))
+
+
+@needs_compiler
+@given(SEED, DTYPES, st.sampled_from(["none", "min"]), st.booleans(), st.booleans())
+def test_rays_have_the_same_bits(
+    skin, random_state, seed, dtype, reduce, per_object, cull
+):
+    rng = np.random.default_rng(seed)
+    grid, sub_beams = [((4, 4), 1), ((8, 8), 1), ((3, 5), 1), ((3, 2), 3)][
+        rng.integers(4)
+    ]
+    common = {"grid": grid, "sub_beams": sub_beams}
+    coverages = [
+        Ray(**common),
+        Ray(**common, fov_deg=rng.uniform(10, 170), measure="depth"),
+    ][: rng.integers(1, 3)]
+    balls, state = draw_state(random_state, rng, dtype)
+    plain, fast = pair(
+        RaySensor,
+        *(draw(skin, coverages, rng), H1_2.chain, balls, 1.0),
+        reduce=reduce,
+        per_object=per_object,
+        cull=cull,
+    )
+    assert_same(measure(fast, state), measure(plain, state))
+    if reduce == "none" and not per_object:
+        inputs = [state[key] for key in KEYS]
+        assert_same(fast.hits(*inputs), plain.hits(*inputs))
+
+
+@needs_compiler
+@pytest.mark.parametrize("per_object", [False, True])
+@pytest.mark.parametrize("shift", [0, 4], ids=["whole lines", "shifted"])
+def test_a_grid_larger_than_the_cache_has_the_same_bits(
+    skin, random_state, per_object, shift
+):
+    state = random_state(2200, seed=1, objects=2)
+    state["joint_pos"][7, 3] = math.nan
+    inputs = [state[key] for key in KEYS]
+    args = (skin, H1_2.chain, BALLS[:2], 1.0)
+    plain, fast = pair(RaySensor, *args, per_object=per_object)
+    expected = plain.compute(*inputs)
+    size = expected[0].numel()
+    assert 4 * size > 32 * 2**20
+    buffer = torch.full((shift + size + 100,), -1.0)
+    planes = (2, *expected[0].shape[:3]) if per_object else expected[0].shape
+    out = buffer[shift : shift + size].view(planes)
+    assert_same_bits(fast.compute(*inputs, out=out), expected)
+    # Nothing is written beside it.
+    assert (buffer[:shift] == -1).all()
+    assert (buffer[shift + size :] == -1).all()
+
+
+@needs_compiler
+def test_many_hits_find_room(skin, random_state):
+    # From within a ball every beam hits: more than the first call has room for.
+    plain, fast = pair(RaySensor, skin, H1_2.chain, [Sphere(radius=3)], math.inf)
+    inputs = [random_state(5, objects=1)[key] for key in KEYS]
+    inputs[3] = torch.ones_like(inputs[3])
+    assert_same_bits(fast.hits(*inputs), plain.hits(*inputs))
+    assert len(fast.hits(*inputs)[0]) > 5 * 64 * 32
+
+
+@needs_compiler
+def test_joints_of_every_kind_have_the_same_bits():
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><body name="base"><freejoint/><geom size="0.1"/>
+        <body name="rail" pos="0.1 0 0.2" euler="20 30 40">
+          <joint name="slide" type="slide" axis="1 2 0"/><geom size="0.1"/>
+          <body name="mount" pos="0 0 0.3" euler="0 50 0"><geom size="0.1"/>
+            <body name="arm" pos="0 0.2 0"><joint name="turn" axis="1 1 1"/>
+              <geom size="0.1"/></body></body></body></body></worldbody></mujoco>"""
+    )
+    chain, links = build_chain(model, "base"), ("base", "rail", "mount", "arm")
+    skin = Skin(
+        robot="rail",
+        links=links,
+        position=np.full((4, 3), 0.05),
+        normal=np.array([[0.6, 0, 0.8]] * 4),
+    )
+    plain, fast = pair(FieldSensor, skin, chain, BALLS[:1], 1.0)
+    joints = torch.randn(40, 2, generator=torch.Generator().manual_seed(0))
+    assert_same_bits(fast.poses_b(joints), plain.poses_b(joints))
+    assert fast.poses_b(joints)[0][:, 3].std() > 0.1
+
+
+@needs_compiler
+def test_inputs_may_be_slices(skin, random_state):
+    plain, fast = pair(FieldSensor, skin, H1_2.chain, BALLS[:1], 2.0)
+    state = random_state(90, seed=3, objects=2)[::3]
+    inputs = [state[key] for key in KEYS]
+    inputs[2:] = [x[:, :1] for x in inputs[2:]]
+    inputs[1] = inputs[1].t().contiguous().t()
+    assert_same_bits(fast.compute(*inputs), plain.compute(*inputs))
+
+
+@needs_compiler
+def test_gradients_flow(skin, random_state):
+    _, fast = pair(FieldSensor, skin, H1_2.chain, BALLS[:1], math.inf)
+    inputs = [random_state(5, objects=1)[key] for key in KEYS]
+    inputs[3] = torch.ones_like(inputs[3])
+    inputs[1].requires_grad_()
+    fast.compute(*inputs)[0].sum().backward()
+    assert inputs[1].grad.abs().sum() > 0
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    "copied", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))]
+)
+def test_a_copy_measures_the_same(skin, random_state, copied):
+    _, fast = pair(RaySensor, skin, H1_2.chain, BALLS[:1], 2.0)
+    state = random_state(5, objects=1)
+    assert_same_bits(measure(copied(fast), state), measure(fast, state))
+
+
+def test_what_the_kernels_lack_is_computed_in_pytorch(skin, random_state):
+    for objects, body in (([Box(half_extents=(0.1, 0.2, 0.3))], ()),
+                          (BALLS[:1], H1_2.primitives)):  # fmt: skip
+        args = (skin, H1_2.chain, objects, 1.0)
+        plain = FieldSensor(*args, body=body)
+        asked = FieldSensor(*args, body=body, compile=True)
+        assert asked._kernels is None
+        state = random_state(20, objects=1)
+        assert_same_bits(measure(asked, state), measure(plain, state))
+
+
+# --- the library ------------------------------------------------------------------
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch) -> Path:
+    """The folder of the compiled libraries, not there yet."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return tmp_path / "cache" / "egoskin"
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    path = tmp_path / "one.cpp"
+    path.write_text('extern "C" int one() { return 1; }')
+    return path
+
+
+def load_anew(source: Path) -> ctypes.CDLL | None:
+    """Load as another process would."""
+    compilation._loaded.cache_clear()
+    return load_library(source)
+
+
+def is_one(library: ctypes.CDLL | None) -> bool:
+    return library is not None and library.one() == 1
+
+
+def told(caplog) -> list[str]:
+    """What was logged since the last call."""
+    messages = [record.getMessage() for record in caplog.records]
+    caplog.clear()
+    return messages
+
+
+def check_stays_plain(source: Path, caplog, *expected: str) -> None:
+    """Loading gives nothing, and says why in one line, once."""
+    assert load_anew(source) is None
+    assert load_library(source) is None
+    lines = [line for line in told(caplog) if not line.startswith("compiling")]
+    assert len(lines) == 1
+    for text in ("one.cpp stays uncompiled", *expected):
+        assert text in lines[0]
+    assert "\n" not in lines[0]
+
+
+@needs_compiler
+def test_a_library_is_compiled_once_for_this_user_alone(source, cache, caplog):
+    assert is_one(load_anew(source))
+    assert told(caplog) == ["compiling one.cpp: some seconds, once on a machine"]
+    (file,) = cache.iterdir()
+    assert stat.S_IMODE(cache.stat().st_mode) == 0o700
+    before = file.stat()
+    assert is_one(load_anew(source))
+    assert told(caplog) == []
+    assert file.stat() == before
+    # What others could write to is closed before anything is taken from it.
+    cache.chmod(0o777)
+    assert is_one(load_anew(source))
+    assert stat.S_IMODE(cache.stat().st_mode) == 0o700
+
+
+@needs_compiler
+@pytest.mark.parametrize("damage", ["cut", "empty", "bit", "folder"])
+def test_a_damaged_library_is_compiled_again(source, cache, caplog, damage):
+    load_anew(source)
+    (file,) = cache.iterdir()
+    content = file.read_bytes()
+    # Not in place: this process has it mapped.
+    file.unlink()
+    if damage == "folder":
+        file.mkdir()
+        # Its name is taken: nothing can be kept.
+        check_stays_plain(source, caplog, "Is a directory", str(file))
+        return
+    flipped = bytes([content[-1] ^ 1])
+    changed = {"cut": content[:4096], "empty": b"", "bit": content[:-1] + flipped}
+    file.write_bytes(changed[damage])
+    caplog.clear()
+    assert is_one(load_anew(source))
+    assert told(caplog) == ["compiling one.cpp: some seconds, once on a machine"]
+    assert [path.read_bytes() for path in cache.iterdir()] == [content]
+
+
+@needs_compiler
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a file away")
+def test_what_belongs_to_another_user_is_not_loaded(source, cache, caplog):
+    load_anew(source)
+    (file,) = cache.iterdir()
+    os.chown(file, 12345, -1)
+    assert is_one(load_anew(source))
+    assert file.stat().st_uid == 0
+    os.chown(cache, 12345, -1)
+    caplog.clear()
+    check_stays_plain(source, caplog, f"{cache} is no folder of this user")
+
+
+@needs_compiler
+def test_a_link_to_a_folder_is_no_cache(source, cache, caplog, tmp_path):
+    cache.parent.mkdir()
+    (tmp_path / "other").mkdir()
+    cache.symlink_to(tmp_path / "other")
+    check_stays_plain(source, caplog, f"{cache} is no folder of this user")
+    assert not list((tmp_path / "other").iterdir())
+
+
+@needs_compiler
+def test_a_cache_that_cannot_be_made_leaves_sensors_plain(source, cache, caplog):
+    cache.parent.write_text("")
+    check_stays_plain(source, caplog, f"Not a directory: '{cache}'")
+    cache.parent.unlink()
+    cache.parent.mkdir()
+    cache.write_text("")
+    check_stays_plain(source, caplog, f"File exists: '{cache}'")
+
+
+@needs_compiler
+def test_a_full_disk_leaves_sensors_plain(source, cache, caplog, monkeypatch):
+    compiled = compilation._compile
+
+    def fill_disk(*args) -> bytes:
+        content = compiled(*args)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (len(content) // 2, hard))
+        return content
+
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    monkeypatch.setattr(compilation, "_compile", fill_disk)
+    try:
+        check_stays_plain(source, caplog, "File too large", str(cache))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert not list(cache.iterdir())
+
+
+BROKEN = {
+    "fails": ("echo one; echo 'no error: but this' >&2; exit 1", "no error: but this"),
+    "says nothing": ("exit 3", "exit status 3"),
+    "is killed": ("kill -9 $$", "exit status -9"),
+    "writes nothing": ("exit 0", "No such file"),
+    "writes nonsense": ('for to; do :; done; echo nonsense > "$to"', "too short"),
+}
+
+
+@pytest.mark.parametrize("how", BROKEN)
+def test_a_broken_compiler_leaves_sensors_plain(
+    source, cache, caplog, tmp_path, monkeypatch, how
+):
+    script, expected = BROKEN[how]
+    compiler = tmp_path / "broken"
+    compiler.write_text(f"#!/bin/sh\n{script}\n")
+    compiler.chmod(0o755)
+    monkeypatch.setenv("CXX", str(compiler))
+    check_stays_plain(source, caplog, expected)
+    assert not list(cache.iterdir())
+
+
+def test_without_a_compiler_sensors_measure_the_same(
+    skin, random_state, monkeypatch, caplog
+):
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.delenv("CXX", raising=False)
+    compilation._loaded.cache_clear()
+    args, state = (skin, H1_2.chain, BALLS[:1], 1.0), random_state(20, objects=1)
+    plain, asked = (FieldSensor(*args, compile=c) for c in (False, True))
+    (line,) = told(caplog)
+    assert "no C++ compiler was found: install g++" in line
+    copied = copy.deepcopy(asked)
+    compilation._loaded.cache_clear()
+    for sensor in (asked, copied):
+        assert_same_bits(measure(sensor, state), measure(plain, state))
+
+
+@needs_compiler
+def test_a_worker_neither_compiles_nor_says_so(source, cache):
+    start_server()
+    forkserver = multiprocessing.get_context("forkserver")
+    with forkserver.Pool(1) as pool:
+        work = partial(pool.apply, in_worker, (source, str(cache.parent)))
+        assert work() == (False, "")
+        assert not list(cache.iterdir())
+        assert is_one(load_anew(source))
+        assert work() == (True, "")
+
+
+def in_worker(source: Path, cache: str) -> tuple[bool, str]:
+    """Load in a process whose environment is that of its server."""
+    os.environ["XDG_CACHE_HOME"] = cache
+    os.environ.pop(compilation.SETTING, None)
+    with contextlib.redirect_stderr(io.StringIO()) as said:
+        return is_one(load_anew(source)), said.getvalue()
+
+
+@needs_compiler
+def test_a_killed_compilation_leaves_nothing_in_the_cache(source, cache, tmp_path):
+    compiler = tmp_path / "slow"
+    compiler.write_text(f"#!/bin/sh\ntouch {tmp_path}/begun\nexec sleep 100\n")
+    compiler.chmod(0o755)
+    code = (
+        "import pathlib, sys\n"
+        "from egoskin.sensors.kernels.compilation import load_library\n"
+        "load_library(pathlib.Path(sys.argv[1]))"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code, str(source)],
+        env={**os.environ, "CXX": str(compiler), "TMPDIR": str(tmp_path)},
+        start_new_session=True,
+        stderr=subprocess.DEVNULL,
+    ) as compiling:
+        while not (tmp_path / "begun").exists():
+            assert compiling.poll() is None
+            time.sleep(0.02)
+        os.killpg(compiling.pid, signal.SIGKILL)
+    assert not list(cache.iterdir())
+
+
+@needs_compiler
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:`torch.jit.script_method` is deprecated")
+def test_compiled_by_torch_a_sensor_measures_the_same(skin, random_state):
+    some = skin.select([i for i, x in enumerate(skin.links) if x == "torso_link"][:9])
+    state = random_state(101, seed=5, objects=1)
+    state["joint_pos"][7] = math.nan
+    sensor = FieldSensor(some, H1_2.chain, BALLS[:1], 2.0, Field(half_angle_deg=70))
+    scene = sensor.scene(*(state[key] for key in KEYS))
+    compiled = torch.compile(sensor.distances, fullgraph=True)
+    assert_same_bits([compiled(scene)], [sensor.distances(scene)])
+    # The whole of it breaks into graphs where the number of hits decides a shape.
+    inputs = [state[key] for key in KEYS]
+    for reduce in ("none", "min"):
+        ray = RaySensor(some, H1_2.chain, BALLS[:1], 2.0, reduce=reduce)
+        assert_same_bits(torch.compile(ray.compute)(*inputs), ray.compute(*inputs))

@@ -1,0 +1,214 @@
+"""What the robot's body hides from its sensors, against MuJoCo's rays."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+
+from egoskin.robots.config import H1_2
+from egoskin.robots.kinematics import rotate_inverse
+from egoskin.sensors import FieldSensor, Ray, RaySensor, Skin, occlusion
+from egoskin.shapes import Box, Capsule, Ellipsoid, Sphere
+from sensing import SEED, measure, turned
+
+RANGE = 2.0
+SHAPES = (
+    Sphere(radius=0.15),
+    Box(half_extents=(0.1, 0.2, 0.05)),
+    Capsule(radius=0.05, half_length=0.3),
+    Ellipsoid(semi_axes=(0.2, 0.1, 0.15)),
+)
+BALL = SHAPES[0]
+WIDE = Ray(grid=(4, 4), fov_deg=120)
+BODY = H1_2.primitives
+
+
+def crowd(random_state, seed: int, rows: int = 6):
+    """States in float64 with four active objects, turned anyhow."""
+    state = turned(random_state(rows, seed, torch.float64, objects=4), seed)
+    state["object_active"][:] = True
+    return state
+
+
+def stands_in_the_way(model, data, geom, place, way, length) -> bool:
+    def hit(direction) -> float:
+        return mujoco.mju_rayGeom(
+            data.geom_xpos[geom],
+            data.geom_xmat[geom],
+            model.geom_size[geom],
+            place,
+            direction,
+            model.geom_type[geom],
+        )
+
+    # A path that starts inside meets the solid ahead and behind, however short it is.
+    ahead = hit(way)
+    return ahead >= 0 and (ahead < length or hit(-way) >= 0)
+
+
+def mujoco_blocks(skin, state, row, sensor, ways, lengths, larger: float) -> np.ndarray:
+    """Whether a robot larger by some length [m] stands in the way, ``[n]``.
+
+    Paths are given by their row, sensor, direction in the sensor's frame and length.
+    """
+    spec = H1_2.spec()
+    for geom in spec.geoms:
+        geom.size = np.where(geom.size > 0, geom.size + larger, geom.size)
+    model = spec.compile()
+    data, frames = mujoco.MjData(model), skin.rotation()
+    result = []
+    for r, s, way, length in zip(row, sensor, ways, lengths, strict=True):
+        data.qpos[:7], data.qpos[7:] = state["base_pose"][r], state["joint_pos"][r]
+        mujoco.mj_kinematics(model, data)
+        link = data.body(skin.links[s])
+        turn = link.xmat.reshape(3, 3)
+        way = turn @ frames[s] @ way
+        # Off the surface that the sensor sits on.
+        place = link.xpos + turn @ skin.position[s] + 1e-4 * way
+        result.append(
+            any(
+                stands_in_the_way(model, data, geom, place, way, length)
+                for geom in range(model.ngeom)
+            )
+        )
+    return np.array(result, dtype=bool)
+
+
+def assert_hidden_as_in_mujoco(hidden, *paths) -> None:
+    """Blocked by a robot thinner by 5 mm: hidden; not even touched: seen."""
+    surely, touched = (mujoco_blocks(*paths, larger) for larger in (-5e-3, 0.0))
+    assert hidden[surely].all()
+    assert not hidden[~touched].any()
+
+
+@settings(max_examples=25)
+@given(SEED)
+def test_a_ray_sees_what_mujoco_sees_before_the_robot(skin, random_state, seed):
+    some = skin.select(np.random.default_rng(seed).permutation(len(skin))[:16])
+    state = crowd(random_state, seed)
+    clear, solid = (
+        measure(
+            RaySensor(some, H1_2.chain, SHAPES, RANGE, WIDE, body=b, per_object=True),
+            state,
+        )[0]
+        for b in ((), BODY)
+    )
+    # The same or nothing, never more.
+    assert (solid.isinf() | (solid == clear)).all()
+    row, sensor, beam, _ = places = clear.isfinite().nonzero().unbind(1)
+    hidden = solid[places].isinf().numpy()
+    ways = WIDE.directions()[beam, 0]
+    assert_hidden_as_in_mujoco(hidden, some, state, row, sensor, ways, clear[places])
+
+
+@settings(max_examples=25)
+@given(SEED)
+def test_a_field_sees_what_mujoco_sees_before_the_robot(skin, random_state, seed):
+    some = skin.select(np.random.default_rng(seed).permutation(len(skin))[:32])
+    state = crowd(random_state, seed)
+    state["object_pose"] = state["object_pose"][:, :1]
+    state["object_active"] = state["object_active"][:, :1]
+    clear, solid = (
+        FieldSensor(some, H1_2.chain, [BALL], RANGE, body=b) for b in ((), BODY)
+    )
+    distance, seen = measure(clear, state)[0], measure(solid, state)[0]
+    assert (seen.isinf() | (seen == distance)).all()
+    # The path to a ball's closest point leads to its centre.
+    position, rotation = clear.poses_b(state["joint_pos"])
+    offset = state["object_pose"][:, 0, :3] - state["base_pose"][:, :3]
+    centre = rotate_inverse(state["base_pose"][:, 3:], offset)
+    ways = torch.nn.functional.normalize(centre[:, None] - position, dim=-1)
+    ways = (rotation.mT @ ways[..., None])[..., 0]
+    near = distance.isfinite() & (distance > 1e-3)
+    row, sensor = near.nonzero().unbind(1)
+    assert_hidden_as_in_mujoco(
+        seen[near].isinf().numpy(),
+        *(some, state, row, sensor, ways[near].numpy(), distance[near]),
+    )
+
+
+# --- what may not change a bit --------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", [FieldSensor, partial(RaySensor, coverage=WIDE)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_leaving_parts_of_the_body_out_changes_nothing(
+    skin, random_state, kind, dtype, monkeypatch
+):
+    state = crowd(random_state, 3, rows=64)
+    state = state.apply(lambda x: x.to(dtype) if x.is_floating_point() else x)
+    # Around a sensor, at its centre even.
+    state["object_pose"][0, 0, :3] = state["base_pose"][0, :3]
+    clear = kind(skin, H1_2.chain, SHAPES, math.inf, per_object=True)
+    sensor = kind(skin, H1_2.chain, SHAPES, math.inf, body=BODY, per_object=True)
+    distance, detected = measure(sensor, state)
+    monkeypatch.setattr(occlusion, "_SLACK", math.inf)
+    everything = measure(sensor, state)
+    assert torch.equal(distance, everything[0])
+    assert torch.equal(detected, everything[1])
+    assert (distance.isinf() & measure(clear, state)[0].isfinite()).any()
+
+
+# --- by hand --------------------------------------------------------------------
+
+
+def chest(front: bool) -> Skin:
+    """A sensor on the middle of the front or the back of the torso's box."""
+    (box,) = (p for p in BODY if p.link == "torso_link" and p.kind == "box")
+    x = np.array([1.0 if front else -1.0, 0, 0])
+    return Skin(
+        robot="h1_2",
+        links=("torso_link",),
+        position=(box.position + box.rotation @ (x * box.size))[None],
+        normal=(box.rotation @ x)[None],
+    )
+
+
+def look(sensor, skin, way, quat=(1, 0, 0, 0)):
+    """(distance, detected) of an object some way from a sensor, default pose."""
+    joint_pos = torch.from_numpy(H1_2.default_joint_pos)[None]
+    position, _ = sensor.poses_b(joint_pos)
+    base = torch.tensor([[0, 0, 0, 1, 0, 0, 0]], dtype=torch.float64)
+    centre = position[0, 0] + torch.tensor(way, dtype=torch.float64)
+    pose = torch.cat((centre, torch.tensor(quat, dtype=torch.float64)))[None, None]
+    distance, detected = sensor.compute(
+        base, joint_pos, pose, torch.ones(1, 1, dtype=torch.bool)
+    )
+    return distance.min().item(), detected.item()
+
+
+def test_the_torso_hides_what_is_behind_it_from_its_front_alone():
+    # The ball's centre is 1 m from the sensor; its surface 0.15 m nearer.
+    for way, sees in (((1.0, 0, 0), True), ((-1.0, 0, 0), False)):
+        skin = chest(front=True)
+        clear, solid = (
+            FieldSensor(skin, H1_2.chain, [BALL], RANGE, body=b) for b in ((), BODY)
+        )
+        distance, detected = look(clear, skin, way)
+        assert detected
+        assert distance == pytest.approx(0.85, abs=1e-6)
+        assert look(solid, skin, way) == ((distance if sees else math.inf), sees)
+
+
+def test_turned_to_the_back_the_same_ball_is_seen():
+    skin, way = chest(front=False), (-1.0, 0, 0)
+    for sensor in (
+        FieldSensor(skin, H1_2.chain, [BALL], RANGE, body=BODY),
+        RaySensor(skin, H1_2.chain, [BALL], RANGE, body=BODY),
+    ):
+        distance, detected = look(sensor, skin, way)
+        assert detected
+        # No beam of an even grid runs along the normal.
+        assert 0.85 - 1e-6 <= distance < 0.9
+
+
+def test_an_object_around_the_sensor_is_not_hidden():
+    skin = chest(front=True)
+    sensor = FieldSensor(skin, H1_2.chain, [Sphere(radius=0.5)], RANGE, body=BODY)
+    assert look(sensor, skin, (0.1, 0, 0)) == (0.0, True)

@@ -1,0 +1,75 @@
+"""What is read of other people's paths, and what is refused without a wait."""
+
+from __future__ import annotations
+
+import os
+import socket
+from pathlib import Path
+
+import pytest
+
+from egoskin.storage.files import check_regular, read_regular
+
+
+def test_a_file_is_read_whole_and_through_a_link(tmp_path: Path):
+    (tmp_path / "file").write_bytes(b"\x00ab\r\n")
+    (tmp_path / "link").symlink_to("file")
+    assert read_regular(tmp_path / "file") == b"\x00ab\r\n"
+    assert read_regular(str(tmp_path / "link"), limit=5) == b"\x00ab\r\n"
+
+
+@pytest.fixture
+def odd(tmp_path: Path) -> dict[str, Path]:
+    """Paths that are no regular files, by what they are called."""
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to("pipe")
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind(str(tmp_path / "socket"))
+    return {
+        "a folder": tmp_path,
+        "a named pipe": tmp_path / "link",
+        "a socket": tmp_path / "socket",
+        "a device": Path("/dev/zero"),
+    }
+
+
+@pytest.mark.parametrize("kind", ["a folder", "a named pipe", "a socket", "a device"])
+@pytest.mark.parametrize("use", [check_regular, read_regular])
+def test_only_regular_files_are_read(use, kind, odd):
+    # A pipe that nobody writes to would be waited for until the test is killed.
+    with pytest.raises(ValueError, match=f"{odd[kind]} must be a file, and is {kind}"):
+        use(odd[kind])
+
+
+def test_a_pipe_put_in_place_of_a_file_is_not_waited_for(tmp_path, monkeypatch):
+    path = tmp_path / "file"
+    path.write_text("text")
+    real_open = os.open
+
+    def swap(name, flags, *args, **options):
+        path.unlink()
+        os.mkfifo(path)
+        return real_open(name, flags, *args, **options)
+
+    monkeypatch.setattr(os, "open", swap)
+    with pytest.raises(ValueError, match="named pipe"):
+        read_regular(path)
+
+
+@pytest.mark.parametrize("use", [check_regular, read_regular])
+def test_a_file_may_be_as_large_as_the_limit_and_no_larger(use, tmp_path: Path):
+    path = tmp_path / "file"
+    path.write_bytes(b"12345")
+    use(path, limit=5)
+    with pytest.raises(ValueError, match="at most 4 bytes, and has 5"):
+        use(path, limit=4)
+    # A file of holes takes no disk, and would take memory.
+    os.truncate(path, 10**12)
+    with pytest.raises(ValueError, match="and has 1,000,000,000,000"):
+        use(path)
+
+
+@pytest.mark.parametrize("use", [check_regular, read_regular])
+def test_a_missing_file_is_named(use, tmp_path: Path):
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        use(tmp_path / "nowhere")

@@ -1,0 +1,412 @@
+"""File formats: nothing damaged loads changed, older files load, newer ones say so."""
+
+from __future__ import annotations
+
+import json
+import random
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import save
+
+import egoskin
+from egoskin.envs.throws import ThrowConfig
+from egoskin.make import EnvConfig
+from egoskin.runs.run import Run, TrainConfig, parse_config
+from egoskin.runs.trainer import open_trainer, train
+from egoskin.sensors.config import SensorConfig
+from egoskin.storage.formats import (
+    FORMAT,
+    content_hash,
+    migrate,
+    read_sealed,
+    seal,
+    sealed_json,
+    unseal,
+)
+from egoskin.storage.serialization import to_plain
+from egoskin.storage.tensor_file import load_tensors, save_tensors
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory) -> Path:
+    """A run of two rollouts of 64 frames; tests copy it."""
+    config = TrainConfig(
+        env=EnvConfig(sensor=SensorConfig(coverage="none")),
+        run_dir=tmp_path_factory.mktemp("formats") / "run",
+        num_envs=4,
+        num_workers=1,
+        total_frames=128,
+    )
+    run = Run.create(config)
+    with open_trainer(run) as trainer:
+        train(trainer)
+    return run.path
+
+
+@pytest.fixture
+def run(trained: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(trained, tmp_path / "run"))
+
+
+def rewrite(file: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """Change a sealed JSON file as somebody would who seals it again."""
+    content, _ = read_sealed(file)
+    change(content)
+    file.write_bytes(sealed_json(content))
+
+
+def resume(path: Path) -> None:
+    """Go on with a run, to the end of it: nothing is left to be trained."""
+    config = parse_config(["--resume", str(path)])
+    with open_trainer(Run(path, config)) as trainer:
+        train(trainer)
+
+
+# --- damage -----------------------------------------------------------------------
+
+
+def damage(content: bytes, draw: random.Random) -> bytes:
+    """Flip bits, cut, zero, or overwrite with noise: what disks and people do."""
+    spoilt = bytearray(content)
+    start = draw.randrange(len(spoilt))
+    end = min(len(spoilt), start + draw.choice([1, 8, 100, 4096]))
+    kind = draw.choice(["bit", "bit", "zeros", "noise", "cut", "lost", "twice"])
+    if kind == "bit":
+        spoilt[start] ^= 1 << draw.randrange(8)
+    elif kind == "zeros":
+        spoilt[start:end] = bytes(end - start)
+    elif kind == "noise":
+        spoilt[start:end] = draw.randbytes(end - start)
+    elif kind == "cut":
+        del spoilt[start:]
+    elif kind == "lost":
+        del spoilt[start:end]
+    else:
+        spoilt[start:start] = spoilt[start:end]
+    return bytes(spoilt)
+
+
+def policy_content(path: Path) -> Any:
+    policy = egoskin.load_policy(path)
+    tensors = {k: v.tolist() for k, v in policy.state_dict().items()}
+    return policy.policy_spec.header(), tensors
+
+
+def checkpoint_content(path: Path) -> Any:
+    tensors, header = Run.open(path.parent).load_checkpoint()
+    return header, content_hash(None, tensors)
+
+
+def skin_content(path: Path) -> Any:
+    return Run.open(path.parent).load_skin().to_dict()
+
+
+READERS: dict[str, Callable[[Path], Any]] = {
+    "checkpoint.safetensors": checkpoint_content,
+    "policies/000000000128.safetensors": policy_content,
+    "config.json": lambda path: Run.open(path.parent).config,
+    "skin.json": skin_content,
+    "versions.json": lambda path: Run.open(path.parent).starts(),
+    "metrics.csv": lambda path: Run.open(path.parent).metrics(),
+}
+
+
+def test_every_file_of_a_run_is_read_by_a_test_of_damage(trained: Path):
+    files = {str(p.relative_to(trained)) for p in trained.rglob("*") if p.is_file()}
+    others = {f for f in files if f == "lock" or f.startswith("events.out.tfevents")}
+    # Nothing reads the lock; each record of the events has a checksum of its own.
+    assert files - others - {"policies/000000000000.safetensors"} == READERS.keys()
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_a_damaged_file_of_a_run_never_loads_changed(name: str, run: Path):
+    file, read = run / name, READERS[name]
+    content, expected = file.read_bytes(), read(run / name)
+    draw, refused = random.Random(0), 0
+    for _ in range(200):
+        spoilt = damage(content, draw)
+        file.write_bytes(spoilt)
+        found, refusal = expected, None
+        try:
+            found = read(file)
+        except ValueError as error:
+            refusal = str(error)
+        # Blank space between words of JSON may change; and the log of metrics is that
+        # of the checkpoint.
+        assert found == expected, spoilt
+        assert refusal is None or file.name in refusal
+        refused += refusal is not None
+    assert name == "metrics.csv" or refused > 150
+
+
+def test_no_order_of_keys_matters():
+    content = {"b": [1, 2.5, "x"], "a": {"d": None, "c": True}}
+    tensors = {"y": torch.ones(2), "x": torch.zeros(3, dtype=torch.int64)}
+    turned = {"a": {"c": True, "d": None}, "b": [1, 2.5, "x"]}
+    assert content_hash(content, tensors) == content_hash(
+        turned, dict(reversed(tensors.items()))
+    )
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"x": torch.zeros(3)},
+        {"y": torch.zeros(2)},
+        {"x": torch.zeros(2, dtype=torch.int32)},
+        {"x": torch.zeros(2, 1)},
+        {"x": torch.tensor([0.0, -0.0])},
+        {},
+    ],
+    ids=["size", "name", "type", "shape", "bytes", "none"],
+)
+def test_whatever_differs_of_a_tensor_differs_in_the_hash(other):
+    assert content_hash(None, {"x": torch.zeros(2)}) != content_hash(None, other)
+
+
+@pytest.mark.parametrize("key", ["sha256", "format", "egoskin"])
+def test_a_seal_that_lost_a_part_is_none(key: str):
+    content = seal({"x": 1})
+    del content[key]
+    with pytest.raises(ValueError, match=r"my\.json is damaged or was edited"):
+        unseal(content, "my.json")
+
+
+# --- older and newer files ----------------------------------------------------------
+
+
+def test_a_newer_format_names_the_egoskin_it_needs(run: Path):
+    for file in (run / "config.json", run / "checkpoint.safetensors"):
+        content = file.read_bytes()
+        # Both hold JSON; in a header its quotes are escaped.
+        for quote in (b'"', b'\\"'):
+            now = b"format" + quote + b": %d" % FORMAT
+            content = content.replace(now, b"format" + quote + b": 9")
+        file.write_bytes(content)
+    message = r"config\.json has format 9, .* needs egoskin 0\.1\.0 or a later one"
+    with pytest.raises(ValueError, match=message):
+        Run.open(run)
+    with pytest.raises(ValueError, match=r"checkpoint\.safetensors has format 9"):
+        egoskin.load_policy(run)
+
+
+def unsealed(run: Path) -> None:
+    """Make the files of a run what they were in format 1."""
+    config, _ = read_sealed(run / "config.json")
+    del config["skin_sha256"]
+    throws = config["env"]["task"]["throws"]
+    throws.update(aim="body")
+    del throws["first_delay"]
+    config["env"]["sensor"]["numb"] = False
+    config.update(core_frames=[0, 0], slow_start=0.4, compile_kernels=True)
+    (run / "config.json").write_text(json.dumps(config))
+    starts = Run(run, TrainConfig()).starts()
+    (run / "versions.json").write_text(json.dumps(starts))
+    tensors, header = load_tensors(run / "checkpoint.safetensors")
+    del tensors["log/metrics"], header["config"], header["starts"]
+    content = save(tensors, metadata={"egoskin": json.dumps(header)})
+    (run / "checkpoint.safetensors").write_bytes(content)
+
+
+def test_a_configuration_of_format_1_throws_as_it_did_and_is_noted_once(
+    run: Path, capsys
+):
+    unsealed(run)
+    Run.open(run)
+    throws = Run.open(run).config.env.task.throws
+    assert throws.first_delay == (0.0, 0.0) != ThrowConfig().first_delay
+    assert throws.aim == "body"
+    for _ in range(2):
+        assert len(Run.open(run).starts()) == 1
+    lines = capsys.readouterr().err.splitlines()
+    for line, name in zip(lines, ("config.json", "versions.json"), strict=True):
+        assert line.startswith(f"note: {run / name} is of an egoskin without")
+
+
+def test_a_run_of_format_1_goes_on_and_is_sealed(run: Path, capsys):
+    metrics = (run / "metrics.csv").read_bytes()
+    unsealed(run)
+    # After the checkpoint, and cut short.
+    with open(run / "metrics.csv", "ab") as file:
+        file.write(metrics.splitlines(keepends=True)[-1].replace(b"128", b"192", 1))
+        file.write(b"256,1.")
+    resume(run)
+    notes = capsys.readouterr().err.splitlines()
+    assert len(notes) == 3
+    assert all("without checksums" in note for note in notes)
+    assert (run / "metrics.csv").read_bytes() == metrics
+    resume(run)
+    assert len(Run.open(run).starts()) == 3
+    assert capsys.readouterr().err == ""
+
+
+def test_an_option_that_is_no_more_is_refused_where_it_had_an_effect(run: Path):
+    unsealed(run)
+    config = json.loads((run / "config.json").read_text())
+    config["core_frames"] = [0, 7]
+    (run / "config.json").write_text(json.dumps(config))
+    with pytest.raises(ValueError, match=r"config\.json was made with core_frames="):
+        Run.open(run)
+
+
+def test_a_migration_leaves_alone_what_is_there_and_makes_no_parts():
+    given = {"env": {"task": {"throws": {"aim": "box", "first_delay": [0, 1]}}}}
+    assert migrate(given, 1) == (given, {})
+    assert migrate({"ppo": {"gamma": 0.9}}, 1) == ({"ppo": {"gamma": 0.9}}, {})
+    bare, _ = migrate({"env": {}}, 1)
+    assert bare["env"]["task"]["throws"] == {"aim": "body", "first_delay": [0.0, 0.0]}
+    now = {"env": {}, "core_frames": [0, 0]}
+    assert migrate(now, FORMAT) == (now, {})
+
+
+def test_stored_policies_without_a_seal_load_and_say_so(capsys):
+    path = ROOT / "results/blind_seed0/policies/000065536000.safetensors"
+    throws = egoskin.load_policy(path).env_config.task.throws
+    assert (throws.first_delay, throws.aim) == ((0.0, 0.0), "body")
+    egoskin.load_policy(path)
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+# --- edited files -------------------------------------------------------------------
+
+
+def test_an_edited_file_of_a_run_is_not_gone_on_with(run: Path):
+    config = json.loads((run / "config.json").read_text())
+    (run / "config.json").write_text(json.dumps({**config, "seed": 1}))
+    with pytest.raises(ValueError, match=r"config\.json is damaged or was edited"):
+        resume(run)
+
+
+def test_a_configuration_that_was_sealed_again_is_not_what_was_trained(run: Path):
+    rewrite(run / "config.json", lambda content: content.update(seed=1))
+    message = r"config\.json is not what .*checkpoint.* trained with.*\(changed: seed\)"
+    with pytest.raises(ValueError, match=message):
+        resume(run)
+
+
+def test_an_edited_skin_is_not_gone_on_with(run: Path):
+    file = run / "skin.json"
+    skin = json.loads(file.read_text())
+    skin["sensors"][3]["position"][0] += 0.001
+    file.write_text(json.dumps(skin))
+    with pytest.raises(ValueError, match=r"skin\.json is damaged or was edited"):
+        resume(run)
+    # Its hash in config.json brought up to date, too: the checkpoint has its own.
+    rewrite(run / "config.json", lambda c: c.update(skin_sha256=content_hash(skin)))
+    message = r"skin\.json is not the skin that .*checkpoint.* was trained with"
+    with pytest.raises(ValueError, match=message):
+        resume(run)
+
+
+def test_a_skin_is_checked_before_there_is_a_checkpoint(run: Path):
+    for name in ("checkpoint.safetensors", "metrics.csv"):
+        (run / name).unlink()
+    skin = json.loads((run / "skin.json").read_text())
+    skin["sensors"].pop()
+    (run / "skin.json").write_text(json.dumps(skin))
+    with pytest.raises(ValueError, match=r"skin\.json is damaged or was edited"):
+        resume(run)
+
+
+# --- what may change at a resume ----------------------------------------------------
+
+
+def test_machine_settings_may_change_at_a_resume_and_change_nothing(
+    trained: Path, run: Path
+):
+    machine = {
+        "num_workers": 2,
+        "learner_threads": 2,
+        "checkpoint_interval": 5.0,
+        "snapshot_frames": 64,
+    }
+    args = [f"--{k.replace('_', '-')}={v}" for k, v in machine.items()]
+    args += ["--resume", str(run), "--total-frames", "192"]
+    config = parse_config(args)
+    assert {k: getattr(config, k) for k in machine} == machine
+    with open_trainer(Run(run, config)) as trainer:
+        train(trainer)
+    assert Run.open(run).config.num_workers == 2
+    # As the run that goes on as it was.
+    other = Path(shutil.copytree(trained, run.with_name("other")))
+    plain = parse_config(["--resume", str(other), "--total-frames", "192"])
+    with open_trainer(Run(other, plain)) as trainer:
+        train(trainer)
+    one, two = (load_tensors(r / "checkpoint.safetensors")[0] for r in (run, other))
+    assert one.keys() == two.keys()
+    for key in one.keys() - {"log/metrics"}:
+        assert torch.equal(one[key], two[key]), key
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("seed", "1"), ("device", "cuda"), ("num-envs", "8"), ("sensor.range", "1")],
+)
+def test_what_changes_results_may_not(option: str, value: str, run: Path):
+    name = option.replace("-", "_")
+    with pytest.raises(ValueError, match=f"changed: {name}. Only .*--num-workers"):
+        parse_config(["--resume", str(run), f"--{option}", value])
+
+
+def test_a_library_user_cannot_change_results_either(run: Path):
+    config = replace(Run.open(run).config, seed=3)
+    with (
+        pytest.raises(ValueError, match="changed: seed"),
+        open_trainer(Run(run, config)),
+    ):
+        pass
+
+
+# --- logs ---------------------------------------------------------------------------
+
+
+def test_a_removed_or_damaged_log_is_made_again(run: Path, capsys):
+    metrics = (run / "metrics.csv").read_bytes()
+    before = Run.open(run).starts()
+    (run / "metrics.csv").unlink()
+    (run / "versions.json").unlink()
+    resume(run)
+    assert (run / "metrics.csv").read_bytes() == metrics
+    assert Run.open(run).starts()[:1] == before
+    assert capsys.readouterr().err == ""
+    (run / "metrics.csv").write_bytes(b"\0" + metrics[1:])
+    (run / "versions.json").write_text("{}")
+    resume(run)
+    assert (run / "metrics.csv").read_bytes() == metrics
+    assert (run / "metrics-damaged-1.csv").read_bytes() == b"\0" + metrics[1:]
+    assert Run.open(run).starts()[:1] == before
+    assert len(Run.open(run).starts()) == 3
+    assert (run / "versions-damaged-1.json").read_text() == "{}"
+    assert len(capsys.readouterr().err.splitlines()) == 2
+
+
+def test_a_log_removed_while_a_run_trains_is_made_again(run: Path):
+    args = ["--resume", str(run), "--total-frames", "192"]
+    with open_trainer(Run(run, parse_config(args))) as trainer:
+        (run / "metrics.csv").unlink()
+        train(trainer)
+    assert len((run / "metrics.csv").read_text().splitlines()) == 4
+
+
+def test_the_header_of_a_file_of_tensors_is_sealed_with_them(tmp_path: Path):
+    path = tmp_path / "x.safetensors"
+    save_tensors(path, {"a": torch.zeros(3)}, {"frames": 3})
+    content = path.read_bytes()
+    path.write_bytes(content.replace(b'frames\\": 3', b'frames\\": 4'))
+    with pytest.raises(ValueError, match=r"x\.safetensors is damaged or was edited"):
+        load_tensors(path)
+
+
+def test_a_plain_configuration_is_what_comes_back(run: Path):
+    content, number = read_sealed(run / "config.json")
+    assert number == FORMAT
+    del content["skin_sha256"]
+    assert content == to_plain(Run.open(run).config)

@@ -1,0 +1,97 @@
+"""Configurations as plain values: what comes back, and what is refused by name."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+
+from egoskin.runs.run import TrainConfig
+from egoskin.storage.serialization import from_plain, read_json, to_plain
+
+
+def test_a_configuration_comes_back(tmp_path):
+    plain = to_plain(TrainConfig(run_dir=tmp_path))
+    plain["env"]["sensor"]["range"] = "inf"
+    plain["ppo"]["clip_epsilon"] = 1
+    config = from_plain(TrainConfig, plain, "here")
+    assert config.run_dir == tmp_path
+    assert config.env.sensor.range == math.inf
+    assert config.ppo.clip_epsilon == 1.0
+    assert isinstance(config.ppo.clip_epsilon, float)
+    assert to_plain(config) == plain
+
+
+@pytest.mark.parametrize("value", [None, [2.0], "abc", {}])
+def test_a_value_of_the_wrong_type_is_named(value: Any):
+    plain = to_plain(TrainConfig())
+    plain["env"]["sensor"]["range"] = value
+    with pytest.raises(ValueError, match=r"my\.json: .*env\.sensor\.range"):
+        from_plain(TrainConfig, plain, "my.json")
+    with pytest.raises(ValueError, match=r"my\.json: .*run_dir"):
+        from_plain(TrainConfig, {"run_dir": 3}, "my.json")
+    with pytest.raises(ValueError, match=r"my\.json: expected an object, got list"):
+        from_plain(TrainConfig, [], "my.json")
+
+
+@pytest.mark.parametrize("value", [None, 3, "ab", [1.0], [1.0, "x"], [[1.0, 2.0]], {}])
+def test_a_range_that_is_none_is_named(value: Any):
+    plain = to_plain(TrainConfig())
+    plain["env"]["task"]["throws"]["interval"] = value
+    with pytest.raises(ValueError, match=r"my\.json: .*env\.task\.throws\.interval"):
+        from_plain(TrainConfig, plain, "my.json")
+
+
+def test_a_range_of_whole_numbers_is_one_of_numbers():
+    plain = to_plain(TrainConfig())
+    plain["env"]["task"]["throws"]["interval"] = [1, 2]
+    interval = from_plain(TrainConfig, plain, "here").env.task.throws.interval
+    assert interval == (1.0, 2.0)
+    assert all(isinstance(bound, float) for bound in interval)
+
+
+def test_what_a_configuration_refuses_is_told_with_the_file():
+    plain = to_plain(TrainConfig())
+    plain["env"]["task"]["throws"]["interval"] = [2.0, 1.0]
+    with pytest.raises(ValueError, match=r"my\.json: interval must be"):
+        from_plain(TrainConfig, plain, "my.json")
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("env.task.reward.survival", math.nan),
+        ("ppo.entropy_coeff", math.nan),
+        ("env.sensor.range", math.nan),
+        ("env.task.throws.mass", math.inf),
+        ("env.task.throws.speed", [4.0, math.inf]),
+        ("env.task.throws.height", [2.0, math.inf]),
+        ("env.task.throws.azimuth_deg", [-math.inf, 180.0]),
+        ("env.task.start_joint_noise", math.inf),
+    ],
+)
+def test_what_is_not_finite_is_refused_wherever_it_stands(field: str, value: object):
+    plain = to_plain(TrainConfig())
+    *parents, name = field.split(".")
+    inner = plain
+    for parent in parents:
+        inner = inner[parent]
+    inner[name] = value
+    with pytest.raises(
+        ValueError, match=rf"{field} must be a finite number|range must"
+    ):
+        from_plain(TrainConfig, plain, "here")
+
+
+def test_a_range_may_be_infinite():
+    plain = to_plain(TrainConfig())
+    plain["env"]["sensor"]["range"] = "inf"
+    assert from_plain(TrainConfig, plain, "here").env.sensor.range == math.inf
+
+
+def test_a_file_that_is_no_json_is_named(tmp_path):
+    for content in (b"{", b"\xff\xfe"):
+        (tmp_path / "bad.json").write_bytes(content)
+        with pytest.raises(ValueError, match=r"bad\.json is not JSON"):
+            read_json(tmp_path / "bad.json")

@@ -1,0 +1,235 @@
+"""Studies and their manifests: what is fixed, what may be added, what cannot be."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from egoskin.runs.run import TrainConfig
+from egoskin.storage.formats import content_hash, read_sealed, sealed_json
+from egoskin.storage.serialization import to_plain
+from egoskin.study.findings import FINDINGS
+from egoskin.study.manifest import (
+    EvaluationPlan,
+    Manifest,
+    Study,
+    load_study,
+    resolve,
+)
+from egoskin.study.metrics import METRICS
+from egoskin.study.shipped import PAPER, SMOKE, STUDIES
+from egoskin.study.store import StudyFolder
+from studies import as_format_1
+
+STUDY = Study(
+    name="small",
+    purpose="to test",
+    cells=({"sensor.range": 1}, {"sensor.coverage": "none"}),
+    seeds=(0, 1),
+    frames=512,
+    base={"num_envs": 32},
+)
+
+
+def changed(**fields: Any) -> Manifest:
+    return resolve(dataclasses.replace(STUDY, **fields))
+
+
+@pytest.fixture(scope="module")
+def resolved() -> dict[str, Manifest]:
+    return {name: resolve(study) for name, study in STUDIES.items()}
+
+
+# --- the shipped studies ------------------------------------------------------------
+
+
+def test_the_papers_study_is_that_of_the_paper(resolved):
+    paper = resolved["paper"]
+    assert (len(paper.cells), len(paper.runs)) == (32, 320)
+    # 4096 agents x 16 steps x 3000 epochs.
+    assert {run.end for run in paper.runs} == {196_608_000}
+    assert {cell.config.env.standard for cell in paper.cells} == {"paper"}
+    assert paper.not_default() == {
+        "env.privileged": "velocity",
+        "env.task.throws.first_delay": [0.0, 0.0],
+        "total_frames": 196_608_000,
+    }
+    assert {run.end for run in resolved["paper-1000"].runs} == {65_536_000}
+
+
+def test_the_findings_are_decided_by_29_cells_of_the_default_recipe(resolved):
+    findings = resolved["findings"]
+    assert (len(findings.cells), findings.not_default()) == (29, {})
+    names = {cell.name for cell in findings.cells}
+    asked = {name for f in FINDINGS for c in f.claims for name in c.weights}
+    # All of them but the blind robot, which is what they are compared with by eye.
+    assert asked == names - {"blind"}
+    assert {f.metric for f in FINDINGS} <= {m.name for m in METRICS}
+
+
+def test_every_cell_is_run_with_a_seed_before_any_with_the_next(resolved):
+    runs = resolved["findings"].runs
+    assert [run.seed for run in runs] == [0] * 29 + [1] * 29 + [2] * 29
+    assert len({run.name for run in runs}) == 87
+
+
+# --- cells --------------------------------------------------------------------------
+
+
+def test_a_cell_is_named_by_what_differs():
+    manifest = changed(
+        cells=(
+            {},
+            {"history": 3},
+            {"sensor.coverage": "ray", "sensor.reduce": "min"},
+            {"ppo.network.hidden": [64, 64], "skin.num_sensors": 8},
+            {"task.throws.first_delay": [0.0, 0.5]},
+        )
+    )
+    assert [cell.name for cell in manifest.cells] == [
+        "field-proximity-2m",
+        "field-proximity-2m-history-3",
+        "ray-proximity-2m-reduce-min",
+        "field-proximity-2m-num_sensors-8-hidden-64-64",
+        "field-proximity-2m-first_delay-0.0-0.5",
+    ]
+    assert manifest.cells[-1].config.env.standard == "custom"
+    run = manifest.runs[0].config
+    assert (run.num_workers, run.learner_threads, run.num_envs) == (1, 1, 32)
+
+
+@pytest.mark.parametrize(
+    ("cell", "text"),
+    [
+        ({"sensor.rang": 1}, "no field 'sensor.rang'; do you mean 'range'"),
+        ({"sensr.range": 1}, "no field 'sensr'; do you mean 'sensor'|no field 'sensr'"),
+        ({"sensor.range": "far"}, "range"),
+        ({"sensor.range": -1.0}, "sensor.range=-1.0.*must be positive"),
+        ({"sensor.reduce": "min"}, "is for ray sensors"),
+        ({"seed": 1}, "seed cannot be chosen here"),
+        ({"total_frames": 1}, "total_frames cannot be chosen here"),
+        ({"checkpoint_interval": 1.0}, "checkpoint_interval cannot be chosen here"),
+        ({"sensor.coverage": "none"}, "blind is there twice"),
+        ({"skin.path": "no.json"}, r"no\.json"),
+    ],
+)
+def test_a_cell_that_cannot_exist_is_named(cell, text):
+    with pytest.raises(ValueError, match=rf"(?s)study small, cell 2.*({text})"):
+        changed(cells=({"sensor.coverage": "none"}, cell))
+
+
+@pytest.mark.parametrize(
+    ("fields", "text"),
+    [
+        ({"cells": ()}, "at least a cell"),
+        ({"seeds": (-1,)}, "seed must be"),
+        ({"frames": 0}, "frames must be"),
+        ({"name": "a/b"}, "name"),
+    ],
+)
+def test_a_study_of_nothing_is_refused(fields, text):
+    with pytest.raises(ValueError, match=text):
+        dataclasses.replace(STUDY, **fields)
+
+
+def test_a_study_can_be_a_file(tmp_path: Path):
+    path = tmp_path / "mine.json"
+    path.write_text(json.dumps(to_plain(STUDY)))
+    assert resolve(load_study(path)) == resolve(STUDY)
+    path.write_text(json.dumps({**to_plain(STUDY), "cell": []}))
+    with pytest.raises(ValueError, match=r"mine\.json: .*cell"):
+        load_study(path)
+
+
+# --- the manifest -------------------------------------------------------------------
+
+
+def test_a_manifest_is_read_as_it_was_written(tmp_path: Path):
+    for study in (STUDY, SMOKE, PAPER):
+        resolve(study).save(tmp_path / "m.json")
+        assert Manifest.load(tmp_path / "m.json") == resolve(study)
+
+
+def test_cells_and_seeds_may_be_added():
+    more = changed(cells=(*STUDY.cells, {"sensor.range": 2}), seeds=(0, 1, 2))
+    both = resolve(STUDY).extended(more)
+    assert both == more
+    assert len(both.runs) == 9
+    # What is not named again stays.
+    assert both.extended(changed(seeds=(5,))).seeds == (0, 1, 2, 5)
+
+
+@pytest.mark.parametrize(
+    ("other", "text"),
+    [
+        ({"frames": 1024}, "total_frames"),
+        ({"standard": "paper"}, "first_delay"),
+        ({"base": {"num_envs": 64}}, "num_envs"),
+        ({"evaluation": EvaluationPlan(episodes=8)}, "evaluation cannot be changed"),
+        ({"name": "other"}, "study cannot be changed"),
+    ],
+)
+def test_nothing_else_may_change(other, text, tmp_path: Path):
+    folder = StudyFolder(tmp_path)
+    folder.plan(resolve(STUDY))
+    before = folder.manifest_path.read_bytes()
+    with pytest.raises(ValueError, match=text):
+        folder.plan(changed(**other))
+    assert folder.manifest_path.read_bytes() == before
+
+
+def test_a_manifest_that_was_edited_is_refused(tmp_path: Path):
+    folder = StudyFolder(tmp_path)
+    folder.plan(resolve(STUDY))
+    text = folder.manifest_path.read_text()
+    folder.manifest_path.write_text(text.replace('"num_envs": 32', '"num_envs": 64'))
+    with pytest.raises(ValueError, match=r"manifest\.json is damaged or was edited"):
+        folder.manifest()
+    with pytest.raises(ValueError, match="is no folder of a study"):
+        StudyFolder(tmp_path / "none").manifest()
+
+
+def test_a_study_begun_before_options_changed_goes_on_as_it_was(tmp_path: Path):
+    folder = StudyFolder(tmp_path)
+    study = dataclasses.replace(STUDY, standard="1")
+    folder.plan(resolve(study))
+    as_format_1(folder.manifest_path)
+    manifest = folder.manifest()
+    assert manifest == resolve(study)
+    assert {run.config.env.standard for run in manifest.runs} == {"1"}
+    # Cells are added to it, and it is written in the present format.
+    more = dataclasses.replace(study, seeds=(0, 1, 2))
+    assert folder.plan(resolve(more)) == folder.manifest() == resolve(more)
+    assert "compile_kernels" not in folder.manifest_path.read_text()
+
+
+def test_a_default_that_changes_changes_no_study_that_has_begun(tmp_path: Path):
+    folder = StudyFolder(tmp_path)
+    folder.plan(resolve(STUDY))
+    # As if the default of the discount had been another one on that day.
+    content, _ = read_sealed(folder.manifest_path)
+    content["base"]["ppo"]["gamma"] = 0.9
+    folder.manifest_path.write_bytes(sealed_json(content))
+    manifest = folder.manifest()
+    assert {run.config.ppo.gamma for run in manifest.runs} == {0.9}
+    assert TrainConfig().ppo.gamma != 0.9
+    with pytest.raises(ValueError, match=r"another is: ppo\.gamma"):
+        folder.plan(resolve(STUDY))
+
+
+def test_an_option_that_is_no_more_and_had_an_effect_is_refused(tmp_path: Path):
+    folder = StudyFolder(tmp_path)
+    folder.plan(resolve(STUDY))
+    as_format_1(folder.manifest_path)
+    content = json.loads(folder.manifest_path.read_text())
+    content["cells"][1]["overrides"]["core_frames"] = [0, 7]
+    content.pop("sha256")
+    folder.manifest_path.write_text(
+        json.dumps({**content, "sha256": content_hash(content)})
+    )
+    with pytest.raises(ValueError, match=r"manifest\.json was made with core_frames="):
+        folder.manifest()

@@ -1,0 +1,562 @@
+"""Studies run for real: what is kept, shared and repeated, whatever happens."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import importlib.util
+import io
+import json
+import os
+import resource
+import runpy
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from egoskin.interrupts import ENDING
+from egoskin.runs.run import Run
+from egoskin.storage.formats import read_sealed, sealed_json
+from egoskin.storage.serialization import to_plain
+from egoskin.study.claims import claimed
+from egoskin.study.cost import cost, measure
+from egoskin.study.job import CLAIMED, STOPPED, Stop, work
+from egoskin.study.manifest import EvaluationPlan, Manifest, Study, resolve
+from egoskin.study.metrics import runs_csv
+from egoskin.study.runner import Progress, slurm_script
+from egoskin.study.store import Failure, StudyFolder, duration
+from studies import as_format_1
+
+ROOT = Path(__file__).parents[2]
+# 16 agents x 16 steps are 256 frames a rollout.
+BATCH = 256
+STUDY = Study(
+    name="tiny",
+    purpose="to test",
+    cells=({}, {"sensor.coverage": "none"}),
+    seeds=(0, 1),
+    frames=12 * BATCH,
+    base={"num_envs": 16, "checkpoint_interval": 0.01},
+    evaluation=EvaluationPlan(episodes=8),
+)
+SHORT = dataclasses.replace(STUDY, frames=2 * BATCH, cells=STUDY.cells[1:], seeds=(0,))
+NAME = "blind-seed0"
+
+
+class Never(Stop):
+    """What no signal stops: pytest keeps its handlers."""
+
+    def __init__(self, requested: bool = False) -> None:
+        self.requested = requested
+
+
+def table(folder: StudyFolder) -> list[dict[str, str]]:
+    """Return the table of all runs, but for wall times."""
+    manifest = folder.manifest()
+    text = runs_csv(manifest, folder.results(manifest))
+    rows = list(csv.DictReader(io.StringIO(text)))
+    words = ("time", "wall", "per_s", "path")
+    kept = [k for k in rows[0] if not any(word in k for word in words)]
+    return [{k: row[k] for k in kept} for row in rows]
+
+
+# --- a run --------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> Path:
+    """A study of one short run, which is finished; tests copy it."""
+    folder = StudyFolder(tmp_path_factory.mktemp("study") / "study")
+    folder.plan(resolve(SHORT))
+    assert work(folder, NAME, Never()) == 0
+    return folder.path
+
+
+@pytest.fixture
+def folder(finished: Path, tmp_path: Path) -> StudyFolder:
+    return StudyFolder(Path(shutil.copytree(finished, tmp_path / "study")))
+
+
+def files(path: Path) -> dict[str, int]:
+    return {str(p): p.stat().st_mtime_ns for p in path.rglob("*") if p.is_file()}
+
+
+def test_a_finished_run_has_all_that_a_report_needs_and_is_not_run_again(
+    folder: StudyFolder,
+):
+    assert sorted(p.name for p in folder.result_path(NAME).iterdir()) == [
+        "config.json",
+        "evaluation_000000000512.json",
+        "metrics.csv",
+        "policies",
+        "run.json",
+        "skin.json",
+    ]
+    before = files(folder.result_path(NAME)) | files(folder.run_path(NAME))
+    assert work(folder, NAME, Never()) == 0
+    assert files(folder.result_path(NAME)) | files(folder.run_path(NAME)) == before
+    # The results alone are enough.
+    expected = table(folder)
+    shutil.rmtree(folder.path / "runs")
+    assert table(folder) == expected
+    (result,) = folder.results(folder.manifest())
+    assert result.stored.evaluation["masked"] is None
+
+
+def test_a_run_that_was_trained_is_only_judged(folder: StudyFolder):
+    expected = table(folder)
+    shutil.rmtree(folder.result_path(NAME))
+    before = files(folder.run_path(NAME))
+    assert folder.status(folder.manifest())[0].state == "begun"
+    assert work(folder, NAME, Never()) == 0
+    assert files(folder.run_path(NAME)) == before
+    assert table(folder) == expected
+
+
+def test_a_policy_without_the_last_checkpoint_is_not_trained_to_its_end(
+    folder: StudyFolder,
+):
+    # Killed between the two, a run lacks the last lines of its metrics.
+    run = Run.open(folder.run_path(NAME))
+    _, header = run.load_checkpoint()
+    assert header["frames"] == 2 * BATCH
+    planned = folder.manifest().run(NAME)
+    assert folder.is_trained(planned)
+    run.policy_path(2 * BATCH).unlink()
+    assert not folder.is_trained(planned)
+
+
+def test_a_stop_leaves_a_checkpoint_and_no_result(tmp_path: Path):
+    folder = StudyFolder(tmp_path / "study")
+    folder.plan(resolve(SHORT))
+    assert work(folder, NAME, Never(requested=True)) == STOPPED
+    assert (folder.run_path(NAME) / "checkpoint.safetensors").is_file()
+    assert not folder.is_finished(NAME)
+    assert [s.state for s in folder.status(folder.manifest())] == ["begun"]
+
+
+def test_a_run_that_somebody_works_on_is_left_alone(folder: StudyFolder):
+    shutil.rmtree(folder.result_path(NAME))
+    with claimed(folder.claims, NAME) as mine:
+        assert mine
+        assert [s.state for s in folder.status(folder.manifest())] == ["running"]
+        assert work(folder, NAME, Never()) == CLAIMED
+    assert not folder.is_finished(NAME)
+
+
+def test_a_run_that_ppo_trains_is_left_to_it(folder: StudyFolder):
+    shutil.rmtree(folder.result_path(NAME))
+    with Run.open(folder.run_path(NAME)).locked():
+        assert [s.state for s in folder.status(folder.manifest())] == ["running"]
+        assert work(folder, NAME, Never()) == CLAIMED
+    assert work(folder, NAME, Never()) == 0
+
+
+def test_a_run_made_before_is_adopted(folder: StudyFolder, tmp_path: Path):
+    expected = table(folder)
+    made = tmp_path / "made"
+    shutil.move(folder.run_path(NAME), made)
+    shutil.rmtree(folder.result_path(NAME))
+    # It says nothing of workers and threads that are the study's.
+    content, _ = read_sealed(made / "config.json")
+    content.update(num_workers=2, learner_threads=None)
+    (made / "config.json").write_bytes(sealed_json(content))
+    assert folder.adopt(folder.manifest(), made).name == NAME
+    before = files(made)
+    assert work(folder, NAME, Never()) == 0
+    assert files(made) == before
+    assert table(folder) == expected
+    with pytest.raises(ValueError, match="is there already"):
+        folder.adopt(folder.manifest(), made)
+
+
+def test_a_run_of_another_study_is_not_adopted(folder: StudyFolder, tmp_path: Path):
+    manifest = resolve(dataclasses.replace(SHORT, base={"num_envs": 32}))
+    other = StudyFolder(tmp_path / "other")
+    other.plan(manifest)
+    with pytest.raises(ValueError, match="blind-seed0, differs in num_envs"):
+        other.adopt(manifest, folder.run_path(NAME))
+    # Nor is its folder taken for one, or its result.
+    shutil.copytree(folder.run_path(NAME), other.run_path(NAME))
+    with pytest.raises(ValueError, match=r"another run .*: it differs in num_envs"):
+        work(other, NAME, Never())
+    shutil.copytree(folder.result_path(NAME), other.result_path(NAME))
+    with pytest.raises(ValueError, match=r"another run .*: it differs in num_envs"):
+        other.results(manifest)
+
+
+def test_a_run_with_another_skin_is_refused(folder: StudyFolder):
+    manifest = folder.manifest()
+    cell = dataclasses.replace(manifest.cells[0], skin_sha256="0" * 64)
+    dataclasses.replace(manifest, cells=(cell,)).save(folder.manifest_path)
+    shutil.rmtree(folder.result_path(NAME))
+    with pytest.raises(ValueError, match="not the skin of the study's cell blind"):
+        work(folder, NAME, Never())
+
+
+def test_a_result_that_was_edited_or_exchanged_is_refused(folder: StudyFolder):
+    (file,) = folder.result_path(NAME).glob("evaluation_*.json")
+    content = json.loads(file.read_text())
+    content["success"]["mean"] = 0.99
+    before = file.read_bytes()
+    file.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match="is damaged or was edited"):
+        table(folder)
+    file.write_bytes(before)
+    policies = folder.run_path(NAME) / "policies"
+    (policy,) = (folder.result_path(NAME) / "policies").iterdir()
+    shutil.copy(policies / "000000000000.safetensors", policy)
+    with pytest.raises(ValueError, match="of another policy"):
+        table(folder)
+
+
+def test_a_study_begun_before_options_changed_goes_on(tmp_path: Path):
+    folder = StudyFolder(tmp_path / "study")
+    old = dataclasses.replace(SHORT, standard="1", seeds=(0, 1))
+    folder.plan(resolve(old))
+    assert work(folder, NAME, Never()) == 0
+    assert work(folder, "blind-seed1", Never(requested=True)) == STOPPED
+    configs = [*folder.path.glob("runs/*/config.json")]
+    configs += folder.path.glob("results/*/config.json")
+    assert len(configs) == 3
+    for path in (folder.manifest_path, *configs):
+        as_format_1(path)
+    # What is done is done, and what was begun is gone on with.
+    (done,) = table(folder)
+    before = files(folder.result_path(NAME))
+    for run in folder.plan(resolve(old)).runs:
+        assert work(folder, run.name, Never()) == 0
+    assert table(folder)[0] == done
+    assert files(folder.result_path(NAME)) == before
+    assert [row["trained_on"] for row in table(folder)] == ["1"] * 2
+
+
+# --- how far it is ------------------------------------------------------------------
+
+
+def test_status_tells_failures_and_what_is_left(folder: StudyFolder):
+    more = dataclasses.replace(SHORT, seeds=(0, 1, 2))
+    manifest = folder.plan(resolve(more))
+    log = folder.log_path("blind-seed1")
+    log.parent.mkdir()
+    log.write_text("--- started\nerror: old\n--- started\nTraceback\nKeyError: 'x'\n")
+    assert folder.last_words("blind-seed1") == "KeyError: 'x'"
+    for tries in (1, 2):
+        failure = folder.note_failure("blind-seed1", folder.last_words("blind-seed1"))
+        assert failure == Failure(tries=tries, error="KeyError: 'x'")
+    status = folder.status(manifest)
+    assert [s.state for s in status] == ["done", "failed", "missing"]
+    assert status[1].failure == failure
+    progress = Progress.of(status)
+    assert str(progress) == "1 done, 1 failed, 1 missing; 33.3% of the frames, ETA -"
+    folder.forget_failures()
+    assert folder.status(manifest)[1].state == "missing"
+
+
+def test_a_study_costs_whole_runs_on_whole_cores(tiny: Manifest):
+    total = cost(tiny, per_s=1000)
+    # 4 runs of 3.072 s: on three cores the fourth has to wait.
+    assert (total.runs, total.frames) == (4, 4 * 12 * BATCH)
+    assert total.core_s == pytest.approx(12.288)
+    assert total.wall_s(3) == pytest.approx(2 * 3.072)
+    assert total.wall_s(64) == pytest.approx(3.072)
+
+
+def test_the_speed_is_measured_and_nothing_is_left(
+    tiny: Manifest, monkeypatch, tmp_path
+):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    assert 10 < measure(tiny.runs[1]) < 1e6
+    assert not list(tmp_path.glob("egoskin-*"))
+
+
+def test_durations_are_readable():
+    assert duration(None) == "-"
+    assert duration(299) == "299 s"
+    assert duration(300) == "5 min"
+    assert duration(3 * 3600 + 60) == "3 h 01 min"
+    assert duration(50 * 3600) == "2 d 02 h"
+
+
+def test_the_slurm_script_shares_the_folder_among_its_elements():
+    manifest = resolve(SHORT)
+    text = slurm_script(manifest, Path("/a/b"), cores=8, elements=3, hours=1.5)
+    assert text.startswith("#!/bin/bash\n")
+    for line in ("--array=0-2", "--cpus-per-task=8", "--time=90", "--signal=B:TERM@"):
+        assert f"#SBATCH {line}" in text
+    assert '--dir /a/b --parallel "$SLURM_CPUS_PER_TASK"' in text
+
+
+# --- the runner, and faults done to it for real -------------------------------------
+
+
+class Runner:
+    """`study.py run` in a process of its own."""
+
+    def __init__(self, folder: Path, *args: str, **options) -> None:
+        self.log = folder.with_name(f"{folder.name}-{time.monotonic_ns()}.log")
+        script = [sys.executable, str(ROOT / "scripts/study.py"), "run"]
+        with open(self.log, "w") as output:
+            self.process = subprocess.Popen(
+                [*script, "--dir", str(folder), "--parallel", "2", *args],
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+                **options,
+            )
+
+    def text(self) -> str:
+        return self.log.read_text()
+
+    def end(self) -> int:
+        return self.process.wait(900)
+
+
+@pytest.fixture
+def start() -> Iterator[Callable[..., Runner]]:
+    """Starts runners that end with the test."""
+    started: list[Runner] = []
+
+    def begin(*args, **options) -> Runner:
+        started.append(Runner(*args, **options))
+        return started[-1]
+
+    yield begin
+    for runner in started:
+        if runner.process.poll() is None:
+            runner.process.terminate()
+            runner.process.wait(200)
+
+
+@pytest.fixture(scope="module")
+def tiny() -> Manifest:
+    return resolve(STUDY)
+
+
+@pytest.fixture
+def study(tiny: Manifest, tmp_path: Path) -> StudyFolder:
+    folder = StudyFolder(tmp_path / "study")
+    folder.plan(tiny)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tiny: Manifest, tmp_path_factory) -> list[dict[str, str]]:
+    """The table of a study to which nothing happened."""
+    folder = StudyFolder(tmp_path_factory.mktemp("undisturbed") / "study")
+    folder.plan(tiny)
+    runner = Runner(folder.path)
+    assert runner.end() == 0, runner.text()
+    rows = table(folder)
+    assert len({row["policy_sha256"] for row in rows}) == len(rows) == 4
+    return rows
+
+
+def wait_for(condition: Callable[[], object], seconds: float = 300) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def in_the_middle(folder: StudyFolder) -> list[str]:
+    """Return the runs that have done a third, and not all."""
+    status = folder.status(folder.manifest())
+    return [s.run.name for s in status if 3 * BATCH < s.frames < s.run.end]
+
+
+def jobs(folder: StudyFolder) -> dict[str, int]:
+    """Return the process ids of the jobs of a study, by the name of the run."""
+    found = {}
+    for path in Path("/proc").glob("[0-9]*"):
+        try:
+            command = (path / "cmdline").read_text().split("\0")
+            state = (path / "stat").read_text().rpartition(")")[2].split()[0]
+        except OSError:
+            continue
+        ours = "egoskin.study.job" in command and str(folder.path) in command
+        if ours and state != "Z":
+            found[command[command.index(str(folder.path)) + 1]] = int(path.name)
+    return found
+
+
+needs_proc = pytest.mark.skipif(
+    not Path("/proc/self/maps").exists(), reason="looks for processes in /proc"
+)
+
+
+@pytest.mark.slow
+@needs_proc
+def test_a_runner_that_is_killed_ends_its_runs_and_is_started_again(
+    study, start, undisturbed
+):
+    runner = start(study.path)
+    wait_for(lambda: in_the_middle(study))
+    assert jobs(study)
+    runner.process.send_signal(signal.SIGKILL)
+    runner.end()
+    # Orphans notice, and stop with a checkpoint.
+    wait_for(lambda: not jobs(study))
+    before = study.status(study.manifest())
+    assert any(s.state == "begun" and s.frames for s in before)
+    again = start(study.path)
+    assert again.end() == 0, again.text()
+    assert table(study) == undisturbed
+
+
+@pytest.mark.slow
+@needs_proc
+def test_a_run_that_is_killed_is_tried_again(study, start, undisturbed):
+    runner = start(study.path)
+    wait_for(lambda: set(in_the_middle(study)) & jobs(study).keys())
+    name, pid = next(
+        (n, p) for n, p in jobs(study).items() if n in in_the_middle(study)
+    )
+    os.kill(pid, signal.SIGKILL)
+    assert runner.end() == 0, runner.text()
+    assert f"{name} failed, try 1 of 3: killed by SIGKILL" in runner.text()
+    assert table(study) == undisturbed
+    assert not study.failure(name)
+
+
+@pytest.mark.slow
+@needs_proc
+def test_two_runners_share_a_study(study, start, undisturbed):
+    one, two = start(study.path), start(study.path)
+    seen: dict[str, set[int]] = {}
+    while None in (one.process.poll(), two.process.poll()):
+        for name, pid in jobs(study).items():
+            seen.setdefault(name, set()).add(pid)
+        time.sleep(0.05)
+    assert (one.end(), two.end()) == (0, 0), one.text() + two.text()
+    assert table(study) == undisturbed
+    # No run was trained twice: each was started once, by whoever claimed it.
+    for run in study.manifest().runs:
+        assert len(Run.open(study.run_path(run.name)).starts()) == 1
+
+
+@pytest.mark.slow
+@needs_proc
+def test_ctrl_c_ends_all_runs_with_checkpoints(study, start, undisturbed):
+    runner = start(study.path)
+    wait_for(lambda: in_the_middle(study))
+    runner.process.send_signal(signal.SIGINT)
+    assert runner.end() == 130
+    assert not jobs(study)
+    assert "Traceback" not in runner.text()
+    for status in study.status(study.manifest()):
+        if status.state == "begun" and status.frames:
+            _, header = Run.open(study.run_path(status.run.name)).load_checkpoint()
+            assert header["frames"] == status.frames
+    again = start(study.path)
+    assert again.end() == 0, again.text()
+    assert table(study) == undisturbed
+
+
+def limit_file_size(size: int) -> None:
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+
+
+@pytest.mark.slow
+def test_a_full_disk_is_told_and_what_was_missing_is_made_up_for(
+    study, start, undisturbed
+):
+    # No checkpoint fits any more.
+    full = start(study.path, "--tries", "1", preexec_fn=partial(limit_file_size, 50000))
+    assert full.end() == 1
+    for run in study.manifest().runs:
+        failure = study.failure(run.name)
+        assert failure is not None
+        assert "File too large" in failure.error
+        assert failure.error in full.text()
+    # It is not tried for ever.
+    assert start(study.path, "--tries", "1").end() == 1
+    again = start(study.path, "--again")
+    assert again.end() == 0, again.text()
+    assert table(study) == undisturbed
+
+
+# --- the command --------------------------------------------------------------------
+
+
+@pytest.fixture
+def command() -> Iterator[Callable[..., int]]:
+    """Function of arguments: `study.py` in this process, as imports take longest."""
+    before = {number: signal.getsignal(number) for number in ENDING}
+
+    def run(*args: str | Path) -> int:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(sys, "argv", ["study.py", *map(str, args)])
+            try:
+                runpy.run_path(str(ROOT / "scripts/study.py"), run_name="__main__")
+            except SystemExit as ended:
+                return int(ended.code or 0)
+        return 0
+
+    yield run
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+def test_the_command_plans_tells_and_reports(
+    finished: Path, tmp_path: Path, command, capsys
+):
+    folder = shutil.copytree(finished, tmp_path / "study")
+    mine = tmp_path / "mine.json"
+    mine.write_text(json.dumps(to_plain(dataclasses.replace(SHORT, seeds=(0, 1)))))
+    assert command("plan", mine, "--dir", folder, "--steps-per-s", "1000") == 0
+    planned = capsys.readouterr().out
+    assert "2 runs, 0.0 M frames" in planned
+    assert "not the default: num_envs = 16" in planned
+    assert command("status", folder) == 0
+    assert capsys.readouterr().out.splitlines()[1].split()[:2] == ["blind", "done"]
+    assert command("report", folder) == 0
+    assert (folder / "report/index.html").is_file()
+    assert "1 of 2 runs are done" in (folder / "report/report.md").read_text()
+    assert command("slurm", folder, "--cores", "2") == 0
+    assert "#SBATCH --array=0-0" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("args", "text"),
+    [
+        (("plan", "papr"), "no study 'papr'; there are paper"),
+        (("run", "smoke", "--dir", "{0}/no/where"), "there is no folder {0}/no"),
+        (("plan", "smoke", "--dir", "{0}/no/where"), "there is no folder {0}/no"),
+        (("status", "{0}"), "is no folder of a study"),
+        (("run", "--dir", "{0}"), "is no folder of a study"),
+        (("report", "{0}"), "is no folder of a study"),
+        (("adopt", "{0}", "{0}"), "is no folder of a study"),
+    ],
+)
+def test_bad_input_is_one_line(args, text, tmp_path: Path, command, capsys):
+    assert command(*(a.format(tmp_path) for a in args)) == 2
+    error = capsys.readouterr().err
+    assert text.format(tmp_path) in error
+    assert len(error.splitlines()) == 1
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("package", ["scipy", "matplotlib"])
+def test_a_report_names_the_package_that_is_missing(
+    package, finished: Path, command, capsys, monkeypatch
+):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util,
+        "find_spec",
+        lambda name: None if name == package else find(name),
+    )
+    assert command("report", finished) == 2
+    assert capsys.readouterr().err == (
+        f"error: a report needs {package}: `pip install 'egoskin[study]'`\n"
+    )
+    assert not (finished / "report").exists()

@@ -1,0 +1,143 @@
+"""Films of made-up frames: text, moments, sheets, files. No OpenGL is needed."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+from PIL import Image, ImageSequence
+
+from egoskin.viewer.film import (
+    Frame,
+    annotate,
+    contact_sheet,
+    pick_moments,
+    save_film,
+    save_picture,
+)
+
+
+def frame(
+    time: float = 0.0,
+    gap: float = 1.0,
+    ending: str | None = None,
+    num_sensors: int = 64,
+    value: int = 100,
+) -> Frame:
+    return Frame(
+        image=np.full((90, 160, 3), value, np.uint8),
+        time=time,
+        gap=gap,
+        num_detecting=0,
+        num_sensors=num_sensors,
+        num_avoided=2,
+        ending=ending,
+    )
+
+
+def approach(n: int, closest: int) -> list[Frame]:
+    """A ball that comes nearest at one frame; brightness tells the frames apart."""
+    return [
+        frame(i / 10, 0.1 * (1 + abs(i - closest)), value=40 + 10 * (i % 20))
+        for i in range(n)
+    ]
+
+
+def test_moments_hold_the_start_the_end_and_the_closest_approach():
+    frames = approach(20, closest=13)
+    picked = pick_moments(frames, 6)
+    assert picked == sorted(set(picked))
+    assert len(picked) == 6
+    assert {0, 13, 19} <= set(picked)
+
+
+def test_moments_lie_closer_together_when_a_ball_is_near():
+    picked = np.array(pick_moments(approach(100, closest=50), 12))
+    step, is_near = np.diff(picked), np.abs(picked[:-1] - 50) < 10
+    assert step[is_near].mean() < step[~is_near].mean() / 2
+
+
+def test_a_short_film_gives_each_frame_once():
+    assert pick_moments(approach(4, closest=2), 12) == [0, 1, 2, 3]
+    assert pick_moments([frame()], 12) == [0]
+
+
+def test_moments_without_a_ball_are_evenly_spaced():
+    frames = [frame(i / 10, math.inf) for i in range(9)]
+    assert pick_moments(frames, 5) == [0, 2, 4, 6, 8]
+
+
+def test_text_is_written_beside_the_middle_of_the_picture():
+    picture = annotate(frame(ending="hit"))
+    assert picture.shape == (90, 160, 3)
+    assert (picture[:30] != 100).any()
+    assert (picture[45:] == 100).all()
+    red = picture[..., 0].astype(int) - picture[..., 1] > 100
+    assert red.any()
+    plain = annotate(frame()).astype(int)
+    assert not (plain[..., 0] - plain[..., 1] > 100).any()
+
+
+def test_a_blind_robot_and_an_empty_sky_leave_only_the_time():
+    full = annotate(frame())
+    bare = annotate(frame(gap=math.inf, num_sensors=0))
+    assert (full[:, 40:] != 100).any()
+    assert (bare[:, 40:] == 100).all()
+
+
+def test_a_sheet_is_a_grid_filled_up_with_white():
+    sheet = contact_sheet(approach(5, closest=2), count=5, columns=3, size=(80, 60))
+    assert sheet.shape == (120, 240, 3)
+    assert (sheet[60:, 160:] == 255).all()
+    # The frames in order: brightness 40, 50, 60; 70, 80.
+    assert [int(sheet[50, 40 + 80 * i, 0]) for i in range(3)] == [40, 50, 60]
+    assert [int(sheet[110, 40 + 80 * i, 0]) for i in range(2)] == [70, 80]
+
+
+def test_a_gif_holds_the_frames_and_the_last_one_stands(tmp_path: Path):
+    path = tmp_path / "film.gif"
+    save_film(path, approach(5, closest=2), fps=10)
+    with Image.open(path) as film:
+        assert film.size == (160, 90)
+        frames = [f.convert("RGB").copy() for f in ImageSequence.Iterator(film)]
+        times = [f.info["duration"] for f in ImageSequence.Iterator(film)]
+    values = [np.asarray(f)[80, 80, 0] for f in frames[:5]]
+    assert np.abs(np.array(values, int) - [40, 50, 60, 70, 80]).max() <= 3
+    # 5 frames of 100 ms and a second of the last.
+    assert sum(times) == pytest.approx(1500, abs=50)
+
+
+def test_an_mp4_holds_the_frames_and_the_last_one_stands(tmp_path: Path):
+    path = tmp_path / "film.mp4"
+    save_film(path, approach(5, closest=2), fps=10)
+    num_frames, seconds = imageio_ffmpeg.count_frames_and_secs(path)
+    assert num_frames == 15
+    assert seconds == pytest.approx(1.5, abs=0.05)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_picture_is_written_as_it_is(tmp_path: Path):
+    path = tmp_path / "sheet.png"
+    image = np.arange(12 * 8 * 3, dtype=np.uint8).reshape(12, 8, 3)
+    save_picture(path, image)
+    with Image.open(path) as written:
+        assert (np.asarray(written) == image).all()
+
+
+@pytest.mark.parametrize("name", ["film.mp3", "film", "no/film.mp4"])
+def test_a_bad_path_is_an_error_that_says_what_is_expected(tmp_path: Path, name: str):
+    with pytest.raises(ValueError, match=r"\.mp4 or \.gif|there is no folder"):
+        save_film(tmp_path / name, [frame()], fps=10)
+
+
+def test_a_film_that_fails_leaves_the_old_file_and_nothing_else(tmp_path: Path):
+    path = tmp_path / "film.mp4"
+    path.write_text("old")
+    broken = Frame(**{**vars(frame()), "image": np.zeros((90, 160), np.float32)})
+    with pytest.raises((TypeError, ValueError)):
+        save_film(path, [frame(), broken], fps=10)
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]

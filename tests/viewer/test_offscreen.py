@@ -1,0 +1,389 @@
+"""Pictures of episodes: what must show, what must not, and where they come from."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from tensordict import TensorDict
+
+from egoskin.cli import clear_errors
+from egoskin.envs.throws import Thrower
+from egoskin.evaluation.throw_set import play_bank, throw_seed
+from egoskin.make import EnvConfig, make_worker_env
+from egoskin.robots.config import RobotConfig
+from egoskin.sensors import Skin
+from egoskin.sensors.config import SensorConfig
+from egoskin.shapes import Sphere
+from egoskin.viewer.film import Frame
+from egoskin.viewer.offscreen import (
+    CameraConfig,
+    Painter,
+    Recording,
+    RenderingError,
+    _ending,
+    closest_point,
+    painter_of,
+    record_episodes,
+    render_recording,
+)
+from throwing import TASK
+
+SIZE = (160, 90)
+SCRIPT = Path(__file__).parents[2] / "scripts" / "render.py"
+
+
+@pytest.fixture(scope="module")
+def painter(robot: RobotConfig, skin: Skin) -> Iterator[Painter]:
+    try:
+        made = Painter(
+            robot,
+            skin,
+            (Sphere(), Sphere()),
+            size=(320, 180),
+            camera=CameraConfig(distance=3.0),
+        )
+    except RenderingError as error:
+        pytest.skip(str(error))
+    with made:
+        yield made
+
+
+@pytest.fixture
+def standing(robot: RobotConfig) -> TensorDict:
+    """The robot in its default pose, facing +x; no ball, nothing detected."""
+    return TensorDict(
+        base_pose=torch.tensor([0, 0, robot.default_base_height, 1, 0, 0, 0]).float(),
+        joint_pos=torch.from_numpy(robot.default_joint_pos).float(),
+        object_pose=torch.tensor([0, 0, 1000.0, 1, 0, 0, 0]).repeat(2, 1),
+        object_active=torch.zeros(2, dtype=torch.bool),
+        balls_avoided=torch.zeros(2),
+    )
+
+
+def place_ball(state: TensorDict, x: float, y: float, z: float) -> TensorDict:
+    """The same state with the first ball in play at a place [m]."""
+    state = state.clone()
+    state["object_active"][0] = True
+    state["object_pose"][0, :3] = torch.tensor([x, y, z])
+    return state
+
+
+def channels(frame: Frame) -> Iterator[np.ndarray]:
+    return iter(np.moveaxis(frame.image.astype(int), -1, 0))
+
+
+def count_blue(frame: Frame) -> int:
+    """Pixels of a field sensor's line."""
+    red, _, blue = channels(frame)
+    return int((blue - red > 70).sum())
+
+
+def count_orange(frame: Frame) -> int:
+    """Pixels of a ball."""
+    red, _, blue = channels(frame)
+    return int((red - blue > 60).sum())
+
+
+def test_the_robot_stands_in_the_picture(painter: Painter, standing: TensorDict):
+    gone = standing.clone()
+    gone["base_pose"][2] = -50.0
+    here, empty = painter.draw(standing, time=0.0), painter.draw(gone, time=0.0)
+    share = (here.image != empty.image).any(-1).mean()
+    assert 0.02 < share < 0.5
+    assert empty.image.std() > 5
+
+
+def test_a_ball_is_drawn_only_in_play(painter: Painter, standing: TensorDict):
+    inside = place_ball(standing, 0.3, 0.6, 1.2)
+    parked = inside.clone()
+    parked["object_active"][:] = False
+    assert count_orange(painter.draw(inside, time=0.0)) > 50
+    assert count_orange(painter.draw(parked, time=0.0)) == 0
+
+
+def test_a_line_leads_from_a_sensor_that_detects_to_the_ball(
+    painter: Painter, standing: TensorDict
+):
+    idle = place_ball(standing, 0.5, 0.9, 1.4)
+    lit = np.arange(64) < 10
+    before, after = painter.draw(idle, time=0.0), painter.draw(idle, lit, time=0.0)
+    assert before.num_detecting == 0
+    assert after.num_detecting == 10
+    assert count_blue(before) == 0
+    assert count_blue(after) > 30
+
+
+def test_a_sensor_that_detects_is_lit(painter: Painter, standing: TensorDict):
+    # No ball in play: no line, the sensors alone change.
+    lit = np.ones(64, dtype=bool)
+    dim, bright = (
+        painter.draw(standing, time=0.0),
+        painter.draw(standing, lit, time=0.0),
+    )
+    changed = (dim.image != bright.image).any(-1)
+    assert changed.any()
+    assert bright.image[changed].mean() > dim.image[changed].mean() + 20
+
+
+def test_the_gap_is_from_surface_to_surface(painter: Painter, standing: TensorDict):
+    assert painter.draw(standing, time=0.0).gap == np.inf
+    # To the side of the arm, which is less than half a metre from the middle.
+    near = painter.draw(place_ball(standing, 0.0, 0.9, 1.2), time=0.0).gap
+    far = painter.draw(place_ball(standing, 0.0, 1.9, 1.2), time=0.0).gap
+    assert 0.2 < near < 0.75
+    assert far - near == pytest.approx(1.0, abs=0.02)
+
+
+def test_the_camera_follows_the_base(painter: Painter, standing: TensorDict):
+    moved = standing.clone()
+    moved["base_pose"][:2] = torch.tensor([30.0, 40.0])
+    lost = painter.draw(standing, time=0.0)
+    for time in (10.0, 20.0):
+        found = painter.draw(moved, time=time)
+    # Floor tiles are 1 m: after whole tiles the picture is the same but for haze.
+    difference = np.abs(found.image.astype(int) - lost.image).mean()
+    assert difference < 3
+
+
+def test_the_closest_point_lies_on_the_surface():
+    ball, pose = Sphere(radius=0.15), np.array([1.0, 0, 0, 1, 0, 0, 0])
+    points = np.array([[0.0, 0, 0], [1, 2, 0], [1.05, 0, 0]])
+    # 1 - 0.15; 0 + 0.15; a point inside is its own.
+    expected = [[0.85, 0, 0], [1, 0.15, 0], [1.05, 0, 0]]
+    assert closest_point(ball, pose, points) == pytest.approx(np.array(expected))
+
+
+def render(
+    config: EnvConfig, skin: Skin, *, hold: bool = False, **options: object
+) -> list[Frame]:
+    (recording,) = record_episodes(config, skin, None, hold=hold)
+    with painter_of(config, skin, size=SIZE) as painter:
+        return render_recording(painter, config, skin, recording, **options)
+
+
+@pytest.mark.usefixtures("painter")
+@pytest.mark.parametrize(("sensor_range", "shows"), [(100.0, True), (1e-3, False)])
+def test_an_episode_shows_lines_only_in_range(
+    skin: Skin, sensor_range: float, shows: bool
+):
+    config = EnvConfig(task=TASK, sensor=SensorConfig(range=sensor_range))
+    frames = render(config, skin, max_seconds=0.2)
+    # 0.2 s at 30 pictures a second, and the start.
+    assert [f.time for f in frames] == pytest.approx([i / 30 for i in range(7)])
+    assert all(f.image.shape == (90, 160, 3) for f in frames)
+    assert all((f.num_detecting == 64) == shows for f in frames)
+    assert all((count_blue(f) > 0) == shows for f in frames)
+    assert [f.ending for f in frames] == [None] * 6 + ["cut"]
+
+
+@pytest.mark.parametrize(
+    ("flags", "expected"),
+    [
+        ((), None),
+        (("truncated",), "time limit"),
+        (("self_contact",), None),
+        (("terminated", "self_contact"), "self-contact"),
+        (("terminated", "self_contact", "fallen"), "fall"),
+        (("terminated", "hit", "fallen"), "hit + fall"),
+    ],
+)
+def test_the_end_of_an_episode_is_named(flags, expected):
+    keys = ("truncated", "terminated", "hit", "fallen", "diverged", "self_contact")
+    state = TensorDict({key: torch.tensor([key in flags]) for key in keys})
+    assert _ending(state) == expected
+
+
+@pytest.mark.usefixtures("painter")
+def test_a_rigid_robot_is_hit_and_the_last_frame_says_so(skin: Skin):
+    frames = render(EnvConfig(task=TASK), skin, hold=True, fps=5)
+    assert frames[-1].ending == "hit"
+    assert frames[-1].gap < 0.05
+    assert all(f.ending is None for f in frames[:-1])
+
+
+@pytest.mark.usefixtures("painter")
+def test_a_whole_episode_lasts_until_long_after_the_first_throw(skin: Skin):
+    # Balls to a point 50 m up, the first after 0.3 s; the limit is 0.2 s later.
+    high = {"aim": "box", "box_height": (50.0, 50.0), "first_delay": (0.3, 0.3)}
+    throws = replace(TASK.throws, **high)
+    task = replace(TASK, throws=throws, episode_length_s=0.2)
+    frames = render(EnvConfig(task=task), skin, hold=True, fps=10)
+    assert frames[-1].ending == "time limit"
+    assert frames[-1].time == pytest.approx(0.5)
+
+
+@pytest.mark.usefixtures("painter")
+@pytest.mark.parametrize("coverage", ["none", "oracle"])
+def test_without_a_skin_there_are_no_sensors_to_draw(coverage, skin: Skin):
+    config = EnvConfig(task=TASK, sensor=SensorConfig(coverage=coverage))
+    frame = render(config, skin, max_seconds=0.02)[0]
+    assert (frame.num_sensors, frame.num_detecting) == (0, 0)
+
+
+def test_recordings_are_of_the_rows_of_the_bank(skin: Skin):
+    config = EnvConfig(task=TASK)
+    recordings = record_episodes(
+        config, skin, None, bank_seed=3, first=5, episodes=2, hold=True
+    )
+    assert [r.row for r in recordings] == [5, 6]
+    bank = {"bank_seed": 3, "episodes": 8, "num_workers": 1, "hold": True}
+    steps = play_bank(None, config, skin, **bank).steps
+    # The start, and a state after each step up to the end.
+    assert [len(r.states) - 1 for r in recordings] == steps[5:7].tolist()
+    env = make_worker_env(
+        config,
+        skin,
+        num_envs=8,
+        seed=throw_seed(config, 3),
+        hold=True,
+        keep_raw=True,
+    )
+    td = env.reset()
+    for step in range(30):
+        for recording in recordings:
+            state = recording.states[step]
+            for key in ("object_pose", "base_pose", "joint_pos", "signal"):
+                assert torch.equal(state[key], td[key][recording.row]), key
+        td["action"] = torch.zeros(8, 21)
+        td = env.step(td)["next"]
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"fps": 61.0}, "fps must be in"),
+        ({"max_seconds": 0.0}, "at least one control step"),
+    ],
+)
+def test_numbers_out_of_range_are_refused(
+    painter: Painter, skin: Skin, options: dict, text: str
+):
+    nothing = Recording(row=0, states=[], ending=None)
+    with pytest.raises(ValueError, match=text):
+        render_recording(painter, EnvConfig(), skin, nothing, **options)
+
+
+@pytest.mark.parametrize("size", [(161, 90), (160, 8)])
+def test_a_size_that_is_no_film_is_refused(skin: Skin, size: tuple[int, int]):
+    with pytest.raises(ValueError, match="two even numbers"):
+        painter_of(EnvConfig(), skin, size=size)
+
+
+@pytest.fixture
+def script(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Function of (arguments, environment): runs the script in an empty folder."""
+
+    def run(*args: str, **environment: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, str(SCRIPT), *args],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            timeout=200,
+            env={**os.environ, **environment},
+        )
+
+    return run
+
+
+@pytest.mark.usefixtures("painter")
+def test_the_script_writes_a_film_and_a_sheet(script: Callable, tmp_path: Path):
+    done = script("--out", "a.gif", "--seconds", "0.1", "--size", "160", "90")
+    assert done.returncode == 0, done.stderr
+    assert "cut" in done.stdout
+    with (
+        Image.open(tmp_path / "a.gif") as film,
+        Image.open(tmp_path / "a.png") as sheet,
+    ):
+        assert film.size == (160, 90)
+        assert sheet.width > sheet.height
+    assert {p.name for p in tmp_path.iterdir()} == {"a.gif", "a.png"}
+
+
+def load_script(monkeypatch) -> ModuleType:
+    spec = importlib.util.spec_from_file_location("render", SCRIPT)
+    assert spec is not None
+    assert spec.loader is not None
+    script = importlib.util.module_from_spec(spec)
+    # Dataclasses look their annotations up in the module of that name.
+    monkeypatch.setitem(sys.modules, "render", script)
+    spec.loader.exec_module(script)
+    return script
+
+
+@pytest.mark.usefixtures("painter")
+def test_a_film_is_of_the_longest_of_the_episodes_that_are_evaluated(
+    skin: Skin, tmp_path: Path, monkeypatch, capsys
+):
+    bank = {"bank_seed": 3, "episodes": 6, "num_workers": 1, "hold": True}
+    config = EnvConfig()
+    thrower = Thrower(config.task.throws, config.robot_config, 1 / 120)
+    row = torch.arange(6)
+    delay = thrower.first_delay(throw_seed(config, 3), row, row * 0)
+    ages = play_bank(None, config, skin, **bank).steps + (60 * delay).round().long()
+    longest = 2 + int(ages[2:].argmax())
+    args = ["--out", str(tmp_path / "a.gif"), "--size", "160", "90", "--fps", "4"]
+    args += ["--bank-seed", "3", "--episode", "2", "--longest-of", "4", "--hold"]
+    load_script(monkeypatch).main(args)
+    length = int(ages[longest]) / 60
+    expected = f"episode {longest} of bank 3: {length:.2f} s, 0 balls avoided, ends "
+    assert expected + "with: hit" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("args", "text"),
+    [
+        (["--out", "a.avi"], "must end in .mp4 or .gif"),
+        (["--out", "nowhere/a.mp4"], "no folder nowhere"),
+        (["--sheet", "a.jpg"], "must end in .png"),
+        (["--slowdown", "0"], "slowdown must be in (0, 100]"),
+        (["--slowdown", "inf"], "slowdown must be in (0, 100]"),
+        (["--bank-seed", "-1"], "bank_seed must be in"),
+        (["--episode", "-1"], "episode must not be negative"),
+        (["--longest-of", "0"], "longest_of must be at least 1"),
+        (["--fps", "61"], "fps must be in"),
+        (["--standard", "3"], "--standard"),
+        (["nothing.safetensors"], "nothing.safetensors"),
+        (["nothing", "--sensor.range", "1"], "a policy brings its own"),
+    ],
+)
+def test_bad_input_is_an_error_and_writes_nothing(
+    args: list, text: str, tmp_path: Path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    script = load_script(monkeypatch)
+    with pytest.raises(SystemExit) as status, clear_errors():
+        script.main(args)
+    assert status.value.code == 2
+    assert text in " ".join(capsys.readouterr().err.split())
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "environment",
+    [
+        # PyOpenGL bound to another platform, as if EGL were not installed.
+        {"MUJOCO_GL": "", "PYOPENGL_PLATFORM": "osmesa"},
+        {"MUJOCO_GL": "no_such_backend"},
+    ],
+)
+def test_without_opengl_the_script_says_what_to_install(
+    script: Callable, tmp_path: Path, environment: dict[str, str]
+):
+    (tmp_path / "a.mp4").write_text("old")
+    done = script("--out", "a.mp4", "--seconds", "0.1", **environment)
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert "apt-get install libegl1" in done.stderr
+    assert (tmp_path / "a.mp4").read_text() == "old"
