@@ -34,7 +34,6 @@ from egoskin.evaluation.throw_set import Estimate, Evaluation, evaluate, standar
 from egoskin.make import MASK_ALL, EnvConfig, check_mask, check_num_workers
 from egoskin.policies.policy import load_policy
 from egoskin.progress import StatusLine
-from egoskin.report import metres
 from egoskin.rng import check_seed
 from egoskin.viewer.film import check_path
 
@@ -126,6 +125,10 @@ def table(result: Evaluation, title: str, age: float) -> str:
     return "\n".join([title, *lines, "  (95 % intervals in brackets)"])
 
 
+def _metres(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f} m"
+
+
 def behaviour_table(result: Behaviour) -> str:
     """Return what the policy does as text."""
     lines = []
@@ -150,8 +153,9 @@ def behaviour_table(result: Behaviour) -> str:
     lines += ["", "  way from the start     mean   a tenth exceeds  base height     of"]
     for way in result.displacement:
         lines.append(
-            f"    after {way.age:g} s       {metres(way.mean):>8} "
-            f"{metres(way.largest_tenth):>16} {metres(way.height):>12} {way.episodes:6}"
+            f"    after {way.age:g} s       {_metres(way.mean):>8} "
+            f"{_metres(way.largest_tenth):>16} {_metres(way.height):>12} "
+            f"{way.episodes:6}"
         )
     lines += ["", f"  {'':<32}{'policy':>10} {'zero action':>13}"]
 

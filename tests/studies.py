@@ -10,11 +10,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import egoskin
-from egoskin.results import Record, to_json
 from egoskin.runs.run import Run
 from egoskin.storage.formats import content_hash, read_sealed, sealed_json
 from egoskin.study.manifest import Manifest, PlannedRun
 from egoskin.study.store import StudyFolder, policy_hash
+from egoskin.study.stored import Record, to_json
 
 POLICY = Path(egoskin.__file__).parent / "assets/policies/blind.safetensors"
 _HASH = policy_hash(POLICY)

@@ -99,10 +99,16 @@ def _sync_folder(path: Path) -> None:
         os.close(descriptor)
 
 
-def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def load_tensors(
+    path: Path, *, quiet: bool = False
+) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Return (tensors by name, header) of a file that `save_tensors` wrote.
 
     Configurations in the header are brought into the present format.
+
+    Args:
+        path: The file.
+        quiet: Whether to say nothing of a file without a seal.
 
     Raises:
         ValueError: If the file is missing, damaged or another format; the text names
@@ -126,7 +132,7 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         raise ValueError(f"{path} is damaged: its header is not JSON") from error
     if not isinstance(header, dict):
         raise ValueError(f"{path} is damaged: its header is no object")
-    header, number = unseal(header, str(path), tensors)
+    header, number = unseal(header, str(path), tensors, quiet=quiet)
     return tensors, present_header(header, number, str(path))
 
 

@@ -2,7 +2,7 @@
 
     manifest.json      what is run, see `egoskin.study.manifest`
     runs/NAME/         a run folder, or a link to one made before
-    results/NAME/      of a finished run what is small, see `egoskin.results`; its
+    results/NAME/      of a finished run what is small, see `egoskin.study.stored`; its
                        evaluation is written last, and marks the run as finished
     claims/            who works on what, see `egoskin.study.claims`
     logs/NAME.log      what the run's processes said
@@ -31,13 +31,13 @@ from typing import Any, Literal
 from egoskin.evaluation.throw_set import play_bank, standard_task, summarize
 from egoskin.make import MASK_ALL
 from egoskin.policies.policy import Policy, load_policy
-from egoskin.results import StoredRun, load_run, record, thin, to_json
 from egoskin.runs.run import Run
 from egoskin.storage.formats import content_hash, read_sealed, sealed_json
 from egoskin.storage.serialization import read_json
 from egoskin.storage.tensor_file import load_tensors, write_file
 from egoskin.study.claims import is_claimed, is_locked
 from egoskin.study.manifest import EvaluationPlan, Manifest, PlannedRun
+from egoskin.study.stored import StoredRun, load_run, record, thin, to_json
 
 State = Literal["done", "running", "failed", "begun", "missing"]
 """How far a run is; begun: nobody works on it, and it can be gone on with."""
@@ -428,7 +428,8 @@ def judge_run(
 
 def policy_hash(path: Path) -> str:
     """Return the hash of what a policy computes with, whoever wrote its file."""
-    tensors, header = load_tensors(path)
+    # Who asks compares it with another.
+    tensors, header = load_tensors(path, quiet=True)
     spec = header["policy"]
     kept = {k: spec[k] for k in ("skin", "sizes", "num_actions", "frames")}
     return content_hash(kept, tensors)

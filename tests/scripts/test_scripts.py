@@ -21,7 +21,6 @@ import torch
 import egoskin
 from egoskin.evaluation import operating_map
 from egoskin.evaluation.throw_set import evaluate, standard_task
-from egoskin.storage.formats import read_sealed, sealed_json
 from egoskin.storage.tensor_file import load_tensors
 
 ROOT = Path(__file__).parents[2]
@@ -307,88 +306,6 @@ def test_a_ceiling_counts_what_policy_and_search_avoid(tmp_path: Path):
     bad = run("ceiling.py", "field_proximity", "--reach", "0")
     assert bad.returncode == 2
     assert "reach must be positive" in bad.stderr
-
-
-def test_a_run_is_stored_and_reported_again_when_it_is_longer(
-    trained: Path, tmp_path: Path
-):
-    pytest.importorskip("matplotlib")
-    stored, report = tmp_path / "results", tmp_path / "results.md"
-    stored.mkdir()
-    (stored / "notes.md").write_text("## By hand\n\nThis stays.\n")
-    add = ("results.py", "add", trained, "--episodes", "16", "--results", stored)
-    done = run(*add)
-    assert done.returncode == 0, done.stderr
-    folder = stored / "field_proximity_2m_seed0"
-    frames = f"{4 * BATCH:012d}"
-    assert {str(p.relative_to(folder)) for p in folder.rglob("*.*")} == {
-        "config.json",
-        "run.json",
-        "metrics.csv",
-        f"policies/{frames}.safetensors",
-        f"evaluation_{frames}.json",
-    }
-    made = json.loads((folder / "run.json").read_text())
-    assert made["command"].startswith("python scripts/ppo.py --num-envs 32")
-    assert str(trained) not in (folder / "run.json").read_text()
-    assert (made["seed"], made["frames"]) == (0, 4 * BATCH)
-    assert made["wall_s"] == pytest.approx(float(metrics(trained)[-1]["time/wall_s"]))
-    evaluation = json.loads((folder / f"evaluation_{frames}.json").read_text())
-    assert (evaluation["episodes"], evaluation["bank_seed"]) == (16, 0)
-
-    # Its evaluation, once more, comes to the same whatever was written there.
-    file = folder / f"evaluation_{frames}.json"
-    spoilt = {**evaluation, "success": {"mean": 0.123}}
-    file.write_text(json.dumps(spoilt))
-    done = run("results.py", "repeat", folder)
-    assert done.returncode == 0, done.stderr
-    success = 100 * evaluation["success"]["mean"]
-    assert f"success {success:.1f} %, was 12.3 %" in done.stdout
-    assert json.loads(file.read_text()) == evaluation
-
-    # The same run once more is an update, another configuration is refused.
-    assert run(*add).returncode == 0
-    config, _ = read_sealed(folder / "config.json")
-    config["env"]["sensor"]["range"] = 1.0
-    (folder / "config.json").write_bytes(sealed_json(config))
-    refused = run(*add)
-    assert refused.returncode == 2
-    assert "another configuration: choose a --name" in refused.stderr
-
-    done = run("results.py", "write", "--results", stored, "--out", report)
-    assert done.returncode == 0, done.stderr
-    text = report.read_text()
-    assert "This stays." in text
-    assert "field proximity, 1 m" in text
-    assert (tmp_path / "results-other-recipes.png").read_bytes()[:4] == b"\x89PNG"
-
-
-@pytest.mark.parametrize(
-    ("args", "expected"),
-    [
-        (["add", "nothing"], "no run folder"),
-        (["add", "nothing", "--name", "a/b"], "must be the name of a folder"),
-        (["add", "nothing", "--episodes", "0"], "must be at least 1"),
-        (["add", "nothing", "--results", "elsewhere"], "no folder elsewhere"),
-        (["repeat"], "name the stored runs"),
-        (["repeat", "results"], "results is not whole: it has no config.json"),
-        (["write", "--results", "results", "--out", "new.md"], "holds no runs"),
-        (["write", "--out", "no/results.md"], "no folder no"),
-    ],
-    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
-)
-def test_bad_input_to_results_is_one_clear_message(
-    args: list[str], expected: str, tmp_path: Path, monkeypatch, capsys
-):
-    pytest.importorskip("matplotlib")
-    (tmp_path / "results").mkdir()
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["results.py", *args])
-    with pytest.raises(SystemExit) as ended:
-        runpy.run_path(str(ROOT / "scripts" / "results.py"), run_name="__main__")
-    assert ended.value.code == 2
-    assert expected in capsys.readouterr().err
-    assert [p.name for p in tmp_path.rglob("*")] == ["results"]
 
 
 def test_physics_steps_that_are_none_are_refused(trained: Path):

@@ -268,7 +268,9 @@ def test_a_migration_leaves_alone_what_is_there_and_makes_no_parts():
 
 
 def test_stored_policies_without_a_seal_load_and_say_so(capsys):
-    path = ROOT / "results/blind_seed0/policies/000065536000.safetensors"
+    path = (
+        ROOT / "studies/version-1/results/blind-seed0/policies/000065536000.safetensors"
+    )
     throws = egoskin.load_policy(path).env_config.task.throws
     assert (throws.first_delay, throws.aim) == ((0.0, 0.0), "body")
     egoskin.load_policy(path)

@@ -14,6 +14,8 @@ from egoskin.study.statistics import (
     Region,
     contrast,
     holm,
+    interquartile_mean,
+    interquartile_range,
     mean_effect,
     seed_sd,
     seeds_needed,
@@ -32,6 +34,19 @@ def test_the_spread_is_the_papers():
     own = spread([8, 1, 7, 2, 6, 3, 5, 4])
     assert (own.iqm, own.low, own.high, own.seeds) == (4.5, 2.75, 6.25, 8)
     assert own.iqm == stats.trim_mean(range(1, 9), 0.25)
+
+
+def test_interquartile_statistics_by_hand():
+    assert interquartile_mean([7.0]) == 7.0
+    assert interquartile_mean([3.0, 1.0]) == 2.0
+    # Of three, the outer count a quarter each: (0.25 * 0 + 3 + 0.25 * 9) / 1.5.
+    assert interquartile_mean([9.0, 0.0, 3.0]) == pytest.approx(3.5)
+    # Of four, two are left; of ten, the third and the eighth count half.
+    assert interquartile_mean([100.0, 1.0, 2.0, -50.0]) == 1.5
+    ten = [0.0, 0, 2, 4, 4, 4, 4, 8, 99, 99]
+    assert interquartile_mean(ten) == pytest.approx((1 + 16 + 4) / 5)
+    assert interquartile_range([0.0, 1, 2, 3, 4]) == (1.0, 3.0)
+    assert interquartile_range([5.0]) == (5.0, 5.0)
 
 
 def test_a_mean_has_scipys_t_interval():

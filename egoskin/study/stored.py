@@ -1,0 +1,185 @@
+"""What is stored of a finished run: how it was made, its curve, its evaluation.
+
+config.json                     the resolved configuration
+skin.json                       its skin
+run.json                        a `Record`: how it was made
+metrics.csv                     thinned, see `thin`
+policies/FRAMES.safetensors     the policy
+evaluation_FRAMES.json          its figures on the throw set of the study
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from egoskin.runs.run import SKIN_HASH, Run, TrainConfig
+from egoskin.storage.formats import present_config, read_sealed
+from egoskin.storage.serialization import from_plain, read_json
+
+# Significant digits of stored metrics.
+_DIGITS = 6
+
+
+@dataclass(frozen=True, kw_only=True)
+class Record:
+    """How a run was made."""
+
+    command: str
+    """The command that started it."""
+    commit: str
+    """Commits of its starts, abbreviated; "+" where the tree was changed."""
+    seed: int
+    """Its seed."""
+    frames: int
+    """Environment steps of the stored policy."""
+    wall_s: float
+    """Time that collecting and learning took up to there [s]."""
+    machine: str
+    """Machines it ran on."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StoredRun:
+    """The folder of a finished run."""
+
+    config: TrainConfig
+    """Its configuration."""
+    record: Record
+    """How it was made."""
+    frames: np.ndarray
+    """Environment steps of the learning curve, ``[n]``, rising."""
+    success: np.ndarray
+    """Share of episodes that last 3 s, estimated in training, ``[n]``."""
+    evaluation: dict[str, Any]
+    """Figures of its policy."""
+
+
+def thin(text: str, every: int) -> str:
+    """Return a run's metrics with fewer lines and digits.
+
+    Kept are the first line at or past each multiple of some environment steps and the
+    last one.
+
+    Args:
+        text: Content of a ``metrics.csv``.
+        every: Environment steps between the lines that are kept.
+    """
+    source = csv.DictReader(io.StringIO(text))
+    rows = list(source)
+    kept, last = [], -1
+    for row in rows:
+        block = int(row["frames"]) // every
+        if block > last or row is rows[-1]:
+            kept.append(row)
+        last = block
+    out = io.StringIO()
+    writer = csv.DictWriter(out, source.fieldnames or (), lineterminator="\n")
+    writer.writeheader()
+    for row in kept:
+        writer.writerow(
+            {
+                key: value if key == "frames" else f"{float(value):.{_DIGITS}g}"
+                for key, value in row.items()
+            }
+        )
+    return out.getvalue()
+
+
+def record(run: Run, frames: int) -> Record:
+    """Return how a run was made.
+
+    Args:
+        run: The run.
+        frames: Environment steps of the policy that is stored.
+
+    Raises:
+        ValueError: If the folder does not say.
+    """
+    starts = run.starts()
+    if not starts:
+        raise ValueError(f"{run.path} has not been started: it has no versions.json")
+    lines = csv.DictReader(io.StringIO(run.metrics()))
+    rows = [row for row in lines if int(row["frames"]) <= frames]
+    script, *args = starts[0]["command"]
+    # Where a run's folder was is of no interest anywhere else.
+    args = _without(args, "--run-dir")
+    commits = [
+        "unknown"
+        if start["git"] is None
+        else start["git"]["commit"][:7] + "+" * start["git"]["changed"]
+        for start in starts
+    ]
+    machines = [
+        f"{start['machine']}, {start['cores']} cores, Python {start['python']}, "
+        f"torch {start['packages']['torch']}, mujoco {start['packages']['mujoco']}"
+        for start in starts
+    ]
+    return Record(
+        command=" ".join(["python", f"scripts/{Path(script).name}", *args]),
+        commit=", ".join(dict.fromkeys(commits)),
+        seed=run.config.seed,
+        frames=frames,
+        wall_s=float(rows[-1]["time/wall_s"]) if rows else 0.0,
+        machine="; ".join(dict.fromkeys(machines)),
+    )
+
+
+def _without(args: Sequence[str], option: str) -> list[str]:
+    """Return arguments without an option and its value, however they are joined."""
+    kept, skip = [], False
+    for arg in args:
+        name, joined, _ = arg.partition("=")
+        if skip:
+            skip = False
+        elif name.replace("_", "-") == option:
+            skip = not joined
+        else:
+            kept.append(arg)
+    return kept
+
+
+def load_run(path: Path) -> StoredRun:
+    """Return the run stored in a folder.
+
+    Raises:
+        ValueError: If it is not whole.
+    """
+    what = path / "run.json"
+    evaluations = sorted(path.glob("evaluation_*.json"))
+    for file in (path / "config.json", what, path / "metrics.csv"):
+        if not file.is_file():
+            raise ValueError(f"{path} is not whole: it has no {file.name}")
+    if not evaluations:
+        raise ValueError(f"{path} is not whole: it has no evaluation")
+    with open(path / "metrics.csv", newline="") as source:
+        rows = list(csv.DictReader(source))
+    curve = np.array(
+        [(float(r["frames"]), float(r["episode/success"])) for r in rows]
+    ).reshape(-1, 2)
+    # No estimate before an episode could have lasted so long.
+    curve = curve[np.isfinite(curve[:, 1])]
+    where = str(path / "config.json")
+    # Stored runs are under version control, with a seal or without.
+    content, number = read_sealed(path / "config.json", quiet=True)
+    content.pop(SKIN_HASH, None)
+    return StoredRun(
+        config=from_plain(TrainConfig, present_config(content, number, where), where),
+        record=from_plain(Record, read_json(what), str(what)),
+        frames=curve[:, 0],
+        success=curve[:, 1],
+        evaluation=read_json(evaluations[-1]),
+    )
+
+
+def to_json(value: Record) -> str:
+    """Return a record as the content of its file."""
+    return json.dumps(dataclasses.asdict(value), indent=2) + "\n"

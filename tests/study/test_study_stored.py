@@ -1,0 +1,73 @@
+"""What is stored of a run: thinned metrics, how it was made, and that it is whole."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from egoskin.runs.run import Run, TrainConfig
+from egoskin.study.store import StudyFolder
+from egoskin.study.stored import load_run, record, thin
+
+ARCHIVE = Path(__file__).parents[2] / "studies" / "version-1"
+
+
+def test_thinned_metrics_keep_a_line_for_each_block_and_the_last():
+    lines = [f"{n * 65536},{n / 3}" for n in range(1, 11)]
+    kept = thin("\n".join(["frames,x", *lines]), 2**18).splitlines()
+    # Blocks of 2**18 = 4 x 65536: lines 1 (in block 0), 4, 8 and the last, 10.
+    assert kept[0] == "frames,x"
+    assert [int(line.split(",")[0]) // 65536 for line in kept[1:]] == [1, 4, 8, 10]
+    assert kept[1].endswith(",0.333333")
+    # What is thin stays as it is.
+    assert thin("\n".join(kept), 2**18).splitlines() == kept
+    assert thin("frames,x\n", 2**18) == "frames,x\n"
+
+
+def test_a_record_says_what_was_run_but_not_where(tmp_path: Path):
+    run = Run(tmp_path, dataclasses.replace(TrainConfig(), seed=4))
+    (tmp_path / "metrics.csv").write_text(
+        "frames,time/wall_s\n100,1.5\n200,3.5\n300,9.0\n"
+    )
+    with pytest.raises(ValueError, match=r"no versions\.json"):
+        record(run, 200)
+    start = {
+        "command": ["/some/where/ppo.py", "--run-dir", "/x", "--seed", "4"],
+        "python": "3.11.7",
+        "machine": "Linux x86_64",
+        "cores": 2,
+        "packages": {"torch": "2.13", "mujoco": "4.0"},
+        "git": {"commit": "0123456789", "changed": True},
+    }
+    again = {**start, "command": ["ppo.py", "--resume=/x"], "git": None}
+    (tmp_path / "versions.json").write_text(json.dumps([start, again]))
+    made = record(run, 200)
+    assert made.command == "python scripts/ppo.py --seed 4"
+    assert made.commit == "0123456+, unknown"
+    assert (made.seed, made.frames, made.wall_s) == (4, 200, 3.5)
+    assert made.machine == (
+        "Linux x86_64, 2 cores, Python 3.11.7, torch 2.13, mujoco 4.0"
+    )
+
+
+@pytest.mark.parametrize("missing", ["run.json", "metrics.csv", "evaluation"])
+def test_a_folder_that_is_not_whole_is_named(missing, tmp_path: Path):
+    half = tmp_path / "half"
+    shutil.copytree(ARCHIVE / "results" / "blind-seed0", half)
+    for path in half.glob(f"{missing}*"):
+        path.unlink()
+    with pytest.raises(ValueError, match=rf"half is not whole: .*{missing}"):
+        load_run(half)
+
+
+def test_the_runs_of_version_1_are_kept_as_a_study():
+    folder = StudyFolder(ARCHIVE)
+    manifest = folder.manifest()
+    results = folder.results(manifest)
+    assert len(results) == 16
+    assert {r.stored.config.env.standard for r in results} == {"1"}
+    assert manifest.evaluation.standard == "1"
