@@ -25,7 +25,7 @@ import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -36,7 +36,7 @@ from egoskin.storage.serialization import to_plain
 from egoskin.storage.tensor_file import write_file
 from egoskin.study.cost import cost, measure
 from egoskin.study.manifest import Manifest, load_study, resolve
-from egoskin.study.runner import LocalRunner, Progress, slurm_script
+from egoskin.study.runner import LocalRunner, Progress, Runner, slurm_script
 from egoskin.study.shipped import STUDIES
 from egoskin.study.store import RunStatus, StudyFolder, duration
 
@@ -64,6 +64,15 @@ def find_study(name: str) -> Manifest:
     if not Path(name).is_file():
         raise ValueError(f"there is no file {name}")
     return resolve(load_study(Path(name)))
+
+
+def check_packages(what: str, extra: str, *packages: str) -> None:
+    """Raise ValueError if a package is missing that something needs."""
+    for package in packages:
+        if importlib.util.find_spec(package) is None:
+            raise ValueError(
+                f"{what} needs {package}: `pip install 'egoskin[{extra}]'`"
+            )
 
 
 def check_parent(folder: Path) -> None:
@@ -182,6 +191,10 @@ class Run:
     """Study to begin or add to; None: what the folder's manifest says."""
     dir: Path
     """Folder of the study."""
+    on: Literal["local", "ray"] = "local"
+    """Where: the cores of this machine, or an existing Ray cluster (extra `ray`)."""
+    ray_address: str = "auto"
+    """Address of the Ray cluster, ``host:port``; auto: the one of this machine."""
     parallel: int | None = None
     """Runs side by side, one worker each; None: one for each core."""
     tries: int = 3
@@ -212,9 +225,10 @@ class Run:
             start, end = ("\r", "\x1b[K") if live else ("", "\n")
             print(f"{start}{text}", end=end, flush=True)
 
-        runner = LocalRunner(
+        kind, cores = self._where()
+        runner = kind(
             folder,
-            parallel=self.parallel or available_cores(),
+            parallel=self.parallel or cores,
             tries=self.tries,
             nice=self.nice,
             show=show,
@@ -225,6 +239,16 @@ class Run:
         if any(each.state != "done" for each in status):
             raise SystemExit(1)
         print(f"done; now: python scripts/study.py report {self.dir}")
+
+    def _where(self) -> tuple[type[Runner], int]:
+        """Return what runs the study, and the cores it has."""
+        if self.on == "local":
+            return LocalRunner, available_cores()
+        check_packages("--on ray", "ray", "ray")
+        # Only here: nothing else needs it.
+        from egoskin.study.ray_runner import RayRunner, connect
+
+        return RayRunner, connect(self.ray_address)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -287,11 +311,7 @@ class Report:
 
     def execute(self) -> None:
         """Write the report."""
-        for package in ("scipy", "matplotlib"):
-            if importlib.util.find_spec(package) is None:
-                raise ValueError(
-                    f"a report needs {package}: `pip install 'egoskin[study]'`"
-                )
+        check_packages("a report", "study", "scipy", "matplotlib")
         # Only here: the rest of this script needs neither.
         from egoskin.study.report import write_report
 

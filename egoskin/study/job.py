@@ -23,7 +23,6 @@ from egoskin.parallel import WorkerError
 from egoskin.progress import ProgressLine
 from egoskin.runs.trainer import open_trainer, train
 from egoskin.study.claims import claimed
-from egoskin.study.manifest import PlannedRun
 from egoskin.study.store import StudyFolder, judge_run, now
 
 FAILED = 1
@@ -104,11 +103,11 @@ def work(folder: StudyFolder, name: str, stop: Stop) -> int:
         return 0
 
 
-def command(folder: Path, run: PlannedRun, nice: int) -> list[str]:
+def command(folder: Path, name: str, nice: int) -> list[str]:
     """Return the command that works on a run, for a child of this process."""
     module = [sys.executable, "-m", "egoskin.study.job"]
     options = ["--parent", str(os.getpid()), "--nice", str(nice)]
-    return [*module, str(folder), run.name, *options]
+    return [*module, str(folder), name, *options]
 
 
 def main() -> int:

@@ -1,4 +1,6 @@
-"""The runs of a study side by side on this machine, each in a process of its own.
+"""The runs of a study side by side, each in a process of its own.
+
+`LocalRunner` works on this machine; `egoskin.study.ray_runner.RayRunner` on a cluster.
 
 Contract: nothing is run twice, whoever else works on the folder; what ends the runner,
 even SIGKILL, ends its runs with a checkpoint, and whoever starts it again goes on.
@@ -11,9 +13,11 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from egoskin.study.claims import is_claimed
 from egoskin.study.job import CLAIMED, STOPPED, command
@@ -24,8 +28,8 @@ from egoskin.study.store import START, RunStatus, StudyFolder, duration, now
 _POLL, _AGAIN = 0.2, 5.0
 # How often the progress line is written: on a terminal, in a file [s].
 _SHOW_LIVE, _SHOW_FILE = 2.0, 60.0
-# How long a run may take to stop with a checkpoint [s].
-_PATIENCE = 120.0
+PATIENCE_S = 120.0
+"""How long a run may take to stop with a checkpoint [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +64,7 @@ class Progress:
         return f"{counts}; {self.share:.1%} of the frames, ETA {duration(self.left_s)}"
 
 
-class LocalRunner:
+class Runner(ABC):
     """Works on the runs of a study until all are done or have failed too often.
 
     Args:
@@ -83,10 +87,25 @@ class LocalRunner:
         self._folder, self._manifest = folder, folder.manifest()
         self._parallel, self._tries, self._nice = parallel, tries, nice
         self._show = show
-        self._jobs: dict[str, subprocess.Popen[bytes]] = {}
         self._finished: set[str] = set()
         # When to ask again for a run that somebody else has claimed.
         self._again: dict[str, float] = {}
+
+    @abstractmethod
+    def _running(self) -> Collection[str]:
+        """Return the names of the runs that are ours."""
+
+    @abstractmethod
+    def _begin(self, run: PlannedRun) -> None:
+        """Begin to work on a run."""
+
+    @abstractmethod
+    def _ended(self) -> dict[str, tuple[int, str]]:
+        """Return (exit status, last error) of the runs that have ended, by name."""
+
+    @abstractmethod
+    def _stop(self) -> None:
+        """Stop our runs, with checkpoints."""
 
     def run(self) -> list[RunStatus]:
         """Work; return how far each run is at the end.
@@ -102,7 +121,7 @@ class LocalRunner:
             while True:
                 self._reap()
                 open_runs = self._open_runs()
-                if not (open_runs or self._jobs):
+                if not (open_runs or self._running()):
                     return self._folder.status(self._manifest)
                 self._start(open_runs)
                 if time.monotonic() - shown > interval:
@@ -117,7 +136,7 @@ class LocalRunner:
         """Return the runs that somebody still has to work on, but for our own."""
         result = []
         for run in self._manifest.runs:
-            if run.name in self._finished or run.name in self._jobs:
+            if run.name in self._finished or run.name in self._running():
                 continue
             if self._folder.is_finished(run.name):
                 self._finished.add(run.name)
@@ -129,7 +148,7 @@ class LocalRunner:
 
     def _start(self, open_runs: list[PlannedRun]) -> None:
         for run in open_runs:
-            if len(self._jobs) >= self._parallel:
+            if len(self._running()) >= self._parallel:
                 return
             clock = time.monotonic()
             if self._again.get(run.name, clock) > clock:
@@ -137,49 +156,83 @@ class LocalRunner:
             if is_claimed(self._folder.claims, run.name):
                 self._again[run.name] = clock + _AGAIN
                 continue
-            with open(self._folder.log_path(run.name), "ab") as log:
-                log.write(f"{START} {now()}\n".encode())
-                log.flush()
-                self._jobs[run.name] = subprocess.Popen(
-                    command(self._folder.path, run, self._nice),
-                    stdin=subprocess.DEVNULL,
-                    stdout=log,
-                    stderr=subprocess.STDOUT,
-                    # A terminal's Ctrl-C reaches the runner alone, which passes it on.
-                    start_new_session=True,
-                    env={**os.environ, "OMP_NUM_THREADS": "1"},
-                )
+            self._begin(run)
 
     def _reap(self) -> None:
         """Look what has ended, and how."""
-        for name, job in list(self._jobs.items()):
-            status = job.poll()
-            if status is None:
-                continue
-            del self._jobs[name]
+        for name, (status, error) in self._ended().items():
             if status == CLAIMED:
                 self._again[name] = time.monotonic() + _AGAIN
             elif status not in (0, STOPPED):
-                error = self._folder.last_words(name)
-                if status < 0:
-                    error = f"killed by {signal.Signals(-status).name}"
                 failure = self._folder.note_failure(name, error)
                 self._show(
                     f"{name} failed, try {failure.tries} of {self._tries}: {error}"
                 )
 
+
+class LocalRunner(Runner):
+    """Works on this machine, as many runs side by side as are asked for."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self._jobs: dict[str, subprocess.Popen[bytes]] = {}
+
+    def _running(self) -> Collection[str]:
+        return self._jobs
+
+    def _begin(self, run: PlannedRun) -> None:
+        self._jobs[run.name] = start_job(self._folder, run.name, self._nice)
+
+    def _ended(self) -> dict[str, tuple[int, str]]:
+        ended = {
+            name: job for name, job in self._jobs.items() if job.poll() is not None
+        }
+        for name in ended:
+            del self._jobs[name]
+        return {
+            name: (job.returncode, how_it_ended(self._folder, name, job.returncode))
+            for name, job in ended.items()
+        }
+
     def _stop(self) -> None:
-        """Stop our runs, with checkpoints."""
         for job in self._jobs.values():
             job.terminate()
-        deadline = time.monotonic() + _PATIENCE
+        deadline = time.monotonic() + PATIENCE_S
         for job in self._jobs.values():
-            try:
-                job.wait(max(0.0, deadline - time.monotonic()))
-            except subprocess.TimeoutExpired:
-                os.killpg(job.pid, signal.SIGKILL)
-                job.wait()
+            end_job(job, deadline - time.monotonic())
         self._jobs.clear()
+
+
+def start_job(folder: StudyFolder, name: str, nice: int) -> subprocess.Popen[bytes]:
+    """Return the process that works on a run; what it says goes to the run's log."""
+    with open(folder.log_path(name), "ab") as log:
+        log.write(f"{START} {now()}\n".encode())
+        log.flush()
+        return subprocess.Popen(
+            command(folder.path, name, nice),
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            # A terminal's Ctrl-C reaches the runner alone, which passes it on.
+            start_new_session=True,
+            env={**os.environ, "OMP_NUM_THREADS": "1"},
+        )
+
+
+def end_job(job: subprocess.Popen[bytes], patience: float) -> None:
+    """Wait until a job that is to stop has ended; end it if it takes too long [s]."""
+    try:
+        job.wait(max(0.0, patience))
+    except subprocess.TimeoutExpired:
+        os.killpg(job.pid, signal.SIGKILL)
+        job.wait()
+
+
+def how_it_ended(folder: StudyFolder, name: str, status: int) -> str:
+    """Return the last error of a run whose job ended with an exit status."""
+    if status < 0:
+        return f"killed by {signal.Signals(-status).name}"
+    return folder.last_words(name)
 
 
 def slurm_script(

@@ -545,9 +545,24 @@ def test_bad_input_is_one_line(args, text, tmp_path: Path, command, capsys):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("package", ["scipy", "matplotlib"])
-def test_a_report_names_the_package_that_is_missing(
-    package, finished: Path, command, capsys, monkeypatch
+@pytest.mark.parametrize(
+    ("package", "args", "error"),
+    [
+        ("scipy", ("report",), "a report needs scipy: `pip install 'egoskin[study]'`"),
+        (
+            "matplotlib",
+            ("report",),
+            "a report needs matplotlib: `pip install 'egoskin[study]'`",
+        ),
+        (
+            "ray",
+            ("run", "--on", "ray", "--dir"),
+            "--on ray needs ray: `pip install 'egoskin[ray]'`",
+        ),
+    ],
+)
+def test_a_package_that_is_missing_is_named(
+    package, args, error, finished: Path, command, capsys, monkeypatch
 ):
     find = importlib.util.find_spec
     monkeypatch.setattr(
@@ -555,8 +570,6 @@ def test_a_report_names_the_package_that_is_missing(
         "find_spec",
         lambda name: None if name == package else find(name),
     )
-    assert command("report", finished) == 2
-    assert capsys.readouterr().err == (
-        f"error: a report needs {package}: `pip install 'egoskin[study]'`\n"
-    )
+    assert command(*args, finished) == 2
+    assert capsys.readouterr().err == f"error: {error}\n"
     assert not (finished / "report").exists()

@@ -1,0 +1,121 @@
+"""The runs of a study on a Ray cluster, their files in a folder that all nodes see.
+
+Each run is a Ray task on one core, which starts the run's job and waits for it. Ray
+chooses the node, and runs the task again on another one if its node is lost: the run
+goes on from its last checkpoint. (Extra `ray`.)
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+import ray
+from ray.exceptions import RayError
+
+from egoskin.study.job import FAILED
+from egoskin.study.manifest import PlannedRun
+from egoskin.study.runner import (
+    PATIENCE_S,
+    Runner,
+    end_job,
+    how_it_ended,
+    start_job,
+)
+from egoskin.study.store import StudyFolder
+
+
+def connect(address: str) -> int:
+    """Connect to an existing cluster; return its number of cores.
+
+    Args:
+        address: Its address, ``host:port``, or "auto": the one of this machine.
+
+    Raises:
+        ValueError: If there is none.
+    """
+    try:
+        ray.init(
+            address=address,
+            log_to_driver=False,
+            logging_level="ERROR",
+            # Nodes have egoskin installed: nothing is sent to them.
+            runtime_env={"env_vars": _own_settings()},
+        )
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        raise ValueError(
+            f"no Ray cluster at {address!r} ({_first_line(error)}); begin one with: "
+            "ray start --head"
+        ) from None
+    return int(ray.cluster_resources().get("CPU", 1))
+
+
+def _own_settings() -> dict[str, str]:
+    return {k: v for k, v in os.environ.items() if k.startswith("EGOSKIN_")}
+
+
+class RayRunner(Runner):
+    """Works on the cluster that `connect` has connected to."""
+
+    def __init__(self, folder: StudyFolder, **options: Any) -> None:
+        # Nodes have other working folders.
+        super().__init__(StudyFolder(folder.path.resolve()), **options)
+        self._tasks: dict[str, ray.ObjectRef] = {}
+
+    def _running(self) -> Collection[str]:
+        return self._tasks
+
+    def _begin(self, run: PlannedRun) -> None:
+        # Of a task whose node is lost Ray keeps the count.
+        task = _work.options(max_retries=self._tries)
+        path = str(self._folder.path)
+        self._tasks[run.name] = task.remote(path, run.name, self._nice)
+
+    def _ended(self) -> dict[str, tuple[int, str]]:
+        found = {}
+        for name, task in list(self._tasks.items()):
+            if ray.wait([task], timeout=0)[0]:
+                del self._tasks[name]
+                try:
+                    found[name] = ray.get(task)
+                except RayError as error:
+                    found[name] = FAILED, _last_line(error)
+        return found
+
+    def _stop(self) -> None:
+        tasks = list(self._tasks.values())
+        self._tasks.clear()
+        for task in tasks:
+            # As Ctrl-C there; one that waits for a core never begins.
+            ray.cancel(task)
+        if tasks:
+            ray.wait(tasks, num_returns=len(tasks), timeout=PATIENCE_S)
+
+
+@ray.remote(num_cpus=1)
+def _work(path: str, name: str, nice: int) -> tuple[int, str]:
+    """Return (exit status, last error) of a run's job, which runs on this node."""
+    folder = StudyFolder(Path(path))
+    if not folder.manifest_path.is_file():
+        node = ray.util.get_node_ip_address()
+        return FAILED, f"node {node} does not see {path}: all nodes need the folder"
+    job: subprocess.Popen[bytes] = start_job(folder, name, nice)
+    try:
+        status = job.wait()
+    except BaseException:
+        # The runner stops.
+        job.terminate()
+        end_job(job, PATIENCE_S)
+        raise
+    return status, how_it_ended(folder, name, status)
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+
+
+def _last_line(error: BaseException) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[-1].strip()
