@@ -34,7 +34,7 @@ from egoskin.evaluation.visibility import analyse
 from egoskin.parallel import available_cores
 from egoskin.storage.serialization import to_plain
 from egoskin.storage.tensor_file import write_file
-from egoskin.study.cost import cost, measure
+from egoskin.study.cost import Speed, cost, measure_all
 from egoskin.study.manifest import Manifest, load_study, resolve
 from egoskin.study.runner import LocalRunner, Progress, Runner, slurm_script
 from egoskin.study.shipped import STUDIES
@@ -42,6 +42,8 @@ from egoskin.study.store import RunStatus, StudyFolder, duration
 
 # A server that many have.
 _MANY_CORES = 64
+# Environment steps of a study that is long enough to look for its best settings.
+_WORTH_MEASURING = 50_000_000
 # Cells whose warning differs for fewer hits than this see alike.
 _ALIKE = 0.05
 
@@ -75,6 +77,17 @@ def check_packages(what: str, extra: str, *packages: str) -> None:
             )
 
 
+def fastest(speeds: list[Speed]) -> Speed:
+    """Print how fast runs are side by side; return the fastest way."""
+    for speed in speeds:
+        print(f"  {speed}")
+    return max(speeds, key=lambda speed: speed.per_s)
+
+
+def _tell(text: str) -> None:
+    print(text, flush=True)
+
+
 def check_parent(folder: Path) -> None:
     """Raise ValueError if the folder that a study is to be in is not there."""
     if not folder.absolute().parent.is_dir():
@@ -90,7 +103,8 @@ class Plan:
     dir: Path | None = None
     """Folder to begin the study in, or to add cells and seeds to; None: only tell."""
     steps_per_s: float | None = None
-    """Environment steps per second and core; None: measured now, in half a minute."""
+    """Environment steps per second and core; None: measured now, in half a minute for
+    each way to share the cores among runs."""
     coverage: bool = False
     """Also say what each coverage and range sees before any training (minutes)."""
 
@@ -107,13 +121,13 @@ class Plan:
         if self.dir is not None:
             manifest = StudyFolder(self.dir).plan(manifest)
         describe(manifest)
-        per_s, source = self.steps_per_s, "as given"
+        per_s, source, cores = self.steps_per_s, "as given", available_cores()
         if per_s is None:
-            per_s = measure(manifest.runs[0], lambda text: print(text, flush=True))
-            source = f"measured on {manifest.runs[0].cell.name}; full ray grids take"
-            source += " longer"
+            run = manifest.runs[0]
+            best = fastest(measure_all(run, cores, _tell))
+            per_s = best.per_s / cores
+            source = f"measured on {run.cell.name}; full ray grids take longer"
         total = cost(manifest, per_s)
-        cores = available_cores()
         print(
             f"{total.runs} runs, {total.frames / 1e6:,.1f} M frames, "
             f"{total.core_s / 3600:,.1f} core-hours ({per_s:,.0f} steps/s and core, "
@@ -196,7 +210,10 @@ class Run:
     ray_address: str = "auto"
     """Address of the Ray cluster, ``host:port``; auto: the one of this machine."""
     parallel: int | None = None
-    """Runs side by side, one worker each; None: one for each core."""
+    """Runs side by side; None: as many as fill the cores."""
+    cores_per_run: int | None = None
+    """Workers and learner threads of each run; None: measured, half a minute for each
+    choice, unless the whole study is short (results do not depend on it)."""
     tries: int = 3
     """How often a run that fails is tried, in all."""
     again: bool = False
@@ -206,7 +223,7 @@ class Run:
 
     def __post_init__(self) -> None:
         """Raise ValueError for counts that are none."""
-        check_counts(self, "parallel", "tries")
+        check_counts(self, "parallel", "cores_per_run", "tries")
         if not 0 <= self.nice < 20:
             raise ValueError(f"nice must be from 0 to 19, got {self.nice}")
 
@@ -226,9 +243,11 @@ class Run:
             print(f"{start}{text}", end=end, flush=True)
 
         kind, cores = self._where()
+        per_run = self.cores_per_run or self._cores_per_run(folder, cores)
         runner = kind(
             folder,
-            parallel=self.parallel or cores,
+            parallel=self.parallel or max(cores // per_run, 1),
+            cores_per_run=per_run,
             tries=self.tries,
             nice=self.nice,
             show=show,
@@ -239,6 +258,15 @@ class Run:
         if any(each.state != "done" for each in status):
             raise SystemExit(1)
         print(f"done; now: python scripts/study.py report {self.dir}")
+
+    def _cores_per_run(self, folder: StudyFolder, cores: int) -> int:
+        """Return with how many cores for each run this machine does most."""
+        status = folder.status(folder.manifest())
+        left = [each for each in status if each.state != "done"]
+        frames = sum(each.run.end - each.frames for each in left)
+        if self.on != "local" or self.parallel or frames < _WORTH_MEASURING:
+            return 1
+        return fastest(measure_all(left[0].run, cores, _tell)).cores_per_run
 
     def _where(self) -> tuple[type[Runner], int]:
         """Return what runs the study, and the cores it has."""

@@ -6,10 +6,13 @@ import dataclasses
 import statistics
 import tempfile
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from multiprocessing import get_context
 from pathlib import Path
 
-from egoskin.runs.run import Run
+from egoskin.cli import counted
+from egoskin.runs.run import Run, TrainConfig
 from egoskin.runs.trainer import open_trainer
 from egoskin.study.manifest import Manifest, PlannedRun
 
@@ -59,14 +62,70 @@ def cost(manifest: Manifest, per_s: float) -> Cost:
     return Cost(runs=len(manifest.runs), frames=frames, per_s=per_s, disk=disk)
 
 
-def measure(run: PlannedRun, tell: Callable[[str], None] = lambda text: None) -> float:
-    """Return the environment steps per second of a run on one core, learning included.
+@dataclass(frozen=True, kw_only=True)
+class Speed:
+    """How fast runs are side by side on this machine."""
 
-    It trains for some seconds in a temporary folder.
+    cores_per_run: int
+    """Workers and learner threads of each."""
+    parallel: int
+    """Runs side by side."""
+    per_s: float
+    """Environment steps per second of all together, learning included."""
+
+    def __str__(self) -> str:
+        """Return a line of text."""
+        return (
+            f"{counted(self.parallel, 'run')} side by side on "
+            f"{counted(self.cores_per_run, 'core')} each: {self.per_s:,.0f} steps/s"
+        )
+
+
+def measure_all(
+    run: PlannedRun, cores: int, tell: Callable[[str], None] = lambda text: None
+) -> list[Speed]:
+    """Return how fast a run is with 1, 2, 4, ... cores each, the machine full of them.
+
+    Each takes about half a minute; they train in temporary folders.
+
+    Args:
+        run: The run.
+        cores: Cores that may be used.
+        tell: Told what is measured.
     """
+    choices = [2**k for k in range(cores.bit_length()) if cores % 2**k == 0]
+    fit = [n for n in choices if run.config.num_envs % n == 0]
+    return [measure(run, n, cores // n, tell) for n in fit]
+
+
+def measure(
+    run: PlannedRun,
+    cores_per_run: int = 1,
+    parallel: int = 1,
+    tell: Callable[[str], None] = lambda text: None,
+) -> Speed:
+    """Return how fast some runs are side by side.
+
+    Args:
+        run: What each of them runs.
+        cores_per_run: Workers and learner threads of each.
+        parallel: Runs side by side, each in a process of its own.
+        tell: Told what is measured.
+    """
+    each = f"{counted(cores_per_run, 'core')} each"
+    tell(f"measuring {counted(parallel, 'run')} of {run.cell.name} on {each} ...")
+    config = dataclasses.replace(
+        run.config, num_workers=cores_per_run, learner_threads=cores_per_run
+    )
+    with ProcessPoolExecutor(parallel, get_context("spawn")) as processes:
+        speeds = list(processes.map(_train, [config] * parallel))
+    return Speed(cores_per_run=cores_per_run, parallel=parallel, per_s=sum(speeds))
+
+
+def _train(config: TrainConfig) -> float:
+    """Train for some seconds in a temporary folder; return the steps per second."""
     with tempfile.TemporaryDirectory(prefix="egoskin-") as folder:
-        config = dataclasses.replace(run.config, run_dir=Path(folder) / "run")
-        tell(f"measuring the speed of {run.cell.name} ...")
+        config = dataclasses.replace(config, run_dir=Path(folder) / "run")
         with open_trainer(Run.create(config)) as trainer:
             speeds = [
                 trainer.iterate()["time/steps_per_s"] for _ in range(_ROLLOUTS + 1)

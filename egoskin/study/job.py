@@ -68,8 +68,14 @@ class Stop:
             raise _StoppedError
 
 
-def work(folder: StudyFolder, name: str, stop: Stop) -> int:
+def work(folder: StudyFolder, name: str, stop: Stop, cores: int = 1) -> int:
     """Train and judge a run, as far as it has not been done; return the exit status.
+
+    Args:
+        folder: The study.
+        name: Name of the run.
+        stop: Whether it is to stop.
+        cores: Workers and learner threads, which change no result.
 
     Raises:
         ValueError: If its folder is that of another run, or damaged.
@@ -85,7 +91,7 @@ def work(folder: StudyFolder, name: str, stop: Stop) -> int:
         if folder.is_finished(name):
             return 0
         print(f"{now()} {name}", flush=True)
-        run = folder.open_run(planned)
+        run = folder.open_run(planned, cores)
         if folder.is_trained_elsewhere(name):
             return CLAIMED
         if not folder.is_trained(planned):
@@ -103,10 +109,11 @@ def work(folder: StudyFolder, name: str, stop: Stop) -> int:
         return 0
 
 
-def command(folder: Path, name: str, nice: int) -> list[str]:
+def command(folder: Path, name: str, nice: int, cores: int) -> list[str]:
     """Return the command that works on a run, for a child of this process."""
     module = [sys.executable, "-m", "egoskin.study.job"]
     options = ["--parent", str(os.getpid()), "--nice", str(nice)]
+    options += ["--cores", str(cores)]
     return [*module, str(folder), name, *options]
 
 
@@ -117,10 +124,12 @@ def main() -> int:
     parser.add_argument("name")
     parser.add_argument("--parent", type=int)
     parser.add_argument("--nice", type=int, default=0)
+    parser.add_argument("--cores", type=int, default=1)
     args = parser.parse_args()
     os.nice(args.nice)
     try:
-        return work(StudyFolder(args.folder), args.name, Stop(args.parent))
+        stop = Stop(args.parent)
+        return work(StudyFolder(args.folder), args.name, stop, args.cores)
     except (ValueError, OSError, WorkerError, NonFiniteError) as error:
         print(f"error: {error}", file=sys.stderr)
         return FAILED

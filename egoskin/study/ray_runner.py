@@ -1,6 +1,6 @@
 """The runs of a study on a Ray cluster, their files in a folder that all nodes see.
 
-Each run is a Ray task on one core, which starts the run's job and waits for it. Ray
+Each run is a Ray task on its cores, which starts the run's job and waits for it. Ray
 chooses the node, and runs the task again on another one if its node is lost: the run
 goes on from its last checkpoint. (Extra `ray`.)
 """
@@ -70,9 +70,9 @@ class RayRunner(Runner):
 
     def _begin(self, run: PlannedRun) -> None:
         # Of a task whose node is lost Ray keeps the count.
-        task = _work.options(max_retries=self._tries)
+        task = _work.options(max_retries=self._tries, num_cpus=self._cores)
         path = str(self._folder.path)
-        self._tasks[run.name] = task.remote(path, run.name, self._nice)
+        self._tasks[run.name] = task.remote(path, run.name, self._nice, self._cores)
 
     def _ended(self) -> dict[str, tuple[int, str]]:
         found = {}
@@ -95,14 +95,14 @@ class RayRunner(Runner):
             ray.wait(tasks, num_returns=len(tasks), timeout=PATIENCE_S)
 
 
-@ray.remote(num_cpus=1)
-def _work(path: str, name: str, nice: int) -> tuple[int, str]:
+@ray.remote
+def _work(path: str, name: str, nice: int, cores: int) -> tuple[int, str]:
     """Return (exit status, last error) of a run's job, which runs on this node."""
     folder = StudyFolder(Path(path))
     if not folder.manifest_path.is_file():
         node = ray.util.get_node_ip_address()
         return FAILED, f"node {node} does not see {path}: all nodes need the folder"
-    job: subprocess.Popen[bytes] = start_job(folder, name, nice)
+    job: subprocess.Popen[bytes] = start_job(folder, name, nice, cores)
     try:
         status = job.wait()
     except BaseException:

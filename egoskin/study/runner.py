@@ -72,6 +72,7 @@ class Runner(ABC):
         parallel: Runs side by side.
         tries: How often a run that fails is tried in all.
         nice: Niceness of the runs.
+        cores_per_run: Workers and learner threads of each run.
         show: Told the progress line, and each failure.
     """
 
@@ -82,11 +83,12 @@ class Runner(ABC):
         parallel: int,
         tries: int = 3,
         nice: int = 5,
+        cores_per_run: int = 1,
         show: Callable[[str], None] = lambda text: None,
     ) -> None:
         self._folder, self._manifest = folder, folder.manifest()
         self._parallel, self._tries, self._nice = parallel, tries, nice
-        self._show = show
+        self._cores, self._show = cores_per_run, show
         self._finished: set[str] = set()
         # When to ask again for a run that somebody else has claimed.
         self._again: dict[str, float] = {}
@@ -181,7 +183,9 @@ class LocalRunner(Runner):
         return self._jobs
 
     def _begin(self, run: PlannedRun) -> None:
-        self._jobs[run.name] = start_job(self._folder, run.name, self._nice)
+        self._jobs[run.name] = start_job(
+            self._folder, run.name, self._nice, self._cores
+        )
 
     def _ended(self) -> dict[str, tuple[int, str]]:
         ended = {
@@ -203,13 +207,15 @@ class LocalRunner(Runner):
         self._jobs.clear()
 
 
-def start_job(folder: StudyFolder, name: str, nice: int) -> subprocess.Popen[bytes]:
+def start_job(
+    folder: StudyFolder, name: str, nice: int, cores: int
+) -> subprocess.Popen[bytes]:
     """Return the process that works on a run; what it says goes to the run's log."""
     with open(folder.log_path(name), "ab") as log:
         log.write(f"{START} {now()}\n".encode())
         log.flush()
         return subprocess.Popen(
-            command(folder.path, name, nice),
+            command(folder.path, name, nice, cores),
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=subprocess.STDOUT,

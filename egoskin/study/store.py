@@ -159,10 +159,14 @@ class StudyFolder:
 
     # --- a run ----------------------------------------------------------------------
 
-    def open_run(self, planned: PlannedRun) -> Run:
+    def open_run(self, planned: PlannedRun, cores: int = 1) -> Run:
         """Return the run folder of a run, made now if there is none.
 
         Only who has claimed the run may call it.
+
+        Args:
+            planned: The run.
+            cores: Its workers and learner threads.
 
         Raises:
             ValueError: If the one that is there is that of another run.
@@ -185,7 +189,10 @@ class StudyFolder:
                 f"{path} is planned for {stored.total_frames:,} frames, the study for "
                 f"{config.total_frames:,}: a longer run is another one"
             )
-        run = Run(path, config)
+        run = Run(
+            path,
+            dataclasses.replace(config, num_workers=cores, learner_threads=cores),
+        )
         run.load_skin()
         if content_hash(read_json(run.skin_path)) != planned.cell.skin_sha256:
             raise ValueError(
