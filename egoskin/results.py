@@ -28,7 +28,8 @@ import numpy as np
 from egoskin.envs.dodgeball import DodgeballConfig
 from egoskin.envs.standards import Standard, training_task
 from egoskin.make import EnvConfig
-from egoskin.runs.run import MACHINE_FIELDS, SKIN_HASH, Run, TrainConfig
+from egoskin.runs.config import MACHINE_FIELDS, SKIN_HASH, TrainConfig
+from egoskin.runs.run import Run
 from egoskin.storage.formats import migrate, read_sealed
 from egoskin.storage.serialization import (
     changed_fields,
@@ -207,8 +208,10 @@ def record(run: Run, frames: int) -> Record:
         f"torch {start['packages']['torch']}, mujoco {start['packages']['mujoco']}"
         for start in starts
     ]
+    # A script's path, or "egoskin train".
+    called = f"python scripts/{Path(script).name}" if script.endswith(".py") else script
     return Record(
-        command=" ".join(["python", f"scripts/{Path(script).name}", *args]),
+        command=" ".join([called, *args]),
         commit=", ".join(dict.fromkeys(commits)),
         seed=run.config.seed,
         frames=frames,

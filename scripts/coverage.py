@@ -44,10 +44,11 @@ except ImportError:
     )
     raise SystemExit(2) from None
 
-from egoskin.cli import clear_errors, counted
+from egoskin.commands.errors import clear_errors
 from egoskin.envs.physics.mujoco import PhysicsConfig
 from egoskin.envs.throws import ThrowConfig
 from egoskin.evaluation.visibility import Analysis, analyse
+from egoskin.progress import counted
 from egoskin.robots.config import ROBOTS, RobotName
 from egoskin.sensors import Field, Ray
 from egoskin.sensors.config import SkinConfig

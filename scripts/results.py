@@ -39,12 +39,13 @@ except ImportError:
     )
     raise SystemExit(2) from None
 
-from egoskin.cli import check_output, clear_errors, counted
+from egoskin.commands.errors import clear_errors, parse_subcommand
 from egoskin.envs.standards import Standard
 from egoskin.evaluation.behaviour import behave
 from egoskin.evaluation.throw_set import standard_task
 from egoskin.make import check_num_workers
 from egoskin.policies.policy import Policy, load_policy
+from egoskin.progress import counted
 from egoskin.report import curve, report, sections
 from egoskin.results import (
     StoredRun,
@@ -57,6 +58,7 @@ from egoskin.results import (
 )
 from egoskin.rng import check_seed
 from egoskin.runs.run import Run
+from egoskin.storage.files import check_output
 from egoskin.storage.tensor_file import write_file
 
 # Okabe and Ito's colours, told apart by colour-blind readers as well.
@@ -265,7 +267,7 @@ def _draw_cell(axes: Axes, name: str, runs: list[StoredRun], number: int) -> Non
 def main(args: list[str]) -> None:
     """Run the command."""
     commands = {"add": Add, "repeat": Repeat, "write": Write}
-    tyro.extras.subcommand_cli_from_dict(commands, args=args).execute()
+    parse_subcommand(commands, args).execute()
 
 
 if __name__ == "__main__":

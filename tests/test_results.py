@@ -29,7 +29,8 @@ from egoskin.results import (
     thin,
     to_json,
 )
-from egoskin.runs.run import Run, TrainConfig
+from egoskin.runs.config import TrainConfig
+from egoskin.runs.run import Run
 from egoskin.storage.serialization import to_plain
 
 ROOT = Path(__file__).parents[1]

@@ -367,7 +367,9 @@ def test_a_pool_that_nobody_closed_ends_with_its_script():
 
 def test_ctrl_c_while_the_server_imports_is_one_line():
     body = UNGUARDED.replace("\n", "\n    ")
-    code = f"from egoskin.cli import clear_errors\nwith clear_errors():{body}"
+    code = (
+        f"from egoskin.commands.errors import clear_errors\nwith clear_errors():{body}"
+    )
     # A socket's path must be short.
     with (
         tempfile.TemporaryDirectory(prefix="ego-") as folder,

@@ -26,8 +26,9 @@ from egoskin.envs.dodgeball import DodgeballConfig
 from egoskin.envs.rewards import TERMS
 from egoskin.envs.standards import training_task
 from egoskin.make import EnvConfig
+from egoskin.runs.config import TrainConfig, parse_config
 from egoskin.runs.events import EventFile
-from egoskin.runs.run import Run, TrainConfig, parse_config
+from egoskin.runs.run import Run
 from egoskin.runs.trainer import METRIC_KEYS, Trainer, open_trainer, train
 from egoskin.sensors.config import SensorConfig
 from egoskin.storage.formats import read_sealed, sealed_json

@@ -17,7 +17,7 @@ import torch
 from PIL import Image
 from tensordict import TensorDict
 
-from egoskin.cli import clear_errors
+from egoskin.commands.errors import clear_errors
 from egoskin.envs.throws import Thrower
 from egoskin.evaluation.throw_set import play_bank, throw_seed
 from egoskin.make import EnvConfig, make_worker_env

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from egoskin import cli
-from egoskin.cli import clear_errors
+from egoskin.commands import errors
+from egoskin.commands.errors import clear_errors
 from egoskin.interrupts import ENDING, say, take
 
 SCRIPTS = sorted((Path(__file__).parents[2] / "scripts").glob("*.py"))
@@ -81,7 +81,7 @@ def test_a_signal_that_arrives_in_a_destructor_is_not_lost(monkeypatch):
             time.sleep(5)
 
     ended = []
-    monkeypatch.setattr(cli, "end_now", ended.append)
+    monkeypatch.setattr(errors, "end_now", ended.append)
     with clear_errors():
         tidied = Tidied()
         del tidied

@@ -18,10 +18,10 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from benchmarks.report import Row, show
 from egoskin.agents.networks import RunningNorm
 from egoskin.agents.ppo import PPO, PPOConfig
 from egoskin.agents.rollout import collect
+from egoskin.commands.bench.report import Row, show
 from egoskin.envs.dodgeball import DodgeballEnv
 from egoskin.envs.physics.mujoco import Physics
 from egoskin.make import (

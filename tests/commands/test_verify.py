@@ -12,7 +12,8 @@ import torch
 
 from egoskin.make import EnvConfig
 from egoskin.parallel import WorkerPool
-from egoskin.runs.run import Run, TrainConfig
+from egoskin.runs.config import TrainConfig
+from egoskin.runs.run import Run
 from egoskin.sensors.config import SensorConfig
 from egoskin.sensors.kernels.compilation import SETTING
 from egoskin.storage.tensor_file import load_tensors, save_tensors

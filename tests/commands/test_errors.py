@@ -10,8 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from egoskin.cli import check_output, clear_errors
+from egoskin.commands.errors import clear_errors
 from egoskin.parallel import WorkerError
+from egoskin.storage.files import check_output
 
 
 def test_a_file_that_cannot_be_written_is_told_of_before_the_work(tmp_path):
@@ -36,7 +37,7 @@ def test_a_file_that_cannot_be_written_is_told_of_before_the_work(tmp_path):
 def test_a_pipe_that_nobody_reads_is_no_error():
     # What is printed at last is still in a buffer; --help ends by SystemExit.
     code = (
-        "from egoskin.cli import clear_errors\n"
+        "from egoskin.commands.errors import clear_errors\n"
         "with clear_errors():\n    print('text')\n    raise SystemExit(0)"
     )
     read, write = os.pipe()
