@@ -17,8 +17,10 @@ from tensordict import TensorDict
 
 import egoskin
 from calling import BATCH, SMALL, call, fail, succeed
+from egoskin.commands.evaluate import EvaluateConfig
 from egoskin.evaluation import operating_map
 from egoskin.evaluation.throw_set import evaluate, standard_task
+from egoskin.make import MASK_ALL
 from egoskin.storage.tensor_file import load_tensors
 
 
@@ -75,12 +77,30 @@ def test_ctrl_c_leaves_a_checkpoint_and_says_how_to_go_on(tmp_path: Path):
     assert header["frames"] == int(metrics(folder)[-1]["frames"]) > 0
 
 
-def test_an_evaluation_has_the_figures_promised(trained: Path, tmp_path: Path):
-    args = ("--episodes", "16", "--json", tmp_path / "out.json")
-    done = call("evaluate", trained, *args)
+EPISODES = 6
+
+
+def figures_of(folder: Path, *args: str | Path) -> tuple[dict, str]:
+    """(JSON, text) of an evaluation."""
+    out = folder / "out.json"
+    done = call("evaluate", *args, "--episodes", EPISODES, "--json", out)
     assert done.returncode == 0, done.stderr
-    assert "success (no contact for 3 s)" in done.stdout
-    result = json.loads((tmp_path / "out.json").read_text())
+    assert f"playing {EPISODES} episodes" in done.stderr
+    return json.loads(out.read_text()), done.stdout
+
+
+@pytest.fixture(scope="module")
+def evaluated(trained: Path, tmp_path_factory) -> dict[str, tuple[dict, str]]:
+    """(JSON, text) of evaluations by each standard."""
+    folder = tmp_path_factory.mktemp("evaluated")
+    return {
+        standard: figures_of(folder, trained, "--standard", standard)
+        for standard in ("1", "2", "paper", "run")
+    }
+
+
+def test_an_evaluation_has_the_figures_promised(evaluated):
+    result, text = evaluated["2"]
     assert result.keys() == {
         "success",
         "success_5s",
@@ -101,9 +121,9 @@ def test_an_evaluation_has_the_figures_promised(trained: Path, tmp_path: Path):
     about = {"standard": "2", "trained_on": "2", "bank_seed": 0, "mask": []}
     assert {key: result[key] for key in about} == about
     assert result["frames"] == 4 * BATCH
-    assert f"{4 * BATCH:,} frames on standard 2; standard 2, bank 0" in done.stdout
-    assert "no contact for 5 s" in done.stdout
-    assert "playing 16 episodes" in done.stderr
+    assert f"{4 * BATCH:,} frames on standard 2; standard 2, bank 0" in text
+    assert "success (no contact for 3 s)" in text
+    assert "no contact for 5 s" in text
     assert result["success_5s"]["mean"] <= result["success"]["mean"]
     assert result["success"].keys() == result["survival_time"].keys()
     assert result["success"].keys() == {"mean", "low", "high"}
@@ -116,7 +136,7 @@ def test_an_evaluation_says_what_the_policy_does_and_at_another_physics_rate(
 ):
     out = succeed(
         "evaluate",
-        *(trained, "--episodes", "16", "--json", tmp_path / "out.json"),
+        *(trained, "--episodes", EPISODES, "--json", tmp_path / "out.json"),
         *("--behaviour", "--check-substeps", "8", "--standard", "run"),
     )
     assert "physics at 120 Hz" in out
@@ -128,7 +148,7 @@ def test_an_evaluation_says_what_the_policy_does_and_at_another_physics_rate(
     assert "mechanical power" in out
     result = json.loads((tmp_path / "out.json").read_text())
     assert result["check_substeps"] == 8
-    assert result["checked"]["episodes"] == result["episodes"] == 16
+    assert result["checked"]["episodes"] == result["episodes"] == EPISODES
     assert 0 < result["behaviour"]["waiting"]["base_speed"] < 1
     # Another rate is another course of events.
     assert result["checked"]["survival_time"] != result["survival_time"]
@@ -136,20 +156,12 @@ def test_an_evaluation_says_what_the_policy_does_and_at_another_physics_rate(
     assert [g["name"] for g in numbers] == ["first", "second", "third", "later"]
     groups = result["behaviour"]["throws"]["direction"]
     assert [g["name"] for g in groups] == ["front", "left", "back", "right"]
-    assert sum(g["episodes"] for g in groups) == 16
+    assert sum(g["episodes"] for g in groups) == EPISODES
 
 
-def figures_of(folder: Path, *args: str | Path) -> tuple[dict, str]:
-    """(JSON, text) of an evaluation."""
-    out = folder / "out.json"
-    text = succeed("evaluate", *args, "--episodes", "16", "--json", out)
-    return json.loads(out.read_text()), text
-
-
-def test_an_evaluation_says_by_which_standard_it_judges(trained: Path, tmp_path: Path):
+def test_an_evaluation_says_by_which_standard_it_judges(evaluated):
     results = {}
-    for standard in ("1", "2", "paper", "run"):
-        result, text = figures_of(tmp_path, trained, "--standard", standard)
+    for standard, (result, text) in evaluated.items():
         assert result["trained_on"] == "2"
         judged = "2" if standard == "run" else standard
         assert result["standard"] == judged
@@ -167,9 +179,8 @@ def test_an_evaluation_may_mask_all_sensors_or_those_of_some_links(
     policy = egoskin.load_policy(trained)
     task = standard_task(policy.env_config)
     links = ["torso_link", "left_elbow_link"]
-    for names, mask in (([], ["all"]), (["all"], ["all"]), (links, links)):
-        args = ["--mask", *names]
-        result, text = figures_of(tmp_path, trained, *args)
+    for names, mask in (([], ["all"]), (links, links)):
+        result, text = figures_of(tmp_path, trained, "--mask", *names)
         assert result["mask"] == mask
         assert f"sensors masked: {', '.join(mask)}" in text
         # Its success is that of the policy whose sensors are masked.
@@ -177,12 +188,13 @@ def test_an_evaluation_may_mask_all_sensors_or_those_of_some_links(
             policy,
             *(task, policy.skin),
             bank_seed=0,
-            episodes=16,
+            episodes=EPISODES,
             num_workers=1,
             mask=mask,
         )
         assert result["survival_time"] == asdict(played.survival_time)
         assert result["success"] == asdict(played.success)
+    assert EvaluateConfig(policy=trained, mask=("all",)).masked == MASK_ALL
 
 
 @pytest.mark.parametrize(
