@@ -27,28 +27,30 @@ COMMANDS = {
     "bench": "measure speed and accuracy",
 }
 """What each command does, by name."""
-_OLD_NAMES = {
+# What else may be meant: names of scripts that are older.
+_OTHER_NAMES = {
     "ppo": "train",
     "render": "film",
     "coverage": "visibility",
     "ceiling": "upper-bound",
+    "--help": "--help",
+    "--version": "--version",
 }
-_HELP, _VERSION = ("--help", "-h"), "--version"
 
 
 def main() -> None:
     """Run the command that the first argument of this process names."""
-    name, *args = sys.argv[1:] or _HELP[:1]
-    if name in _HELP:
+    name, *args = sys.argv[1:] or ["--help"]
+    if name in ("--help", "-h"):
         print(_page())
-    elif name == _VERSION:
+    elif name == "--version":
         print(f"egoskin {__version__}")
     elif name in COMMANDS:
         # Help and the record of a run show how it was called.
         sys.argv = [f"egoskin {name}", *args]
         run(name)
     else:
-        print(f"error: {unknown(name, COMMANDS, _OLD_NAMES)}", file=sys.stderr)
+        print(f"error: {unknown(name, COMMANDS, _OTHER_NAMES)}", file=sys.stderr)
         raise SystemExit(2)
 
 
@@ -84,14 +86,14 @@ def _page() -> str:
     )
 
 
-def unknown(name: str, known: Iterable[str], old: Mapping[str, str] = {}) -> str:
+def unknown(name: str, known: Iterable[str], other: Mapping[str, str] = {}) -> str:
     """Return what to say of a name that is none, with the nearest that is one.
 
     Args:
         name: What was given.
         known: The names that there are.
-        old: Present name of each that there was.
+        other: Other names that may have been meant, and what each stands for.
     """
-    near = difflib.get_close_matches(name, [*known, *old], n=1)
-    hint = f", did you mean {old.get(near[0], near[0])!r}?" if near else ""
+    near = difflib.get_close_matches(name, [*known, *other], n=1)
+    hint = f", did you mean {other.get(near[0], near[0])!r}?" if near else ""
     return f"there is no command {name!r}{hint} (commands: {', '.join(known)})"
