@@ -2,6 +2,13 @@
 
 from __future__ import annotations
 
+from egoskin.viewer import draw_without_display
+
+# Before mujoco is first imported.
+draw_without_display()
+
+# isort: split
+
 import os
 from collections.abc import Callable
 from pathlib import Path

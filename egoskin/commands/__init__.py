@@ -13,6 +13,7 @@ from importlib import import_module
 
 from egoskin import __version__
 from egoskin.interrupts import end_quietly
+from egoskin.viewer import draw_without_display
 
 COMMANDS = {
     "train": "train a robot to dodge, or go on with a run",
@@ -37,6 +38,9 @@ _OTHER_NAMES = {
     "--version": "--version",
 }
 
+# Commands that draw the robot.
+_PICTURES = ("film", "skin")
+
 
 def main() -> None:
     """Run the command that the first argument of this process names."""
@@ -57,6 +61,8 @@ def main() -> None:
 def run(name: str) -> None:
     """Run a command on the arguments of this process, with clear errors."""
     end_quietly()
+    if name in _PICTURES:
+        draw_without_display()
     command = import_module(f"egoskin.commands.{name.replace('-', '_')}")
     # Only now: it imports torch.
     from egoskin.commands.errors import clear_errors
