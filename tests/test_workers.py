@@ -342,6 +342,8 @@ def test_a_pool_that_nobody_closed_ends_with_its_script():
     assert not Path("/proc", done.stdout.strip()).exists()
 
 
+# By default, that of a training which starts its workers (runs/test_faults.py).
+@pytest.mark.slow
 def test_ctrl_c_while_the_server_imports_is_one_line():
     body = UNGUARDED.replace("\n", "\n    ")
     code = (

@@ -213,7 +213,7 @@ class Run:
                 "machine": f"{platform.system()} {platform.machine()}",
                 "cores": os.cpu_count(),
                 "packages": {p: package_version(p) for p in _PACKAGES},
-                "git": _git_state(),
+                "git": git_state(Path(__file__)),
             }
         )
         write_file(self._versions_path, sealed_json({"starts": self._starts}))
@@ -409,12 +409,15 @@ def _whole_rows(path: Path, frames: int) -> str:
     return "".join([first, *kept]) if kept else ""
 
 
-def _git_state() -> dict[str, Any] | None:
-    """Commit of the source tree and whether it was changed; None if git has none."""
+def git_state(source: Path) -> dict[str, Any] | None:
+    """Return the commit that a source file is of, and whether its tree was changed.
+
+    None if no repository holds the file.
+    """
 
     def git(*args: str) -> str:
         return subprocess.run(
-            ["git", "-C", str(Path(__file__).parent), *args],
+            ["git", "-C", str(source.parent), *args],
             capture_output=True,
             text=True,
             check=True,
@@ -422,7 +425,7 @@ def _git_state() -> dict[str, Any] | None:
 
     try:
         # An installed copy may lie inside a repository of something else.
-        git("ls-files", "--error-unmatch", str(Path(__file__)))
+        git("ls-files", "--error-unmatch", str(source))
         return {
             "commit": git("rev-parse", "HEAD"),
             "changed": bool(git("status", "--porcelain", "--untracked-files=no")),
