@@ -21,7 +21,6 @@ import time
 import traceback
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from multiprocessing import (
     active_children,
@@ -278,8 +277,7 @@ class WorkerPool(ParallelEnv):
     def __init__(self, builders: Sequence[Callable[[], EnvBase]]) -> None:
         _check_guarded()
         self._reports = Path(tempfile.mkdtemp(dir=_temporary_folder()))
-        self._num_all, self._last_step = len(builders), 0.0
-        self._halves: list[WorkerPool] = []
+        self._last_step = 0.0
         keep_freed_memory()
         threads = torch.get_num_threads()
         super().__init__(
@@ -289,30 +287,6 @@ class WorkerPool(ParallelEnv):
         )
         # TorchRL lowers the parent's threads for good when the workers start.
         self.num_threads = threads
-
-    def halves(self) -> list[WorkerPool]:
-        """Return what may be stepped at the same time, in the order of the workers.
-
-        That is each half of the workers, or this where they are odd in number.
-        """
-        if self.num_workers % 2:
-            return [self]
-        if not self._halves:
-            middle = self.num_workers // 2
-            self._halves = [self._part(p) for p in (slice(middle), slice(middle, None))]
-        return self._halves
-
-    def _part(self, workers: slice) -> WorkerPool:
-        """Return TorchRL's view of some workers, without its lazy stacks.
-
-        Those take an operation for each row.
-        """
-        part = self[workers]
-        assert isinstance(part, WorkerPool)
-        shared = part.shared_tensordict_parent = self.shared_tensordict_parent[workers]
-        part._shared_tensordict_parent_next = shared.get("next")
-        part._shared_tensordict_parent_root = shared.exclude("next", *part.reset_keys)
-        return part
 
     def simulation_state(self) -> dict[str, Tensor]:
         """Return the state of all rows, in the order of the workers."""
@@ -357,9 +331,7 @@ class WorkerPool(ParallelEnv):
         start_server()
         self._reports.mkdir(exist_ok=True)
         started = Event()
-        self._workers, self._hung, self._halves = [], set[int](), []
-        # The halves share this list.
-        self._failures: list[str] = []
+        self._workers, self._hung = [], set[int]()
         others = set(active_children())
         watch = Thread(target=self._watch_start, args=(started,), daemon=True)
         watch.start()
@@ -397,20 +369,18 @@ class WorkerPool(ParallelEnv):
     def _wait_for_workers(self, workers_range: Iterable[int]) -> None:
         """Sleep until the workers have set their flags; raise if one cannot."""
         workers, flags = list(workers_range), self._shm_done_flags
-        indices, begin = self._worker_indices, time.monotonic()
+        begin = time.monotonic()
         time.sleep(min(_SURE_SHARE * self._last_step, _LOOK))
-        self._wait(workers, lambda worker: bool(flags[indices[worker]]))
+        self._wait(workers, lambda worker: bool(flags[worker]))
         self._last_step = time.monotonic() - begin
         for worker in workers:
-            flags[indices[worker]] = 0
+            flags[worker] = 0
 
     def _wait(self, workers: Iterable[int], answered: Callable[[int], bool]) -> None:
         """Sleep until the workers have answered a command; raise if one cannot."""
         waiting, looks = list(workers), 0
         begin = looked = time.monotonic()
         while waiting := [worker for worker in waiting if not answered(worker)]:
-            if self._failures:
-                raise WorkerError(self._failures[0])
             now = time.monotonic()
             if now - looked > _LOOK:
                 looked, looks = now, looks + 1
@@ -432,6 +402,10 @@ class WorkerPool(ParallelEnv):
             yield
         except (EOFError, ConnectionError):
             self._explain_death()
+        except KeyboardInterrupt:
+            # The next command would be given the answers to this one.
+            self._end()
+            raise
 
     def _explain_death(self) -> NoReturn:
         """Raise, saying which worker ended and how."""
@@ -445,10 +419,9 @@ class WorkerPool(ParallelEnv):
         raise WorkerError("the channel to a worker broke; all were ended")
 
     def _death(self, worker: int) -> str:
-        number = self._worker_indices[worker]
-        if number in self._hung:
+        if worker in self._hung:
             return f"hung while it started: no answer in {HANG_LIMIT:g} s"
-        report = self._report(number)
+        report = self._report(worker)
         if report.exists():
             return f"raised\n{report.read_text()}"
         code = self._workers[worker].exitcode
@@ -460,11 +433,9 @@ class WorkerPool(ParallelEnv):
         return f"ended with exit status {code}"
 
     def _fail(self, worker: int, reason: str) -> NoReturn:
-        """End the workers and raise; the other half then does, too."""
-        number = self._worker_indices[worker]
-        self._failures.append(f"worker {number} of {self._num_all} {reason}")
+        """End the workers and raise."""
         self._end()
-        raise WorkerError(self._failures[0])
+        raise WorkerError(f"worker {worker} of {self.num_workers} {reason}")
 
     def _end(self) -> None:
         """Kill all workers."""
@@ -487,41 +458,3 @@ class WorkerPool(ParallelEnv):
             else:
                 self._end()
         shutil.rmtree(self._reports, ignore_errors=True)
-
-
-def in_halves(
-    env: EnvBase,
-    root: TensorDictBase,
-    run: Callable[[EnvBase, TensorDictBase, slice], T],
-) -> list[T]:
-    """Let both halves of an environment's workers go on at the same time.
-
-    Each half is stepped while another thread reads what the other half gave: no core
-    is idle between two steps, and no worker waits for a slower one.
-
-    Args:
-        env: Batched environment; all of it is one half if it has no two.
-        root: Tensordict to start from.
-        run: Is given a half, what of ``root`` is that half's, and its rows.
-
-    Returns:
-        What was returned for each half.
-    """
-    halves = env.halves() if isinstance(env, WorkerPool) else [env]
-    roots = root.chunk(len(halves))
-    ends = [(i + 1) * root.numel() // len(halves) for i in range(len(halves))]
-    rows = map(slice, [0, *ends], ends)
-    # As many of PyTorch's threads for each, be there two halves or one: with more, the
-    # last bits of a sum may differ.
-    threads = max(torch.get_num_threads() // 2, 1)
-    with ThreadPoolExecutor(
-        len(halves), "collector", torch.set_num_threads, (threads,)
-    ) as pool:
-        try:
-            return list(pool.map(run, halves, roots, rows))
-        except BaseException:
-            # Ctrl-C, too: the other half is not waited for to its end.
-            for half in halves:
-                if isinstance(half, WorkerPool):
-                    half._failures.append("it was interrupted: start anew")
-            raise

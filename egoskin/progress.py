@@ -1,4 +1,4 @@
-"""A progress line that is readable on a terminal and in a file."""
+"""How far work is, readable on a terminal and in a file."""
 
 from __future__ import annotations
 
@@ -9,6 +9,11 @@ from collections.abc import Mapping
 
 # In a file a line is written this often [s]; a terminal shows every rollout.
 _FILE_INTERVAL = 10.0
+
+
+def counted(number: int, noun: str) -> str:
+    """Return a number with its noun: "1 worker", "2 workers"."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 class StatusLine:

@@ -36,7 +36,7 @@ import tyro
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from egoskin.cli import clear_errors
+from egoskin.commands.errors import clear_errors
 from egoskin.robots.config import H1_2
 from egoskin.robots.surface import sample_surface
 

@@ -33,7 +33,7 @@ from torch import Tensor
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 from torchrl.envs import Compose, GymWrapper, StepCounter, TransformedEnv
 
-from egoskin.cli import clear_errors
+from egoskin.commands.errors import clear_errors
 from egoskin.robots.chains import build_chain
 from egoskin.sensors import FieldSensor, Proximity, Skin
 from egoskin.shapes import Sphere

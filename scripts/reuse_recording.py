@@ -24,11 +24,12 @@ import tyro
 from tensordict import TensorDict
 from torch import Tensor
 
-from egoskin.cli import check_counts, clear_errors
+from egoskin.commands.errors import clear_errors
 from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
 from egoskin.envs.throws import ThrowConfig
 from egoskin.robots.config import H1_2
 from egoskin.sensors import FieldSensor, Ray, RaySensor, place_sensors
+from egoskin.storage.serialization import check_counts
 
 # The first ball at once: a recording is short.
 TASK = DodgeballConfig(throws=ThrowConfig(first_delay=(0.0, 0.0)))

@@ -22,7 +22,7 @@ import tyro
 from tensordict import TensorDict
 from torchrl.envs import Compose
 
-from egoskin.cli import clear_errors
+from egoskin.commands.errors import clear_errors
 from egoskin.sensors import FieldSensor, Ray, RaySensor, Skin
 from egoskin.shapes import Sphere
 

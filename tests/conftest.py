@@ -2,6 +2,13 @@
 
 from __future__ import annotations
 
+from egoskin.viewer import draw_without_display
+
+# Before mujoco is first imported.
+draw_without_display()
+
+# isort: split
+
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -12,6 +19,7 @@ import torch
 from hypothesis import settings
 from tensordict import TensorDict
 
+from calling import BATCH, SMALL, succeed
 from egoskin.robots.config import H1_2, RobotConfig
 from egoskin.sensors import Skin, place_sensors
 from egoskin.sensors.kernels import compilation
@@ -88,6 +96,14 @@ def random_state(
         )
 
     return draw
+
+
+@pytest.fixture(scope="session")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of four rollouts, to be read; who changes it copies it."""
+    folder = tmp_path_factory.mktemp("runs") / "trained"
+    succeed("train", *SMALL, "--run-dir", folder, "--total-frames", 4 * BATCH)
+    return folder
 
 
 @pytest.fixture

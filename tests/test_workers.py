@@ -31,7 +31,6 @@ from egoskin.parallel import (
     WorkerError,
     WorkerPool,
     default_num_workers,
-    in_halves,
 )
 from egoskin.robots.config import H1_2
 from egoskin.sensors import place_sensors
@@ -147,39 +146,17 @@ def test_a_killed_worker_is_named_with_its_signal(skin):
     pool.close()
 
 
-def test_both_halves_end_when_a_worker_of_one_is_killed(skin):
-    pool = make_pool(skin, 4)
-
-    def run(half, root, rows: slice) -> None:
-        for i in range(1000):
-            if i == 3 and rows.start:
-                os.kill(half._workers[1].pid, signal.SIGKILL)
-            root["action"] = torch.zeros(*root.batch_size, 21)
-            _, root = half.step_and_maybe_reset(root)
-
-    root, start = pool.reset(), time.monotonic()
-    with pytest.raises(WorkerError, match="worker 3 of 4 was killed by SIGKILL"):
-        in_halves(pool, root, run)
-    assert time.monotonic() - start < 10
-    pool.close()
-    assert not any(process.is_alive() for process in pool._workers)
-
-
-def test_neither_half_waits_for_the_other(skin):
-    pool, met = make_pool(skin, 2), threading.Event()
-
-    def run(half, root, rows: slice) -> tuple[int, int]:
-        for _ in range(3):
-            root["action"] = torch.zeros(*root.batch_size, 21)
-            _, root = half.step_and_maybe_reset(root)
-        # The first waits in the middle until the second is at its end.
-        met.set() if rows.start else met.wait(30)
-        assert met.is_set()
-        root["action"] = torch.zeros(*root.batch_size, 21)
-        half.step_and_maybe_reset(root)
-        return rows.start, rows.stop
-
-    assert in_halves(pool, pool.reset(), run) == [(0, 16), (16, 32)]
+def test_an_interrupted_pool_ends_its_workers(skin):
+    pool = make_pool(skin, 2)
+    root, processes = pool.reset(), list(pool._workers)
+    root["action"] = torch.zeros(*root.batch_size, 21)
+    # It waits for this one.
+    os.kill(processes[0].pid, signal.SIGSTOP)
+    threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
+    with pytest.raises(KeyboardInterrupt):
+        pool.step_and_maybe_reset(root)
+    # Their answers would be taken for those to the next command.
+    assert not any(process.is_alive() for process in processes)
     pool.close()
 
 
@@ -365,9 +342,13 @@ def test_a_pool_that_nobody_closed_ends_with_its_script():
     assert not Path("/proc", done.stdout.strip()).exists()
 
 
+# By default, that of a training which starts its workers (runs/test_faults.py).
+@pytest.mark.slow
 def test_ctrl_c_while_the_server_imports_is_one_line():
     body = UNGUARDED.replace("\n", "\n    ")
-    code = f"from egoskin.cli import clear_errors\nwith clear_errors():{body}"
+    code = (
+        f"from egoskin.commands.errors import clear_errors\nwith clear_errors():{body}"
+    )
     # A socket's path must be short.
     with (
         tempfile.TemporaryDirectory(prefix="ego-") as folder,

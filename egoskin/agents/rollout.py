@@ -1,16 +1,14 @@
 """Collection: what an agent meets in an environment, as PPO needs it.
 
 Contract: a rollout keeps the values it bootstraps from, not the next observations;
-the value of a time-out is taken from the terminal observation, before the reset. Both
-halves of the workers go through a rollout on their own, and neither waits for the
-other; what a row meets does not depend on how many workers there are.
+the value of a time-out is taken from the terminal observation, before the reset; and
+what a row meets does not depend on how many workers there are.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from tensordict import NonTensorData, TensorDict, TensorDictBase
@@ -18,10 +16,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from egoskin.agents.networks import Agent, input_keys
-from egoskin.parallel import in_halves
 from egoskin.sparse import SparseRows
-
-T = TypeVar("T")
 
 
 @torch.no_grad()
@@ -52,24 +47,24 @@ def collect(
     device = agent.head.log_std.device
     shape = (num_steps, root.numel(), len(agent.head.log_std))
     noise = correlated_noise(shape, noise_correlation).to(device)
-    # The policy reads as many rows at once, however they are shared out.
-    part = shape[1] if shape[1] % 2 else shape[1] // 2
-
-    def run(env: EnvBase, root: TensorDictBase, rows: slice) -> _Walk:
-        return _walk(env, agent, root, noise[:, rows], part, info_keys)
-
-    walks = in_halves(env, root, run)
-    root = _cat([walk.root for walk in walks])
-    flat = agent.critic(_joined(_in_turn([walk.frames for walk in walks])))
-    rollout = flat.reshape(shape[:2])
+    frames, ended, infos = [], [], []
+    for now in noise:
+        frame = _act(agent, _readable(agent, root), now)
+        root["action"] = frame["action"].reshape(*root.batch_size, -1).to(root.device)
+        step, root = env.step_and_maybe_reset(root)
+        after = step["next"].reshape(-1)
+        for key in ("reward", "done", "terminated"):
+            frame[key] = after[key].to(device)
+        frames.append(frame)
+        ended.append(_readable(agent, after)[_timed_out(after)])
+        infos.append(after.select(*info_keys))
+    rollout = agent.critic(_joined(frames)).reshape(shape[:2])
     following = _value(agent, _readable(agent, root))
     next_value = torch.cat((rollout["state_value"][1:], following[None]))
-    ended = _cat(_in_turn([walk.ended for walk in walks]))
-    if len(ended):
-        next_value[_timed_out(rollout)] = _value(agent, ended)
+    timed_out = torch.cat(ended)
+    if len(timed_out):
+        next_value[_timed_out(rollout)] = _value(agent, timed_out)
     rollout["next_state_value"] = next_value
-    steps = zip(*(walk.infos for walk in walks), strict=True)
-    infos = [_cat(halves) for halves in steps]
     return rollout, root, infos
 
 
@@ -90,55 +85,6 @@ def correlated_noise(shape: tuple[int, int, int], correlation: float) -> Tensor:
         for before, after in zip(noise, noise[1:], strict=False):
             after.add_(before, alpha=correlation)
     return noise
-
-
-@dataclass
-class _Walk:
-    """What some rows met in a rollout; lists are of its steps."""
-
-    root: TensorDictBase
-    """Where they go on from."""
-    frames: list[TensorDict]
-    """What PPO needs."""
-    ended: list[TensorDictBase]
-    """What the agent would read of the rows that timed out."""
-    infos: list[TensorDictBase]
-    """What else was asked for."""
-
-
-@torch.no_grad()
-def _walk(
-    env: EnvBase,
-    agent: Agent,
-    root: TensorDictBase,
-    noise: Tensor,
-    part: int,
-    info_keys: Sequence[str],
-) -> _Walk:
-    """Step an environment with an agent that reads some rows at once.
-
-    Args:
-        env: Batched environment of ``n`` rows.
-        agent: Chooses the actions.
-        root: Tensordict to start from.
-        noise: Of the actions, in standard deviations, ``[T, n, J]``.
-        part: How many rows.
-        info_keys: What else to keep of what the environment says.
-    """
-    frames, ended, infos = [], [], []
-    for now in noise:
-        state = _readable(agent, root).split(part)
-        parts = zip(state, now.split(part), strict=True)
-        frame = _joined([_act(agent, *each) for each in parts])
-        root["action"] = frame["action"].reshape(*root.batch_size, -1).to(root.device)
-        step, root = env.step_and_maybe_reset(root)
-        after = step["next"].reshape(-1)
-        for key in ("reward", "done", "terminated"):
-            frame[key] = after[key].to(noise.device)
-        frames.append(frame)
-        ended.append(_readable(agent, after)[_timed_out(after)])
-        infos.append(after.select(*info_keys))
-    return _Walk(root, frames, ended, infos)
 
 
 def _act(agent: Agent, state: TensorDictBase, noise: Tensor) -> TensorDict:
@@ -176,18 +122,6 @@ def _value(agent: Agent, state: TensorDictBase) -> Tensor:
 def _timed_out(steps: TensorDictBase) -> Tensor:
     """Return which rows ended without termination, ``[*B]`` bool."""
     return (steps["done"] & ~steps["terminated"])[..., 0]
-
-
-def _cat(parts: Sequence[TensorDictBase]) -> TensorDict:
-    """Return the rows of tensordicts, one after the other."""
-    joined = torch.cat(list(parts))
-    assert isinstance(joined, TensorDict)
-    return joined
-
-
-def _in_turn(lists: Sequence[Sequence[T]]) -> list[T]:
-    """Return the first of each list, then the second of each, and so on."""
-    return [item for items in zip(*lists, strict=True) for item in items]
 
 
 def _joined(frames: Sequence[TensorDict]) -> TensorDict:

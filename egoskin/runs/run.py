@@ -6,7 +6,7 @@
     metrics.csv              one line for each rollout; TensorBoard files beside it
     checkpoint.safetensors   everything needed to go on, at most a minute old
     policies/<frames>.safetensors   self-contained policies, from the first on
-    not-finite-<frames>.safetensors   an update that failed, for scripts/replay.py
+    not-finite-<frames>.safetensors   an update that failed, for `egoskin replay`
     lock                     held by the process that trains
 
 Contract: a checkpoint is written atomically, metrics written after it are dropped on
@@ -18,7 +18,6 @@ as if they had not been, or does not.
 
 from __future__ import annotations
 
-import argparse
 import csv
 import datetime
 import errno
@@ -31,38 +30,33 @@ import subprocess
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import Any
 
 import numpy as np
 import torch
-import tyro
 from torch import Tensor
 
-from egoskin.agents.ppo import PPOConfig
-from egoskin.cli import check_counts
-from egoskin.envs.dodgeball import DodgeballConfig
-from egoskin.envs.standards import Standard, training_task
-from egoskin.make import EnvConfig, check_num_workers
-from egoskin.parallel import available_cores
 from egoskin.policies.policy import CHECKPOINT_NAME
-from egoskin.rng import check_seed
+from egoskin.runs.config import (
+    CALL_FIELDS,
+    MACHINE_FIELDS,
+    SKIN_HASH,
+    TrainConfig,
+    load_config,
+    read_config,
+)
 from egoskin.runs.events import EventFile
 from egoskin.sensors import Skin
 from egoskin.storage.files import read_regular
 from egoskin.storage.formats import (
     content_hash,
     package_version,
-    present_config,
-    read_sealed,
     sealed_json,
     unseal,
 )
 from egoskin.storage.serialization import (
     changed_fields,
-    check_numbers,
-    from_plain,
     read_json,
     to_plain,
 )
@@ -79,177 +73,8 @@ _PACKAGES = ("egoskin", "torch", "torchrl", "tensordict", "mujoco", "numpy")
 _PACKAGES += ("pytorch-kinematics", "gymnasium")
 
 
-@dataclass(frozen=True, kw_only=True)
-class TrainConfig:
-    """Train a robot to dodge balls by what its skin feels."""
-
-    env: Annotated[EnvConfig, tyro.conf.arg(name="")] = field(default_factory=EnvConfig)
-    """Robot, task, skin, sensors."""
-    ppo: PPOConfig = field(default_factory=PPOConfig)
-    """Networks and PPO."""
-    standard: Standard | None = None
-    """Version of the standard throw: sets throws and ends. None: 2, the defaults. A
-    throw or end given beside it makes the task custom."""
-    seed: int = 0
-    """Seed of everything random: throws, starts, networks, actions."""
-    total_frames: int = 65_536_000
-    """Environment steps of the whole run (the paper's 1000 epochs)."""
-    num_envs: int = 4096
-    """Agents simulated in parallel."""
-    num_workers: int | None = None
-    """Processes that simulate; None: the largest divisor of num_envs <= cores."""
-    device: str = "cpu"
-    """Device of the learner ("cpu", "cuda", "cuda:1")."""
-    learner_threads: int | None = None
-    """Threads of the learner; None: one for each core."""
-    run_dir: Path | None = None
-    """Folder of the run; None: a new one under runs/, named after time and sensor."""
-    snapshot_frames: int = 5_000_000
-    """Environment steps between the policies kept for learning curves."""
-    checkpoint_interval: float = 60.0
-    """A checkpoint is at most this old [s]."""
-    resume: Path | None = None
-    """Run folder to go on with; changed may be --total-frames, to a later end, and what
-    changes no result: workers, threads, when checkpoints and policies are kept."""
-
-    def __post_init__(self) -> None:
-        """Raise ValueError for values with which no run can start."""
-        check_numbers(self, may_be_infinite=("env.sensor.range",))
-        check_counts(self, "total_frames", "snapshot_frames", "learner_threads")
-        check_seed(self.seed)
-        if not self.checkpoint_interval > 0:
-            raise ValueError(
-                f"checkpoint_interval must be positive, got {self.checkpoint_interval}"
-            )
-        check_num_workers(self.num_envs, self.num_workers)
-        frames = self.num_envs * self.ppo.rollout_steps
-        if frames < self.ppo.num_mini_batches:
-            raise ValueError(
-                f"a rollout of {frames} frames cannot be split into "
-                f"{self.ppo.num_mini_batches} minibatches"
-            )
-
-    @property
-    def frames_per_batch(self) -> int:
-        """Environment steps of one rollout."""
-        return self.num_envs * self.ppo.rollout_steps
-
-    @property
-    def num_learner_threads(self) -> int:
-        """Threads of the learner on this machine; results do not depend on it."""
-        return self.learner_threads or available_cores()
-
-    def check_machine(self) -> None:
-        """Raise ValueError for what this machine lacks: the device."""
-        self.learner_device()
-
-    def learner_device(self) -> torch.device:
-        """Return the device of the learner.
-
-        Raises:
-            ValueError: If there is no such device.
-        """
-        valid = ["cpu", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]
-        try:
-            device = torch.device(self.device)
-        except RuntimeError:
-            device = None
-        if device is None or (
-            device.type != "cpu"
-            and not (device.type == "cuda" and (device.index or 0) < len(valid) - 1)
-        ):
-            raise ValueError(
-                f"no device {self.device!r} here; available: {', '.join(valid)}"
-            )
-        return device
-
-
-# What a run's stored configuration leaves out: it says how a run was called.
-_CALL_FIELDS = ("run_dir", "resume", "standard")
-MACHINE_FIELDS = frozenset(
-    (
-        *_CALL_FIELDS,
-        "num_workers",
-        "learner_threads",
-        "snapshot_frames",
-        "checkpoint_interval",
-    )
-)
-"""Fields that say how a run was called, where it is computed and what is kept of it:
-they change no result, to the last bit, and may change at a resume. The device is none
-of them: sums on another one round otherwise."""
-SKIN_HASH = "skin_sha256"
-"""What config.json holds beside the configuration: the hash of the skin."""
 # Where a checkpoint keeps the metrics.
 _METRICS = "log/metrics"
-
-
-def parse_config(args: list[str]) -> TrainConfig:
-    """Return the configuration of a command line.
-
-    With ``--resume RUN`` the stored configuration of the run is the default, and no
-    field but ``total_frames`` and `MACHINE_FIELDS` may differ from it.
-
-    Args:
-        args: Arguments, without the program's name.
-
-    Raises:
-        ValueError: If a field is changed that may not be, or the end lies before the
-            one planned.
-    """
-    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    first.add_argument("--resume", type=Path)
-    first.add_argument("--standard")
-    run, _ = first.parse_known_args(args)
-    if run.resume is None or str(run.resume) == "None":
-        if run.standard not in get_args(Standard):
-            return tyro.cli(TrainConfig, args=args)
-        task = training_task(run.standard, DodgeballConfig())
-        default = TrainConfig(env=EnvConfig(task=task))
-        return tyro.cli(TrainConfig, args=args, default=default)
-    if run.standard is not None:
-        raise ValueError("--standard cannot be changed on resume")
-    stored = Run.open(run.resume).config
-    # What the file lacks was filled with today's defaults.
-    file, before = run.resume / "config.json", to_plain(stored)
-    if lacking := changed_fields(_read_config(file)[0], before):
-        raise ValueError(
-            f"{file} lacks {', '.join(lacking)}: another version made it. Go on with "
-            "that version (its commit is in versions.json)"
-        )
-    config = tyro.cli(TrainConfig, args=args, default=stored)
-    if config.run_dir is not None:
-        raise ValueError("--run-dir cannot be changed on resume")
-    free = MACHINE_FIELDS | {"total_frames"}
-    changed = [n for n in changed_fields(before, to_plain(config)) if n not in free]
-    if changed:
-        names = ", ".join(n.removeprefix("env.") for n in changed)
-        may = sorted(free - set(_CALL_FIELDS))
-        raise ValueError(
-            f"a resumed run keeps its configuration; changed: {names}. Only "
-            f"{', '.join(map(_option, may))} may be"
-        )
-    if config.total_frames < stored.total_frames:
-        raise ValueError(
-            f"--total-frames {config.total_frames} is before the planned end "
-            f"{stored.total_frames}"
-        )
-    return config
-
-
-def _option(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
-
-
-def _read_config(file: Path) -> tuple[dict[str, Any], str | None]:
-    """Return (configuration in the present format, hash of the skin if it holds one).
-
-    Raises:
-        ValueError: If it is damaged, or has options that are no more.
-    """
-    content, number = read_sealed(file)
-    skin = content.pop(SKIN_HASH, None)
-    return present_config(content, number, str(file)), skin
 
 
 class Run:
@@ -307,15 +132,12 @@ class Run:
         Raises:
             ValueError: If it is none.
         """
-        file = path / "config.json"
-        if not file.is_file():
-            raise ValueError(f"{path} is no run folder: it has no config.json")
-        return cls(path, from_plain(TrainConfig, _read_config(file)[0], str(file)))
+        return cls(path, load_config(path))
 
     def write_config(self) -> None:
         """Write the configuration (again, with a later end) and the skin's hash."""
         content = to_plain(self.config)
-        for name in _CALL_FIELDS:
+        for name in CALL_FIELDS:
             content[name] = None
         content[SKIN_HASH] = self._skin_hash
         write_file(self.path / "config.json", sealed_json(content))
@@ -328,7 +150,7 @@ class Run:
         """
         skin = Skin.load(self.skin_path)
         self._skin_hash = content_hash(read_json(self.skin_path))
-        _, written = _read_config(self.path / "config.json")
+        _, written = read_config(self.path / "config.json")
         if written not in (None, self._skin_hash):
             raise ValueError(
                 f"{self.skin_path} is damaged or was edited: it is not the skin that "
@@ -391,7 +213,7 @@ class Run:
                 "machine": f"{platform.system()} {platform.machine()}",
                 "cores": os.cpu_count(),
                 "packages": {p: package_version(p) for p in _PACKAGES},
-                "git": _git_state(),
+                "git": git_state(Path(__file__)),
             }
         )
         write_file(self._versions_path, sealed_json({"starts": self._starts}))
@@ -466,7 +288,7 @@ class Run:
                 f"{self.path} is gone: start a new run or, if it was only renamed, "
                 "--resume it by its new name"
             )
-        return f"go on with: python scripts/ppo.py --resume {self.path}"
+        return f"go on with: egoskin train --resume {self.path}"
 
     def save_checkpoint(
         self, tensors: Mapping[str, Tensor], header: Mapping[str, Any]
@@ -587,12 +409,15 @@ def _whole_rows(path: Path, frames: int) -> str:
     return "".join([first, *kept]) if kept else ""
 
 
-def _git_state() -> dict[str, Any] | None:
-    """Commit of the source tree and whether it was changed; None if git has none."""
+def git_state(source: Path) -> dict[str, Any] | None:
+    """Return the commit that a source file is of, and whether its tree was changed.
+
+    None if no repository holds the file.
+    """
 
     def git(*args: str) -> str:
         return subprocess.run(
-            ["git", "-C", str(Path(__file__).parent), *args],
+            ["git", "-C", str(source.parent), *args],
             capture_output=True,
             text=True,
             check=True,
@@ -600,7 +425,7 @@ def _git_state() -> dict[str, Any] | None:
 
     try:
         # An installed copy may lie inside a repository of something else.
-        git("ls-files", "--error-unmatch", str(Path(__file__)))
+        git("ls-files", "--error-unmatch", str(source))
         return {
             "commit": git("rev-parse", "HEAD"),
             "changed": bool(git("status", "--porcelain", "--untracked-files=no")),

@@ -132,7 +132,7 @@ class Trainer:
             learned = self.ppo.update(rollout, self.frames)
         except NonFiniteError as error:
             path = self.dump(error)
-            error.args = (f"{error}\nreplay it with: python scripts/replay.py {path}",)
+            error.args = (f"{error}\nreplay it with: egoskin replay {path}",)
             raise
         end = time.perf_counter()
         self.frames += self.config.frames_per_batch
@@ -221,7 +221,7 @@ class Trainer:
         torch.set_rng_state(tensors["random_state"])
 
     def dump(self, error: NonFiniteError) -> Path:
-        """Write what `scripts/replay.py` needs to meet an error again; return where."""
+        """Write what `egoskin replay` needs to meet an error again; return where."""
         path = self.run.dump_path(self.frames)
         ppo = self.config.ppo
         now = ppo.entropy_coeff_at(self.frames)

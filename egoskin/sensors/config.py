@@ -41,7 +41,7 @@ class SkinConfig:
     seed: int = 0
     """Seed of the placement (ignored with a file)."""
     placement: Literal["area_uniform", "poisson_disk"] = "area_uniform"
-    """Independent points or well-spread ones; scripts/skin.py has more to choose."""
+    """Independent points or well-spread ones; `egoskin skin` has more to choose."""
 
     def build(self, robot: RobotConfig) -> Skin:
         """Return the skin, checked against the robot.

@@ -57,6 +57,31 @@ def read_regular(path: Path | str, limit: int = TEXT_LIMIT) -> bytes:
         return file.read(status.st_size)
 
 
+def check_output(path: Path | None, option: str) -> None:
+    """Raise ValueError if a file cannot be written there, before the work starts.
+
+    Args:
+        path: The file; None is none.
+        option: The option that named it, for the error text.
+    """
+    if path is None:
+        return
+    if not path.parent.is_dir():
+        raise ValueError(f"{option}: there is no folder {path.parent}")
+    if os.path.isdir(path):
+        raise ValueError(f"{option}: {path} is a folder")
+    try:
+        new = not os.path.lexists(path)
+        if new or path.is_file():
+            # Appending nothing changes nothing.
+            path.open("ab").close()
+        if new:
+            path.unlink()
+    except OSError as error:
+        text = f"{option}: {path} cannot be written ({error.strerror})"
+        raise ValueError(text) from None
+
+
 def _open_without_waiting(path: str, flags: int) -> int:
     """Open a file; a named pipe without a writer, too, returns at once."""
     return os.open(path, flags | os.O_NONBLOCK)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 
-from egoskin.cli import counted
+from egoskin.progress import counted
 from egoskin.runs.run import Run, TrainConfig
 from egoskin.runs.trainer import open_trainer
 from egoskin.study.manifest import Manifest, PlannedRun

@@ -21,11 +21,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from egoskin.cli import check_counts
 from egoskin.envs.standards import Standard, training_task
 from egoskin.make import EnvConfig
 from egoskin.rng import check_seed
-from egoskin.runs.run import MACHINE_FIELDS, TrainConfig
+from egoskin.runs.config import MACHINE_FIELDS, TrainConfig
 from egoskin.sensors import Skin
 from egoskin.storage.formats import (
     content_hash,
@@ -35,6 +34,7 @@ from egoskin.storage.formats import (
 )
 from egoskin.storage.serialization import (
     changed_fields,
+    check_counts,
     from_plain,
     read_json,
     to_plain,
@@ -256,7 +256,7 @@ class Manifest:
         if not path.is_file():
             raise ValueError(
                 f"{path.parent} is no folder of a study: it has no {path.name} (begin "
-                "with: python scripts/study.py plan NAME --dir FOLDER)"
+                "with: egoskin study plan NAME --dir FOLDER)"
             )
         content, number = read_sealed(path)
         what = str(path)

@@ -267,5 +267,5 @@ def slurm_script(
 #SBATCH --signal=B:TERM@180
 #SBATCH --requeue
 #SBATCH --output={folder}/logs/slurm-%A-%a.log
-exec python scripts/study.py run --dir {folder} --parallel "$SLURM_CPUS_PER_TASK"
+exec egoskin study run --dir {folder} --parallel "$SLURM_CPUS_PER_TASK"
 """

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from typing import Any
 
-from egoskin.runs.run import TrainConfig
+from egoskin.runs.config import TrainConfig
 from egoskin.study.manifest import EvaluationPlan, Study
 
 RANGES = (0.2, 0.5, 1.0, 2.0)

@@ -13,7 +13,7 @@ import imageio_ffmpeg
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
-from egoskin.cli import check_output
+from egoskin.storage.files import check_output
 
 # The last picture stands for this long [s].
 _LAST_PICTURE = 1.0

@@ -1,7 +1,7 @@
 """Pictures of an episode: the robot, its sensors, the balls, and what is detected.
 
-Headless: on Linux the OpenGL context is EGL's unless ``MUJOCO_GL`` asks for another, so
-neither a display nor an environment variable is needed, whatever was imported first.
+MuJoCo chooses its OpenGL when it is first imported: where there is no display, call
+`egoskin.viewer.draw_without_display` before, or set ``MUJOCO_GL`` to egl or osmesa.
 
 Contract: the picture is drawn from the keys of the environment alone (``base_pose``,
 ``joint_pos``, ``object_pose``, ``object_active``, ``distance``, ``balls_avoided``),
@@ -15,7 +15,6 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -45,6 +44,7 @@ _FADE_LENGTH, _FAINTEST = 2.5, 0.25
 # The camera's point of attention follows the base with this time constant [s] and
 # stays at this height [m].
 _FOLLOW_TIME, _LOOK_HEIGHT = 0.4, 1.0
+_IS_LINUX = sys.platform == "linux"
 
 
 class RenderingError(ValueError):
@@ -124,7 +124,7 @@ def record_episodes(
         watch=watch,
     )
     return [
-        Recording(row=first + i, states=seen, ending=_ending(seen[-1]))
+        Recording(row=first + i, states=seen, ending=ending_of(seen[-1]))
         for i, seen in enumerate(states)
     ]
 
@@ -228,8 +228,8 @@ def check_film(hz: float, fps: float, max_seconds: float | None) -> None:
         )
 
 
-def _ending(state: TensorDictBase) -> str | None:
-    """Why the episode of a row is over; None if it is not."""
+def ending_of(state: TensorDictBase) -> str | None:
+    """Return why the episode of a row is over; None if it is not."""
     if state["truncated"].item():
         return "time limit"
     names = {"hit": "hit", "fallen": "fall", "diverged": "diverged"}
@@ -285,13 +285,13 @@ class Painter:
             if model.body_rootid[model.geom_bodyid[geom]] == model.body(robot.base).id
         ]
         most = model.ngeom + 2 * len(self._link_of_sensor) + 100
-        self._canvas = _Canvas(model, size, most)
+        self._renderer = _renderer(model, size, most)
 
     def __enter__(self) -> Painter:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._canvas.close()
+        self._renderer.close()
 
     def draw(
         self,
@@ -316,7 +316,7 @@ class Painter:
         active = np.asarray(state["object_active"])
         self._follow(np.asarray(state["base_pose"], float), time)
         self._place(state, active)
-        self._canvas.update(self._data, self._camera)
+        self._renderer.update_scene(self._data, self._camera)
         if self._skin is None:
             detecting = np.zeros(0, dtype=bool)
         else:
@@ -345,11 +345,13 @@ class Painter:
             radius: Radius of the line [m].
             rgba: Its colour and opacity.
         """
-        self._canvas.add_line(start, end, radius, rgba)
+        kind = mujoco.mjtGeom.mjGEOM_CAPSULE
+        geom = self._add(kind, rgba, glows=True)
+        mujoco.mjv_connector(geom, kind, radius, start, end)
 
     def image(self) -> np.ndarray:
         """Return the picture of the state drawn last, ``[H, W, 3]`` uint8."""
-        return self._canvas.read()
+        return self._renderer.render()
 
     def _place(self, state: TensorDictBase, active: np.ndarray) -> None:
         """Put the robot and the balls of the visual model where the state says."""
@@ -395,7 +397,8 @@ class Painter:
         for point, is_lit in zip(points, detecting, strict=True):
             radius = _LIT_RADIUS if is_lit else _IDLE_RADIUS
             rgba = _LIT_RGBA if is_lit else _IDLE_RGBA
-            self._canvas.add_sphere(point, radius, rgba, glows=bool(is_lit))
+            geom = self._add(mujoco.mjtGeom.mjGEOM_SPHERE, rgba, glows=bool(is_lit))
+            geom.size[:], geom.pos[:] = radius, point
         if not (detecting.any() and active.any()):
             return
         points = points[detecting]
@@ -408,9 +411,22 @@ class Painter:
         colours = [_RAY_LINE_RGB if k else _FIELD_LINE_RGB for k in kinds[detecting]]
         for i, point in enumerate(points):
             fade = max(1 - length[nearest[i], i] / _FADE_LENGTH, _FAINTEST)
-            self._canvas.add_line(
-                point, ends[nearest[i], i], _LINE_RADIUS, (*colours[i], fade)
-            )
+            end, rgba = ends[nearest[i], i], (*colours[i], fade)
+            self.draw_line(point, end, _LINE_RADIUS, rgba)
+
+    def _add(
+        self, kind: mujoco.mjtGeom, rgba: Sequence[float], *, glows: bool
+    ) -> mujoco.MjvGeom:
+        """Add a shape to the scene, of no size and at the origin."""
+        scene = self._renderer.scene
+        assert scene.ngeom < scene.maxgeom
+        geom = scene.geoms[scene.ngeom]
+        zero, colour = np.zeros(3), np.array(rgba, np.float32)
+        mujoco.mjv_initGeom(geom, kind, zero, zero, np.eye(3).ravel(), colour)
+        geom.category = mujoco.mjtCatBit.mjCAT_DECOR
+        geom.emission = float(glows)
+        scene.ngeom += 1
+        return geom
 
     def _gap(self, active: np.ndarray) -> float:
         """Smallest distance between robot and balls in play [m], inf if none is."""
@@ -500,110 +516,27 @@ def _build_model(
     return spec.compile()
 
 
-class _Canvas:
-    """An off-screen picture of a MuJoCo model to which shapes can be added.
+def _renderer(
+    model: mujoco.MjModel, size: tuple[int, int], max_geoms: int
+) -> mujoco.Renderer:
+    """Return MuJoCo's renderer.
 
-    `mujoco.Renderer` is bound to the backend that ``MUJOCO_GL`` named when mujoco was
-    first imported; this one is not.
+    Raises:
+        RenderingError: If no OpenGL context can be made.
+        ValueError: If it has no picture of that size.
     """
-
-    def __init__(
-        self, model: mujoco.MjModel, size: tuple[int, int], max_geoms: int
-    ) -> None:
-        self._model, self._size = model, size
-        self._gl = _gl_context(size)
-        self._scene = mujoco.MjvScene(model, max_geoms)
-        self._option, self._perturb = mujoco.MjvOption(), mujoco.MjvPerturb()
-        self._rect = mujoco.MjrRect(0, 0, *size)
-        scale = mujoco.mjtFontScale.mjFONTSCALE_100
-        try:
-            self._context = mujoco.MjrContext(model, scale.value)
-        except mujoco.FatalError as error:
-            self._gl.free()
-            raise ValueError(f"no picture of {size} pixels here: {error}") from error
-        offscreen = mujoco.mjtFramebuffer.mjFB_OFFSCREEN
-        mujoco.mjr_setBuffer(offscreen.value, self._context)
-
-    def close(self) -> None:
-        """Give the OpenGL context back."""
-        self._gl.make_current()
-        self._context.free()
-        self._gl.free()
-
-    def update(self, data: mujoco.MjData, camera: mujoco.MjvCamera) -> None:
-        """Set the scene from simulation data; shapes added before are gone."""
-        mujoco.mjv_updateScene(
-            self._model,
-            data,
-            self._option,
-            self._perturb,
-            camera,
-            mujoco.mjtCatBit.mjCAT_ALL.value,
-            self._scene,
-        )
-
-    def add_sphere(
-        self,
-        position: np.ndarray,
-        radius: float,
-        rgba: Sequence[float],
-        *,
-        glows: bool,
-    ) -> None:
-        """Add a sphere (metres, world)."""
-        geom = self._next_geom(mujoco.mjtGeom.mjGEOM_SPHERE, rgba, glows=glows)
-        geom.size[:] = radius
-        geom.pos[:] = position
-
-    def add_line(
-        self, start: np.ndarray, end: np.ndarray, radius: float, rgba: Sequence[float]
-    ) -> None:
-        """Add a thin capsule between two points (metres, world)."""
-        kind = mujoco.mjtGeom.mjGEOM_CAPSULE
-        geom = self._next_geom(kind, rgba, glows=True)
-        mujoco.mjv_connector(geom, kind, radius, start, end)
-
-    def _next_geom(
-        self, kind: mujoco.mjtGeom, rgba: Sequence[float], *, glows: bool
-    ) -> mujoco.MjvGeom:
-        scene = self._scene
-        assert scene.ngeom < scene.maxgeom
-        geom = scene.geoms[scene.ngeom]
-        colour = np.array(rgba, np.float32)
-        zero, identity = np.zeros(3), np.eye(3).ravel()
-        mujoco.mjv_initGeom(geom, kind, zero, zero, identity, colour)
-        geom.category = mujoco.mjtCatBit.mjCAT_DECOR
-        geom.emission = float(glows)
-        scene.ngeom += 1
-        return geom
-
-    def read(self) -> np.ndarray:
-        """Return the picture, ``[height, width, 3]`` uint8."""
-        self._gl.make_current()
-        width, height = self._size
-        image = np.empty((height, width, 3), np.uint8)
-        mujoco.mjr_render(self._rect, self._scene, self._context)
-        mujoco.mjr_readPixels(image, None, self._rect, self._context)
-        # OpenGL's first row is the lowest.
-        return image[::-1].copy()
-
-
-def _gl_context(size: tuple[int, int]) -> Any:
-    """A current OpenGL context; raises RenderingError if there is none to be had."""
     backend = os.environ.get("MUJOCO_GL", "")
+    has_display = any(os.environ.get(k) for k in ("DISPLAY", "WAYLAND_DISPLAY"))
+    # It warns of a missing display in some lines before it fails.
+    if mujoco.GLContext.__module__ == "mujoco.glfw" and _IS_LINUX and not has_display:
+        raise RenderingError(no_gl_text(backend))
     try:
-        if sys.platform == "linux" and not backend:
-            backend = "egl"
-            # Importing it fails where the system's library is missing.
-            from mujoco.egl import GLContext
-        else:
-            from mujoco import GLContext
-        context = GLContext(*size)
-        context.make_current()
+        return mujoco.Renderer(model, size[1], size[0], max_geoms)
     # PyOpenGL reports a missing library as an attribute that None does not have.
-    except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
+    except (ImportError, AttributeError, RuntimeError) as error:
         raise RenderingError(no_gl_text(backend)) from error
-    return context
+    except mujoco.FatalError as error:
+        raise ValueError(f"no picture of {size} pixels here: {error}") from error
 
 
 def no_gl_text(backend: str) -> str:
@@ -611,5 +544,6 @@ def no_gl_text(backend: str) -> str:
     return (
         f"cannot render: no OpenGL context from {backend or 'the default backend'!r}; "
         "install one (Debian: `apt-get install libegl1`, or `apt-get install "
-        "libosmesa6` and set MUJOCO_GL=osmesa)"
+        "libosmesa6` and set MUJOCO_GL=osmesa); in Python, call egoskin.viewer."
+        "draw_without_display before mujoco is imported"
     )

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import json
 import math
-import runpy
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 import torch
 
+from calling import call, succeed
 from egoskin.envs.dodgeball import DodgeballEnv
 from egoskin.envs.throws import ThrowConfig
 from egoskin.evaluation.approaches import (
@@ -33,7 +31,6 @@ from egoskin.sensors import Field, Ray, Skin
 from egoskin.shapes import Sphere
 from throwing import TASK
 
-ROOT = Path(__file__).parents[2]
 BALL = Sphere(radius=0.15)
 FIELD = {"field": Field()}
 BOTH = {"field": Field(), "ray": Ray()}
@@ -409,19 +406,14 @@ def test_what_cannot_be_analysed_is_refused(skin, changes, message):
 # --- the command ----------------------------------------------------------------
 
 
-def run_script(monkeypatch, *args: str) -> None:
-    monkeypatch.setattr(sys, "argv", ["coverage.py", *args])
-    runpy.run_path(str(ROOT / "scripts" / "coverage.py"), run_name="__main__")
-
-
-def test_the_command_writes_a_picture_and_figures(tmp_path, monkeypatch, capsys):
+def test_the_command_writes_a_picture_and_figures(tmp_path, monkeypatch):
     pytest.importorskip("matplotlib")
     monkeypatch.chdir(tmp_path)
     small = ("--skin.num-sensors", "8", "--num-throws", "16")
-    run_script(monkeypatch, *small, "--ranges", "0.4", "0.2", "--throws.radius", "0.1")
-    assert "16 of 16 throws hit" in capsys.readouterr().out
-    assert (tmp_path / "coverage.png").read_bytes()[:4] == b"\x89PNG"
-    result = json.loads((tmp_path / "coverage.json").read_text())
+    ranges = ("--ranges", "0.4", "0.2", "--throws.radius", "0.1")
+    assert "16 of 16 throws hit" in succeed("visibility", *small, *ranges)
+    assert (tmp_path / "visibility.png").read_bytes()[:4] == b"\x89PNG"
+    result = json.loads((tmp_path / "visibility.json").read_text())
     cells = [(cell["coverage"], cell["range"]) for cell in result["cells"]]
     assert cells == [("field", 0.2), ("field", 0.4), ("ray", 0.2), ("ray", 0.4)]
     assert result["config"]["throws"]["radius"] == 0.1
@@ -438,7 +430,7 @@ def test_the_command_has_the_body_in_the_way_if_asked(tmp_path, monkeypatch):
     for name in ("clear", "solid"):
         out = ("--out", f"{name}.png", "--json", f"{name}.json")
         option = ("--occlusion",) if name == "solid" else ()
-        run_script(monkeypatch, *small, *out, *option, "--ranges", "1")
+        succeed("visibility", *small, *out, *option, "--ranges", "1")
     clear, solid = (
         json.loads((tmp_path / f"{name}.json").read_text())
         for name in ("clear", "solid")
@@ -452,20 +444,18 @@ def test_the_command_has_the_body_in_the_way_if_asked(tmp_path, monkeypatch):
     ("args", "message"),
     [
         (["--ranges", "-1"], "ranges must be positive"),
-        (["--out", "coverage.mp4"], "coverage.mp4 must end in .png or .jpg"),
-        (["--json", "none/coverage.json"], "there is no folder none"),
+        (["--out", "visibility.mp4"], "visibility.mp4 must end in .png or .jpg"),
+        (["--json", "none/visibility.json"], "there is no folder none"),
     ],
 )
 def test_bad_input_to_the_command_is_one_clear_message(
-    args, message, tmp_path, monkeypatch, capsys
+    args, message, tmp_path, monkeypatch
 ):
     pytest.importorskip("matplotlib")
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit) as ended:
-        run_script(monkeypatch, *args)
-    assert ended.value.code == 2
-    said = capsys.readouterr()
-    assert message in said.err
+    done = call("visibility", *args)
+    assert done.returncode == 2
+    assert message in done.stderr
     # Told before the analysis, not after it.
-    assert not said.out
+    assert not done.stdout
     assert not list(tmp_path.iterdir())

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import os
-import subprocess
 import sys
 from pathlib import Path
 
@@ -12,6 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from calling import call
 from egoskin.robots.config import H1_2
 
 trimesh = pytest.importorskip("trimesh")
@@ -133,13 +132,7 @@ def test_openness_of_a_plane_is_one_and_of_a_pit_its_sky(tmp_path):
 
 
 def test_missing_directory_is_one_line_and_status_2(tmp_path):
-    result = subprocess.run(
-        [sys.executable, SCRIPT, "--meshes", tmp_path / "none"],
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, "PYTHONPATH": str(SCRIPT.parents[1])},
-    )
+    result = call("fit_shell.py", "--meshes", tmp_path / "none")
     assert result.returncode == 2
     assert result.stderr == f"fit_shell: no such mesh directory: {tmp_path / 'none'}\n"
 

@@ -8,13 +8,13 @@ import os
 import pty
 import random
 import resource
-import runpy
 import select
 import shutil
 import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -24,16 +24,19 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from calling import BATCH, SMALL, call, fail, succeed
 from egoskin.agents.networks import Agent, NetworkConfig
 from egoskin.agents.ppo import PPO, NonFiniteError, PPOConfig
+from egoskin.commands import train
+from egoskin.commands.errors import clear_errors
 from egoskin.sensors.kernels import compilation
 from egoskin.storage.formats import read_sealed, sealed_json
 from egoskin.storage.tensor_file import load_tensors, save_tensors
 
-ROOT = Path(__file__).parents[2]
-SMALL = ("--num-envs", "32", "--num-workers", "2", "--ppo.num-mini-batches", "2")
-# Environment steps of one rollout of SMALL: 32 agents x 16 steps.
-BATCH = 512
+# Rollouts of the run that tests go on with.
+DONE = 4
+
+TRAIN = (sys.executable, "-m", "egoskin", "train")
 
 pytestmark = pytest.mark.skipif(
     not Path("/proc/self/maps").exists(), reason="looks for what is left over in /proc"
@@ -47,7 +50,7 @@ class Training:
         self.temporary = temporary
         self.output = tempfile.TemporaryFile("w+")  # noqa: SIM115
         self.process = subprocess.Popen(
-            [sys.executable, str(ROOT / "scripts/ppo.py"), *map(str, args)],
+            [*TRAIN, *map(str, args)],
             stdout=self.output,
             stderr=subprocess.STDOUT,
             start_new_session=True,
@@ -137,24 +140,10 @@ def start(temporary: Path) -> Iterator[Callable[..., Training]]:
         training.output.close()
 
 
-def here(script: str, *args: str | Path) -> None:
-    """Run a script as a user calls it, but in this process: imports take longest."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", [script, *map(str, args)])
-        runpy.run_path(str(ROOT / "scripts" / script), run_name="__main__")
-
-
-@pytest.fixture(scope="module")
-def short_run(tmp_path_factory) -> Path:
-    """A finished run of two rollouts; tests copy it."""
-    folder = tmp_path_factory.mktemp("short") / "run"
-    here("ppo.py", *SMALL, "--run-dir", folder, "--total-frames", 2 * BATCH)
-    return folder
-
-
 @pytest.fixture
-def run(short_run: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(short_run, tmp_path / "run"))
+def run(trained: Path, tmp_path: Path) -> Path:
+    """A finished run of four rollouts, to go on with."""
+    return Path(shutil.copytree(trained, tmp_path / "run"))
 
 
 def rows(run: Path) -> list[dict[str, str]]:
@@ -217,15 +206,16 @@ def test_a_trainer_killed_while_it_writes_a_checkpoint_goes_on(start, tmp_path):
     end = saved + 4 * BATCH
     # The planned end of a run cannot come earlier: only a test's can.
     plan(run, end)
-    again = start("--resume", run)
-    assert again.end() == 0, again.text()
+    succeed("train", "--resume", run)
     assert int(rows(run)[-1]["frames"]) == end
     check_logs_have_no_gap(run)
     assert not list(run.rglob("*.partial"))
-    again.check_nothing_is_left()
 
 
-@pytest.mark.parametrize("whole_group", [False, True])
+# By default, its whole group is killed while it trains.
+@pytest.mark.parametrize(
+    "whole_group", [False, pytest.param(True, marks=pytest.mark.slow)]
+)
 def test_a_trainer_killed_while_it_starts_leaves_nothing(
     whole_group, start, tmp_path, temporary
 ):
@@ -251,7 +241,7 @@ def test_ctrl_c_twice_while_workers_start_is_one_line(start, tmp_path, temporary
 
 def test_a_closed_terminal_leaves_a_checkpoint(tmp_path, temporary):
     run = tmp_path / "run"
-    command = [sys.executable, str(ROOT / "scripts/ppo.py"), *SMALL, "--run-dir"]
+    command = [*TRAIN, *SMALL, "--run-dir"]
     pid, terminal = pty.fork()
     if pid == 0:
         os.environ["TMPDIR"] = str(temporary)
@@ -273,21 +263,25 @@ def test_a_closed_terminal_leaves_a_checkpoint(tmp_path, temporary):
         time.sleep(0.1)
 
 
-def test_a_training_that_nobody_reads_ends_with_a_checkpoint(run):
-    args = ("--resume", run, "--total-frames", 10**6)
-    command = [sys.executable, ROOT / "scripts/ppo.py", *map(str, args)]
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as training:
-        assert training.stdout is not None
-        assert training.stderr is not None
-        assert training.stdout.readline().startswith("run ")
+def test_a_training_that_nobody_reads_ends_with_a_checkpoint(run, monkeypatch):
+    read, write = os.pipe()
+
+    def read_a_line() -> None:
         # As `head -n 1` does.
-        training.stdout.close()
-        assert training.stderr.read() == ""
-    assert training.returncode == 128 + signal.SIGPIPE
+        with open(read) as source:
+            assert source.readline().startswith("run ")
+
+    reader = threading.Thread(target=read_a_line)
+    reader.start()
+    args = ["--resume", str(run), "--total-frames", str(10**6)]
+    with open(write, "w", buffering=1) as output:
+        monkeypatch.setattr(sys, "stdout", output)
+        with pytest.raises(SystemExit) as ended, clear_errors():
+            train.main(args)
+    reader.join()
+    assert ended.value.code == 128 + signal.SIGPIPE
     saved = load_tensors(run / "checkpoint.safetensors")[1]["frames"]
-    assert saved == int(rows(run)[-1]["frames"]) > 2 * BATCH
+    assert saved == int(rows(run)[-1]["frames"]) > DONE * BATCH
 
 
 @pytest.mark.slow
@@ -358,7 +352,7 @@ def test_a_signal_to_the_whole_group_leaves_a_checkpoint(start, tmp_path):
 def test_a_worker_killed_in_training_ends_it_with_its_signal(start, run):
     before = (run / "checkpoint.safetensors").read_bytes()
     training = start("--resume", run, "--total-frames", 10**6)
-    training.wait_for(lambda: len(rows(run)) > 2)
+    training.wait_for(lambda: len(rows(run)) > DONE)
     os.kill(training.workers()[1], signal.SIGKILL)
     begun = time.monotonic()
     message = "of 2 was killed by SIGKILL"
@@ -372,42 +366,38 @@ def test_a_worker_killed_in_training_ends_it_with_its_signal(start, run):
 
 def check_fails_not_finite(run: Path, *args: str | Path) -> tuple[str, Path]:
     """Train until a number is not finite; return the message and the dump."""
-    with pytest.raises(SystemExit) as ended:
-        here("ppo.py", *args)
-    message = str(ended.value.code)
+    done = call("train", *args)
+    assert done.returncode == 1
+    message = done.stderr
     (dump,) = run.glob("not-finite-*.safetensors")
-    assert f"replay it with: python scripts/replay.py {dump}" in message
+    assert f"replay it with: egoskin replay {dump}" in message
     return message, dump
 
 
-def test_a_loss_that_is_not_finite_is_dumped_and_replayed(tmp_path, capsys):
+def test_a_loss_that_is_not_finite_is_dumped_and_replayed(tmp_path):
     run = tmp_path / "run"
     rate = ("--ppo.learning-rate", "1e15", "--ppo.desired-kl", "None")
     message, dump = check_fails_not_finite(run, *SMALL, "--run-dir", run, *rate)
     assert "actor gradient norm" in message
     # The checkpoint of the start, from before the first update.
     assert load_tensors(run / "checkpoint.safetensors")[1]["frames"] == 0
-    capsys.readouterr()
-    here("replay.py", dump)
-    lines = capsys.readouterr().out.splitlines()
+    lines = succeed("replay", dump).splitlines()
     assert lines[0].removeprefix("recorded: ") == lines[-1].removeprefix("again:    ")
     assert lines[1].startswith("first: output of ")
 
 
-def test_a_bad_weight_is_named_by_the_replay(run, capsys):
+def test_a_bad_weight_is_named_by_the_replay(run):
     # As memory that lost a bit would: an infinite entry in the optimiser.
     path = run / "checkpoint.safetensors"
     tensors, header = load_tensors(path)
     tensors["optimizer/0/exp_avg"].view(-1)[3] = float("inf")
     save_tensors(path, tensors, header)
     before = path.read_bytes()
-    resume = ("--resume", run, "--total-frames", 3 * BATCH)
+    resume = ("--resume", run, "--total-frames", (DONE + 1) * BATCH)
     message, dump = check_fails_not_finite(run, *resume)
     assert "norm of the weights" in message
     assert path.read_bytes() == before
-    capsys.readouterr()
-    here("replay.py", dump)
-    assert "first: agent head.log_std [21]" in capsys.readouterr().out
+    assert "first: agent head.log_std [21]" in succeed("replay", dump)
 
 
 def test_an_infinite_observation_is_met_in_the_normaliser():
@@ -426,11 +416,8 @@ def test_an_infinite_observation_is_met_in_the_normaliser():
     assert len(error.value.batch["observation"]) == 1
 
 
-def test_a_dump_that_is_none_is_refused(run, capsys):
-    with pytest.raises(SystemExit) as ended:
-        here("replay.py", run / "checkpoint.safetensors")
-    assert ended.value.code == 2
-    assert "no dump" in capsys.readouterr().err
+def test_a_dump_that_is_none_is_refused(trained):
+    assert "no dump" in fail("replay", trained / "checkpoint.safetensors")
 
 
 # --- the disk ---------------------------------------------------------------------
@@ -445,7 +432,7 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_previous(start, run):
     path = run / "checkpoint.safetensors"
     before = path.read_bytes()
     training = start(
-        *("--resume", run, "--total-frames", 3 * BATCH),
+        *("--resume", run, "--total-frames", (DONE + 1) * BATCH),
         preexec_fn=partial(limit_file_size, len(before) // 2),
     )
     check_failed_clearly(training, "File too large", str(path), f"--resume {run}")
@@ -453,7 +440,7 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_previous(start, run):
     again = start("--resume", run)
     assert again.end() == 0, again.text()
     check_logs_have_no_gap(run)
-    assert len(rows(run)) == 3
+    assert len(rows(run)) == DONE + 1
 
 
 def in_own_mounts(script: str, *args: str | Path) -> subprocess.CompletedProcess[str]:
@@ -480,13 +467,12 @@ def test_a_full_disk_is_one_clear_error(run, tmp_path):
         mount -t tmpfs -o size=16m tmpfs "$1" && cp -r "$0" "$1/run" || exit 99
         cat /dev/zero > "$1/fill" 2> /dev/null
         truncate -s -100K "$1/fill"
-        "$2" "$3" --resume "$1/run" --total-frames 1536
+        "$2" -m egoskin train --resume "$1/run" --total-frames 2560
         code=$?
-        cp "$1/run/checkpoint.safetensors" "$4"
+        cp "$1/run/checkpoint.safetensors" "$3"
         exit $code
     """
-    ppo = ROOT / "scripts/ppo.py"
-    done = in_own_mounts(script, run, disk, sys.executable, ppo, kept)
+    done = in_own_mounts(script, run, disk, sys.executable, kept)
     assert done.returncode == 1, done.stderr
     path = disk / "run" / "checkpoint.safetensors"
     assert f"No space left on device: '{path}'" in done.stderr
@@ -499,10 +485,10 @@ def test_a_full_disk_is_one_clear_error(run, tmp_path):
 def test_a_read_only_run_folder_is_one_clear_error(run):
     script = """
         mount --bind "$0" "$0" && mount -o remount,ro,bind "$0" || exit 99
-        "$1" "$2" --resume "$0" --total-frames 1536
+        "$1" -m egoskin train --resume "$0" --total-frames 2560
     """
     before = (run / "checkpoint.safetensors").read_bytes()
-    done = in_own_mounts(script, run, sys.executable, ROOT / "scripts/ppo.py")
+    done = in_own_mounts(script, run, sys.executable)
     assert done.returncode == 1, done.stderr
     assert "Read-only file system" in done.stderr
     assert f"--resume {run}" in done.stderr
@@ -510,18 +496,16 @@ def test_a_read_only_run_folder_is_one_clear_error(run):
     assert (run / "checkpoint.safetensors").read_bytes() == before
 
 
-def test_a_run_folder_that_cannot_be_made_is_one_clear_error(tmp_path, capsys):
+def test_a_run_folder_that_cannot_be_made_is_one_clear_error(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(SystemExit) as ended:
-        here("ppo.py", *SMALL, "--run-dir", tmp_path / "file" / "run")
-    assert ended.value.code == 2
-    assert "error: [Errno 20] Not a directory" in capsys.readouterr().err
+    text = fail("train", *SMALL, "--run-dir", tmp_path / "file" / "run")
+    assert "error: [Errno 20] Not a directory" in text
 
 
 @pytest.mark.slow
 def test_a_removed_run_folder_is_one_clear_error(start, run):
     training = start("--resume", run, "--total-frames", 10**6)
-    training.wait_for(lambda: len(rows(run)) > 2)
+    training.wait_for(lambda: len(rows(run)) > DONE)
     # Renamed, then removed: a row that is just being written would not come back.
     shutil.rmtree(run.rename(run.with_name("gone")))
     message = f"No such file or directory: '{run}"
@@ -562,7 +546,7 @@ def test_a_run_that_stored_whether_to_compile_goes_on(run):
     old = {k: v for k, v in content.items() if k not in ("format", "egoskin", "sha256")}
     del old["skin_sha256"]
     file.write_text(json.dumps({**old, "compile_kernels": True}))
-    here("ppo.py", "--resume", run, "--total-frames", 3 * BATCH)
+    succeed("train", "--resume", run, "--total-frames", (DONE + 1) * BATCH)
     assert "compile_kernels" not in json.loads(file.read_text())
 
 

@@ -17,7 +17,8 @@ from safetensors.torch import save
 import egoskin
 from egoskin.envs.throws import ThrowConfig
 from egoskin.make import EnvConfig
-from egoskin.runs.run import Run, TrainConfig, parse_config
+from egoskin.runs.config import TrainConfig, parse_config
+from egoskin.runs.run import Run
 from egoskin.runs.trainer import open_trainer, train
 from egoskin.sensors.config import SensorConfig
 from egoskin.storage.formats import (

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from egoskin.runs.run import TrainConfig
+from egoskin.runs.config import TrainConfig
 from egoskin.storage.serialization import from_plain, read_json, to_plain
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from egoskin.runs.run import TrainConfig
+from egoskin.runs.config import TrainConfig
 from egoskin.storage.formats import content_hash, read_sealed, sealed_json
 from egoskin.storage.serialization import to_plain
 from egoskin.study.findings import FINDINGS

@@ -9,7 +9,6 @@ import io
 import json
 import os
 import resource
-import runpy
 import shutil
 import signal
 import subprocess
@@ -21,7 +20,7 @@ from pathlib import Path
 
 import pytest
 
-from egoskin.interrupts import ENDING
+from calling import call, succeed
 from egoskin.runs.run import Run
 from egoskin.storage.formats import read_sealed, sealed_json
 from egoskin.storage.serialization import to_plain
@@ -34,7 +33,6 @@ from egoskin.study.runner import Progress, slurm_script
 from egoskin.study.store import Failure, StudyFolder, duration
 from studies import as_format_1
 
-ROOT = Path(__file__).parents[2]
 # 16 agents x 16 steps are 256 frames a rollout.
 BATCH = 256
 STUDY = Study(
@@ -301,11 +299,11 @@ def test_the_slurm_script_shares_the_folder_among_its_elements():
 
 
 class Runner:
-    """`study.py run` in a process of its own."""
+    """`egoskin study run` in a process of its own."""
 
     def __init__(self, folder: Path, *args: str, **options) -> None:
         self.log = folder.with_name(f"{folder.name}-{time.monotonic_ns()}.log")
-        script = [sys.executable, str(ROOT / "scripts/study.py"), "run"]
+        script = [sys.executable, "-m", "egoskin", "study", "run"]
         with open(self.log, "w") as output:
             self.process = subprocess.Popen(
                 [*script, "--dir", str(folder), "--parallel", "2", *args],
@@ -489,42 +487,21 @@ def test_a_full_disk_is_told_and_what_was_missing_is_made_up_for(
 # --- the command --------------------------------------------------------------------
 
 
-@pytest.fixture
-def command() -> Iterator[Callable[..., int]]:
-    """Function of arguments: `study.py` in this process, as imports take longest."""
-    before = {number: signal.getsignal(number) for number in ENDING}
-
-    def run(*args: str | Path) -> int:
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(sys, "argv", ["study.py", *map(str, args)])
-            try:
-                runpy.run_path(str(ROOT / "scripts/study.py"), run_name="__main__")
-            except SystemExit as ended:
-                return int(ended.code or 0)
-        return 0
-
-    yield run
-    for number, handler in before.items():
-        signal.signal(number, handler)
-
-
-def test_the_command_plans_tells_and_reports(
-    finished: Path, tmp_path: Path, command, capsys
-):
+def test_the_command_plans_tells_and_reports(finished: Path, tmp_path: Path):
     folder = shutil.copytree(finished, tmp_path / "study")
     mine = tmp_path / "mine.json"
     mine.write_text(json.dumps(to_plain(dataclasses.replace(SHORT, seeds=(0, 1)))))
-    assert command("plan", mine, "--dir", folder, "--steps-per-s", "1000") == 0
-    planned = capsys.readouterr().out
+    args = ("--dir", folder, "--steps-per-s", "1000")
+    planned = succeed("study", "plan", mine, *args)
     assert "2 runs, 0.0 M frames" in planned
     assert "not the default: num_envs = 16" in planned
-    assert command("status", folder) == 0
-    assert capsys.readouterr().out.splitlines()[1].split()[:2] == ["blind", "done"]
-    assert command("report", folder) == 0
+    status = succeed("study", "status", folder)
+    assert status.splitlines()[1].split()[:2] == ["blind", "done"]
+    succeed("study", "report", folder)
     assert (folder / "report/index.html").is_file()
     assert "1 of 2 runs are done" in (folder / "report/report.md").read_text()
-    assert command("slurm", folder, "--cores", "2") == 0
-    assert "#SBATCH --array=0-0" in capsys.readouterr().out
+    array = succeed("study", "slurm", folder, "--cores", "2")
+    assert "#SBATCH --array=0-0" in array
 
 
 @pytest.mark.parametrize(
@@ -539,9 +516,10 @@ def test_the_command_plans_tells_and_reports(
         (("adopt", "{0}", "{0}"), "is no folder of a study"),
     ],
 )
-def test_bad_input_is_one_line(args, text, tmp_path: Path, command, capsys):
-    assert command(*(a.format(tmp_path) for a in args)) == 2
-    error = capsys.readouterr().err
+def test_bad_input_is_one_line(args, text, tmp_path: Path):
+    done = call("study", *(a.format(tmp_path) for a in args))
+    assert done.returncode == 2
+    error = done.stderr
     assert text.format(tmp_path) in error
     assert len(error.splitlines()) == 1
     assert not list(tmp_path.iterdir())
@@ -564,7 +542,7 @@ def test_bad_input_is_one_line(args, text, tmp_path: Path, command, capsys):
     ],
 )
 def test_a_package_that_is_missing_is_named(
-    package, args, error, finished: Path, command, capsys, monkeypatch
+    package, args, error, finished: Path, monkeypatch
 ):
     find = importlib.util.find_spec
     monkeypatch.setattr(
@@ -572,6 +550,5 @@ def test_a_package_that_is_missing_is_named(
         "find_spec",
         lambda name: None if name == package else find(name),
     )
-    assert command(*args, finished) == 2
-    assert capsys.readouterr().err == f"error: {error}\n"
+    assert call("study", *args, finished).stderr == f"error: {error}\n"
     assert not (finished / "report").exists()

@@ -2,23 +2,14 @@
 
 from __future__ import annotations
 
-import importlib.util
-import os
-import subprocess
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 from tensordict import TensorDict
 
-from egoskin.cli import clear_errors
-from egoskin.envs.throws import Thrower
 from egoskin.evaluation.throw_set import play_bank, throw_seed
 from egoskin.make import EnvConfig, make_worker_env
 from egoskin.robots.config import RobotConfig
@@ -31,8 +22,8 @@ from egoskin.viewer.offscreen import (
     Painter,
     Recording,
     RenderingError,
-    _ending,
     closest_point,
+    ending_of,
     painter_of,
     record_episodes,
     render_recording,
@@ -40,7 +31,6 @@ from egoskin.viewer.offscreen import (
 from throwing import TASK
 
 SIZE = (160, 90)
-SCRIPT = Path(__file__).parents[2] / "scripts" / "render.py"
 
 
 @pytest.fixture(scope="module")
@@ -201,7 +191,7 @@ def test_an_episode_shows_lines_only_in_range(
 def test_the_end_of_an_episode_is_named(flags, expected):
     keys = ("truncated", "terminated", "hit", "fallen", "diverged", "self_contact")
     state = TensorDict({key: torch.tensor([key in flags]) for key in keys})
-    assert _ending(state) == expected
+    assert ending_of(state) == expected
 
 
 @pytest.mark.usefixtures("painter")
@@ -278,112 +268,3 @@ def test_numbers_out_of_range_are_refused(
 def test_a_size_that_is_no_film_is_refused(skin: Skin, size: tuple[int, int]):
     with pytest.raises(ValueError, match="two even numbers"):
         painter_of(EnvConfig(), skin, size=size)
-
-
-@pytest.fixture
-def script(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
-    """Function of (arguments, environment): runs the script in an empty folder."""
-
-    def run(*args: str, **environment: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [sys.executable, str(SCRIPT), *args],
-            cwd=tmp_path,
-            capture_output=True,
-            text=True,
-            timeout=200,
-            env={**os.environ, **environment},
-        )
-
-    return run
-
-
-@pytest.mark.usefixtures("painter")
-def test_the_script_writes_a_film_and_a_sheet(script: Callable, tmp_path: Path):
-    done = script("--out", "a.gif", "--seconds", "0.1", "--size", "160", "90")
-    assert done.returncode == 0, done.stderr
-    assert "cut" in done.stdout
-    with (
-        Image.open(tmp_path / "a.gif") as film,
-        Image.open(tmp_path / "a.png") as sheet,
-    ):
-        assert film.size == (160, 90)
-        assert sheet.width > sheet.height
-    assert {p.name for p in tmp_path.iterdir()} == {"a.gif", "a.png"}
-
-
-def load_script(monkeypatch) -> ModuleType:
-    spec = importlib.util.spec_from_file_location("render", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    script = importlib.util.module_from_spec(spec)
-    # Dataclasses look their annotations up in the module of that name.
-    monkeypatch.setitem(sys.modules, "render", script)
-    spec.loader.exec_module(script)
-    return script
-
-
-@pytest.mark.usefixtures("painter")
-def test_a_film_is_of_the_longest_of_the_episodes_that_are_evaluated(
-    skin: Skin, tmp_path: Path, monkeypatch, capsys
-):
-    bank = {"bank_seed": 3, "episodes": 6, "num_workers": 1, "hold": True}
-    config = EnvConfig()
-    thrower = Thrower(config.task.throws, config.robot_config, 1 / 120)
-    row = torch.arange(6)
-    delay = thrower.first_delay(throw_seed(config, 3), row, row * 0)
-    ages = play_bank(None, config, skin, **bank).steps + (60 * delay).round().long()
-    longest = 2 + int(ages[2:].argmax())
-    args = ["--out", str(tmp_path / "a.gif"), "--size", "160", "90", "--fps", "4"]
-    args += ["--bank-seed", "3", "--episode", "2", "--longest-of", "4", "--hold"]
-    load_script(monkeypatch).main(args)
-    length = int(ages[longest]) / 60
-    expected = f"episode {longest} of bank 3: {length:.2f} s, 0 balls avoided, ends "
-    assert expected + "with: hit" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("args", "text"),
-    [
-        (["--out", "a.avi"], "must end in .mp4 or .gif"),
-        (["--out", "nowhere/a.mp4"], "no folder nowhere"),
-        (["--sheet", "a.jpg"], "must end in .png"),
-        (["--slowdown", "0"], "slowdown must be in (0, 100]"),
-        (["--slowdown", "inf"], "slowdown must be in (0, 100]"),
-        (["--bank-seed", "-1"], "bank_seed must be in"),
-        (["--episode", "-1"], "episode must not be negative"),
-        (["--longest-of", "0"], "longest_of must be at least 1"),
-        (["--fps", "61"], "fps must be in"),
-        (["--standard", "3"], "--standard"),
-        (["nothing.safetensors"], "nothing.safetensors"),
-        (["nothing", "--sensor.range", "1"], "a policy brings its own"),
-    ],
-)
-def test_bad_input_is_an_error_and_writes_nothing(
-    args: list, text: str, tmp_path: Path, monkeypatch, capsys
-):
-    monkeypatch.chdir(tmp_path)
-    script = load_script(monkeypatch)
-    with pytest.raises(SystemExit) as status, clear_errors():
-        script.main(args)
-    assert status.value.code == 2
-    assert text in " ".join(capsys.readouterr().err.split())
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(
-    "environment",
-    [
-        # PyOpenGL bound to another platform, as if EGL were not installed.
-        {"MUJOCO_GL": "", "PYOPENGL_PLATFORM": "osmesa"},
-        {"MUJOCO_GL": "no_such_backend"},
-    ],
-)
-def test_without_opengl_the_script_says_what_to_install(
-    script: Callable, tmp_path: Path, environment: dict[str, str]
-):
-    (tmp_path / "a.mp4").write_text("old")
-    done = script("--out", "a.mp4", "--seconds", "0.1", **environment)
-    assert done.returncode == 2
-    assert len(done.stderr.splitlines()) == 1
-    assert "apt-get install libegl1" in done.stderr
-    assert (tmp_path / "a.mp4").read_text() == "old"

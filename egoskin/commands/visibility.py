@@ -1,8 +1,8 @@
 """Show what a skin sees, before any training: a picture, a table and JSON.
 
-python scripts/coverage.py --out coverage.png --json coverage.json
-python scripts/coverage.py --skin.path skin.json --coverages field ray --ranges 0.5 1
-python scripts/coverage.py --occlusion
+egoskin visibility --out visibility.png --json visibility.json
+egoskin visibility --skin.path skin.json --coverages field ray --ranges 0.5 1
+egoskin visibility --occlusion
 
 A robot stands still in its default pose. Balls come straight at its base from all
 directions, straight at every part of its surface, and as the task throws them. A ball
@@ -12,13 +12,6 @@ signals can set them apart.
 """
 
 from __future__ import annotations
-
-from egoskin.interrupts import end_quietly
-
-if __name__ == "__main__":
-    end_quietly()
-
-# isort: split
 
 import dataclasses
 import json
@@ -44,10 +37,10 @@ except ImportError:
     )
     raise SystemExit(2) from None
 
-from egoskin.cli import clear_errors, counted
 from egoskin.envs.physics.mujoco import PhysicsConfig
 from egoskin.envs.throws import ThrowConfig
 from egoskin.evaluation.visibility import Analysis, analyse
+from egoskin.progress import counted
 from egoskin.robots.config import ROBOTS, RobotName
 from egoskin.sensors import Field, Ray
 from egoskin.sensors.config import SkinConfig
@@ -61,7 +54,7 @@ BLIND, NOWHERE = "#c1272d", "#e6e6e6"
 
 
 @dataclass(frozen=True, kw_only=True)
-class CoverageConfig:
+class VisibilityConfig:
     """Show what a skin sees, before any training: a picture, a table and JSON."""
 
     robot: RobotName = "h1_2"
@@ -86,9 +79,9 @@ class CoverageConfig:
     """Throws followed."""
     seed: int = 0
     """Seed of the throws and of the points on the surface."""
-    out: Path = Path("coverage.png")
+    out: Path = Path("visibility.png")
     """Picture to write, .png, .jpg, .svg or .pdf."""
-    json: Path = Path("coverage.json")
+    json: Path = Path("visibility.json")
     """All figures, to write."""
 
 
@@ -233,7 +226,7 @@ def draw(analysis: Analysis, report: dict[str, Any], title: str) -> Figure:
 
 def main(args: list[str]) -> None:
     """Run the command."""
-    config = tyro.cli(CoverageConfig, args=args, description=__doc__)
+    config = tyro.cli(VisibilityConfig, args=args, description=__doc__)
     # Before the minutes that the analysis takes.
     check_path(config.out, PICTURE_SUFFIXES)
     check_path(config.json, (".json",))
@@ -266,8 +259,3 @@ def main(args: list[str]) -> None:
     figure.savefig(config.out, dpi=110)
     plt.close(figure)
     print(f"picture {config.out}, figures {config.json}")
-
-
-if __name__ == "__main__":
-    with clear_errors():
-        main(sys.argv[1:])

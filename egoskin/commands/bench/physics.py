@@ -11,11 +11,11 @@ import mujoco
 import numpy as np
 import torch
 
-from benchmarks.report import Row, show
-from egoskin.cli import check_counts
+from egoskin.commands.bench.report import Row, show
 from egoskin.envs.physics.mujoco import Physics, PhysicsConfig, build_scene
 from egoskin.envs.throws import ThrowConfig
 from egoskin.make import EnvConfig
+from egoskin.storage.serialization import check_counts
 
 
 @dataclass(frozen=True, kw_only=True)

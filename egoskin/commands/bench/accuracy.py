@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import torch
 
-from benchmarks.report import Row, show
+from egoskin.commands.bench.report import Row, show
 from egoskin.envs.physics.mujoco import PhysicsConfig, build_scene
 from egoskin.envs.throws import Release, ThrowConfig, Thrower
 from egoskin.make import EnvConfig

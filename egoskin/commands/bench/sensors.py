@@ -12,13 +12,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from benchmarks.report import Row, show
-from egoskin.cli import check_counts
+from egoskin.commands.bench.report import Row, show
 from egoskin.make import EnvConfig, make_worker_env
 from egoskin.parallel import keep_freed_memory
 from egoskin.robots.config import H1_2
 from egoskin.sensors import FieldSensor, Proximity, RaySensor, Skin
 from egoskin.shapes import Sphere
+from egoskin.storage.serialization import check_counts
 
 # States are taken this often along the rollout [control steps]: balls are in flight.
 _STRIDE = 8

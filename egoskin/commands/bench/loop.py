@@ -18,10 +18,10 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from benchmarks.report import Row, show
 from egoskin.agents.networks import RunningNorm
 from egoskin.agents.ppo import PPO, PPOConfig
 from egoskin.agents.rollout import collect
+from egoskin.commands.bench.report import Row, show
 from egoskin.envs.dodgeball import DodgeballEnv
 from egoskin.envs.physics.mujoco import Physics
 from egoskin.make import (
@@ -31,7 +31,7 @@ from egoskin.make import (
     make_env,
     save_env_state,
 )
-from egoskin.parallel import WorkerPool, in_halves
+from egoskin.parallel import WorkerPool
 from egoskin.policies.policy import PolicySpec, sparse_sources
 from egoskin.storage.tensor_file import part
 
@@ -209,12 +209,12 @@ class _Loop:
         return load_env_state(pool, self._start)
 
     def _replay(self, env: EnvBase) -> Callable[[TensorDictBase], object]:
-        def run(env: EnvBase, root: TensorDictBase, rows: slice) -> None:
-            for action in self._actions[:, rows]:
+        def run(root: TensorDictBase) -> None:
+            for action in self._actions:
                 root["action"] = action.reshape(*root.batch_size, -1)
                 _, root = env.step_and_maybe_reset(root)
 
-        return lambda root: in_halves(env, root, run)
+        return run
 
     def _collect(self, root: TensorDictBase) -> None:
         collect(self._pool, self._agent, root, self._steps)
@@ -225,8 +225,8 @@ class _Loop:
     def _serial(self) -> Row:
         """Return what no other thread or process can do meanwhile, however many.
 
-        That is the CPU time of this process's first thread: while others collect, one
-        half of the workers steps. The ratio is to the CPU time of all workers.
+        That is the CPU time of this process's first thread. The ratio is to the CPU
+        time of all workers.
         """
         pool, serial, ratios = self._pool, [], []
         for i in range(self.config.rounds):

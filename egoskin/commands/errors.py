@@ -1,4 +1,4 @@
-"""What the scripts share: clear errors, wording, checks of options."""
+"""Clear errors: what ends a command becomes one line and an exit status."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ import os
 import select
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from types import FrameType
 from typing import Any
 
+import tyro
+
+from egoskin.commands import unknown
 from egoskin.interrupts import ENDING, end_next_time, end_now, say, take
 from egoskin.parallel import WorkerError
 
@@ -22,7 +24,7 @@ class _Ended(KeyboardInterrupt):
 
 @contextmanager
 def clear_errors() -> Iterator[None]:
-    """Turn what ends a script into one line on stderr and an exit status.
+    """Turn what ends a command into one line on stderr and an exit status.
 
     An error that the user can mend is ValueError (bad input) or OSError (files): status
     2. A worker's end is status 1, and a signal 128 with its number added. If nobody
@@ -81,39 +83,21 @@ def _end_if_lost(lost: sys.UnraisableHookArgs) -> None:
     sys.__unraisablehook__(lost)
 
 
-def counted(number: int, noun: str) -> str:
-    """Return a number with its noun: "1 worker", "2 workers"."""
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
-
-
-def check_counts(config: Any, *names: str) -> None:
-    """Raise ValueError if a field that counts something is below 1; None is left."""
-    for name in names:
-        value = getattr(config, name)
-        if value is not None and value < 1:
-            raise ValueError(f"{name} must be at least 1, got {value}")
-
-
-def check_output(path: Path | None, option: str) -> None:
-    """Raise ValueError if a file cannot be written there, before the work starts.
+def parse_subcommand(
+    kinds: Mapping[str, type], args: Sequence[str], description: str | None = None
+) -> Any:
+    """Return the configuration that arguments name and fill, by subcommand.
 
     Args:
-        path: The file; None is none.
-        option: The option that named it, for the error text.
+        kinds: Dataclass of each subcommand.
+        args: Arguments, the subcommand first.
+        description: Text of the help; None: that of the subcommands.
+
+    Raises:
+        ValueError: If there is no such subcommand; the text has the nearest name.
     """
-    if path is None:
-        return
-    if not path.parent.is_dir():
-        raise ValueError(f"{option}: there is no folder {path.parent}")
-    if os.path.isdir(path):
-        raise ValueError(f"{option}: {path} is a folder")
-    try:
-        new = not os.path.lexists(path)
-        if new or path.is_file():
-            # Appending nothing changes nothing.
-            path.open("ab").close()
-        if new:
-            path.unlink()
-    except OSError as error:
-        text = f"{option}: {path} cannot be written ({error.strerror})"
-        raise ValueError(text) from None
+    if args and not args[0].startswith("-") and args[0] not in kinds:
+        raise ValueError(unknown(args[0], kinds))
+    return tyro.extras.subcommand_cli_from_dict(
+        dict(kinds), args=args, description=description
+    )

@@ -12,9 +12,9 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from benchmarks.report import Row, show
 from egoskin.agents.ppo import PPO, add_advantages
 from egoskin.agents.rollout import collect
+from egoskin.commands.bench.report import Row, show
 from egoskin.runs.run import Run
 from egoskin.runs.trainer import open_trainer
 

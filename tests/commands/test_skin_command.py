@@ -3,40 +3,34 @@
 from __future__ import annotations
 
 import os
-import runpy
-import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from calling import call, fail, succeed
 from egoskin.robots.config import H1_2
 from egoskin.sensors import Field, Ray, Skin
 
-SCRIPT = Path(__file__).parents[2] / "scripts" / "skin.py"
 TABLE = """Index,X,Y,Z,NormX,NormY,NormZ,Radius,Parent,Object Name in Blender
 0,0.093,0.02,0.2,1.0,0.0,0.0,0.004,/bot/torso_link/visuals,visuals.004
 1,0.05,-0.03,-0.01,0.0,-1.0,0.0,0.1,/bot/arm/visuals,visuals.011
 """
 
 
-@pytest.fixture
-def run(monkeypatch, capsys, tmp_path: Path) -> Callable[..., str]:
-    """Function of the arguments: what the command prints, in the test's folder."""
+@pytest.fixture(autouse=True)
+def folder(monkeypatch, tmp_path: Path) -> None:
+    """Work in the test's folder."""
     monkeypatch.chdir(tmp_path)
 
-    def call(*args: str) -> str:
-        # As a user calls it, but in this process: importing takes most of a call.
-        monkeypatch.setattr(sys, "argv", ["skin.py", *args])
-        runpy.run_path(str(SCRIPT), run_name="__main__")
-        return capsys.readouterr().out
 
-    return call
+def run(*args: str) -> str:
+    """Return what the command prints."""
+    return succeed("skin", *args)
 
 
-def test_a_placed_skin_is_a_file_that_training_reads(run):
+def test_a_placed_skin_is_a_file_that_training_reads():
     out = run("place", "--num-sensors", "20", "--seed", "3", "--out", "skin.json")
     skin = Skin.load(Path("skin.json"))
     assert len(skin) == 20
@@ -48,7 +42,7 @@ def test_a_placed_skin_is_a_file_that_training_reads(run):
     assert one.startswith("one.json: 1 sensor on links of h1_2\n")
 
 
-def test_the_options_of_a_placement_reach_it(run):
+def test_the_options_of_a_placement_reach_it():
     run(
         *("place", "--num-sensors", "12", "--method", "poisson_disk"),
         *("--links", "torso_link", "left_elbow_link", "--stand-off", "0.009"),
@@ -61,7 +55,7 @@ def test_the_options_of_a_placement_reach_it(run):
     assert gaps[~np.eye(12, dtype=bool)].min() >= 0.05 - 1e-5
 
 
-def test_a_skin_can_be_placed_on_meshes(run):
+def test_a_skin_can_be_placed_on_meshes():
     trimesh = pytest.importorskip("trimesh")
     pytest.importorskip("embreex")
     Path("meshes").mkdir()
@@ -77,7 +71,7 @@ def test_a_skin_can_be_placed_on_meshes(run):
     np.testing.assert_allclose(beyond.max(-1), 0.01, atol=1e-5)
 
 
-def test_a_gentact_file_goes_in_and_comes_out(run):
+def test_a_gentact_file_goes_in_and_comes_out():
     Path("gentact.csv").write_text(TABLE)
     out = run(
         *("import", "gentact.csv", "--link-map", "arm=left_elbow_link"),
@@ -101,7 +95,7 @@ CRANE = """<robot name="crane"><link name="foot"/>
 </collision></link></robot>"""
 
 
-def test_files_of_any_robot_make_one_skin(run):
+def test_files_of_any_robot_make_one_skin():
     Path("crane.urdf").write_text(CRANE)
     Path("boom.csv").write_text(
         "Index,X,Y,Z,Radius,Parent\n0,0.5,0.11,0,0.01,/r/boom\n1,9,0,0,0.01,/r/boom"
@@ -113,8 +107,7 @@ def test_files_of_any_robot_make_one_skin(run):
         *("import", "boom.csv", "hook.csv", "--robot", "crane.urdf"),
         *("--link-map", "claw=hook", "arm=boom", "--out", "skin.json"),
     )
-    with pytest.raises(SystemExit):
-        run(*args)
+    fail("skin", *args)
     out = run(*args, "--skip-invalid")
     assert "skin.json: 2 sensors on links of crane" in out
     assert "remark: no file needs 'arm' of --link-map" in out
@@ -125,7 +118,7 @@ def test_files_of_any_robot_make_one_skin(run):
     np.testing.assert_allclose(skin.normal, [[0, 1, 0], [1, 0, 0]], atol=1e-6)
 
 
-def test_millimetres_and_a_link_that_the_file_leaves_out(run):
+def test_millimetres_and_a_link_that_the_file_leaves_out():
     Path("gentact.csv").write_text(
         "Index,X,Y,Z,NormX,NormY,NormZ,Radius,Parent\n0,93,20,200,1,0,0,4,\n"
     )
@@ -139,7 +132,7 @@ def test_millimetres_and_a_link_that_the_file_leaves_out(run):
 
 
 @pytest.mark.parametrize(("height", "told"), [("200", False), ("970", True)])
-def test_sensors_far_from_the_robot_are_told(run, height: str, told: bool):
+def test_sensors_far_from_the_robot_are_told(height: str, told: bool):
     Path("gentact.csv").write_text(
         "Index,X,Y,Z,NormX,NormY,NormZ,Radius,Parent\n"
         f"0,93,20,{height},1,0,0,4,torso_link\n"
@@ -164,7 +157,7 @@ def mixed(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_summary_counts_links_types_and_ranges(run, mixed):
+def test_a_summary_counts_links_types_and_ranges(mixed):
     head, *rows = run("show", str(mixed)).splitlines()
     assert head == f"{mixed}: 3 sensors on links of h1_2"
     assert [" ".join(row.split()) for row in rows] == [
@@ -176,18 +169,16 @@ def test_a_summary_counts_links_types_and_ranges(run, mixed):
     ]
 
 
-def test_an_export_says_what_it_leaves_out(run, mixed):
+def test_an_export_says_what_it_leaves_out(mixed):
     out = run("export", str(mixed), "--out", "out.csv")
     assert "does not hold coverage, range" in out
 
 
-def test_a_picture_shows_sensors_and_normals_from_both_sides(run, mixed, capsys):
-    try:
-        run("show", str(mixed), "--picture", "skin.png")
-    except SystemExit:
-        text = capsys.readouterr().err
-        assert "OpenGL" in text
-        pytest.skip(text)
+def test_a_picture_shows_sensors_and_normals_from_both_sides(mixed):
+    done = call("skin", "show", str(mixed), "--picture", "skin.png")
+    if "OpenGL" in done.stderr:
+        pytest.skip(done.stderr)
+    assert done.returncode == 0, done.stderr
     image = np.asarray(Image.open("skin.png"), int)
     assert image.shape == (960, 1280, 3)
     red, green, blue = np.moveaxis(image, -1, 0)
@@ -226,7 +217,7 @@ def test_a_picture_shows_sensors_and_normals_from_both_sides(run, mixed, capsys)
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
-def test_bad_input_is_one_clear_message(args, expected, run, capsys):
+def test_bad_input_is_one_clear_message(args, expected):
     Path("bad.csv").write_text(f"{TABLE.splitlines()[0]}\n0,1,2\n")
     content = """{"format": "egoskin-skin-1", "robot": "ROBOT", "sensors": [
       {"link": "torso_lnk", "position": [0, 0, 0], "normal": [1, 0, 0]}]}"""
@@ -235,20 +226,11 @@ def test_bad_input_is_one_clear_message(args, expected, run, capsys):
     Path("deep.json").write_text("[" * 100_000)
     os.mkfifo("pipe")
     before = sorted(Path().iterdir())
-    with pytest.raises(SystemExit) as ended:
-        run(*args)
-    assert ended.value.code == 2
-    # tyro draws boxes: take the lines together.
-    text = " ".join(capsys.readouterr().err.replace("│", " ").split())
-    assert expected in text
-    assert "Traceback" not in text
+    assert expected in fail("skin", *args)
     assert sorted(Path().iterdir()) == before
 
 
-def test_the_command_says_what_it_can_do(run, capsys):
-    with pytest.raises(SystemExit) as ended:
-        run("--help")
-    assert ended.value.code == 0
-    out = capsys.readouterr().out
+def test_the_command_says_what_it_can_do():
+    out = run("--help")
     for command in ("place", "import", "export", "show"):
         assert command in out

@@ -1,76 +1,32 @@
-"""The scripts as a user runs them: train, stop, resume, evaluate, and bad input."""
+"""Commands as a user runs them: train, stop, resume, evaluate, and bad input."""
 
 from __future__ import annotations
 
 import csv
-import io
 import json
 import os
-import runpy
 import signal
-import subprocess
-import sys
+import threading
 import time
-from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 import egoskin
+from calling import BATCH, SMALL, call, fail, succeed
+from egoskin.commands.evaluate import EvaluateConfig
 from egoskin.evaluation import operating_map
 from egoskin.evaluation.throw_set import evaluate, standard_task
+from egoskin.make import MASK_ALL
 from egoskin.storage.tensor_file import load_tensors
-
-ROOT = Path(__file__).parents[2]
-SMALL = ["--num-envs", "32", "--num-workers", "2", "--ppo.num-mini-batches", "2"]
-# Environment steps of one rollout of SMALL: 32 agents x 16 steps.
-BATCH = 512
-
-
-def command(script: str, *args: str | Path) -> list[str]:
-    return [sys.executable, str(ROOT / "scripts" / script), *map(str, args)]
-
-
-def run(script: str, *args: str | Path) -> subprocess.CompletedProcess[str]:
-    """As a user calls it, but in this process: importing takes most of a call."""
-    out, errors = io.StringIO(), io.StringIO()
-    handlers = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)}
-    status: int | str | None = 0
-    with pytest.MonkeyPatch.context() as patch, redirect_stdout(out):
-        patch.setattr(sys, "argv", [script, *map(str, args)])
-        patch.syspath_prepend(str(ROOT / "scripts"))
-        try:
-            with redirect_stderr(errors):
-                runpy.run_path(str(ROOT / "scripts" / script), run_name="__main__")
-        except SystemExit as end:
-            status = end.code
-        finally:
-            for number, handler in handlers.items():
-                signal.signal(number, handler)
-    if isinstance(status, str):
-        errors.write(status)
-        status = 1
-    return subprocess.CompletedProcess(
-        [script, *map(str, args)], status or 0, out.getvalue(), errors.getvalue()
-    )
 
 
 def metrics(folder: Path) -> list[dict[str, str]]:
     with open(folder / "metrics.csv", newline="") as file:
         return list(csv.DictReader(file))
-
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory) -> Path:
-    """A run of four rollouts."""
-    folder = tmp_path_factory.mktemp("runs") / "trained"
-    args = ("ppo.py", *SMALL, "--run-dir", folder, "--total-frames", 4 * BATCH)
-    # In a process of its own.
-    done = subprocess.run(command(*args), capture_output=True, text=True, timeout=200)
-    assert done.returncode == 0, done.stderr
-    return folder
 
 
 def test_a_run_folder_holds_what_is_needed_to_understand_it(trained: Path):
@@ -92,10 +48,8 @@ def test_a_run_folder_holds_what_is_needed_to_understand_it(trained: Path):
 
 def test_a_resumed_run_equals_one_that_never_stopped(trained: Path, tmp_path: Path):
     args = ("--run-dir", tmp_path / "halves", "--total-frames", 2 * BATCH)
-    done = run("ppo.py", *SMALL, *args)
-    assert done.returncode == 0, done.stderr
-    done = run("ppo.py", "--resume", tmp_path / "halves", "--total-frames", 4 * BATCH)
-    assert done.returncode == 0, done.stderr
+    succeed("train", *SMALL, *args)
+    succeed("train", "--resume", tmp_path / "halves", "--total-frames", 4 * BATCH)
     whole, _ = load_tensors(trained / "checkpoint.safetensors")
     halves, _ = load_tensors(tmp_path / "halves" / "checkpoint.safetensors")
     assert whole.keys() == halves.keys()
@@ -110,30 +64,43 @@ def test_a_resumed_run_equals_one_that_never_stopped(trained: Path, tmp_path: Pa
 
 def test_ctrl_c_leaves_a_checkpoint_and_says_how_to_go_on(tmp_path: Path):
     folder = tmp_path / "stopped"
-    process = subprocess.Popen(
-        command("ppo.py", *SMALL, "--run-dir", folder),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    deadline = time.monotonic() + 120
-    while not (folder / "metrics.csv").exists() and time.monotonic() < deadline:
-        time.sleep(0.2)
-    process.send_signal(signal.SIGINT)
-    out, errors = process.communicate(timeout=60)
-    assert process.returncode == 0, errors
-    assert f"--resume {folder}" in out
+
+    def interrupt() -> None:
+        while not (folder / "metrics.csv").exists():
+            time.sleep(0.02)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=interrupt, daemon=True).start()
+    out = succeed("train", *SMALL, "--run-dir", folder)
+    assert f"egoskin train --resume {folder}" in out
     _, header = load_tensors(folder / "checkpoint.safetensors")
     assert header["frames"] == int(metrics(folder)[-1]["frames"]) > 0
 
 
-def test_an_evaluation_has_the_figures_promised(trained: Path, tmp_path: Path):
-    done = run(
-        "evaluate.py", trained, "--episodes", "32", "--json", tmp_path / "out.json"
-    )
+EPISODES = 6
+
+
+def figures_of(folder: Path, *args: str | Path) -> tuple[dict, str]:
+    """(JSON, text) of an evaluation."""
+    out = folder / "out.json"
+    done = call("evaluate", *args, "--episodes", EPISODES, "--json", out)
     assert done.returncode == 0, done.stderr
-    assert "success (no contact for 3 s)" in done.stdout
-    result = json.loads((tmp_path / "out.json").read_text())
+    assert f"playing {EPISODES} episodes" in done.stderr
+    return json.loads(out.read_text()), done.stdout
+
+
+@pytest.fixture(scope="module")
+def evaluated(trained: Path, tmp_path_factory) -> dict[str, tuple[dict, str]]:
+    """(JSON, text) of evaluations by each standard."""
+    folder = tmp_path_factory.mktemp("evaluated")
+    return {
+        standard: figures_of(folder, trained, "--standard", standard)
+        for standard in ("1", "2", "paper", "run")
+    }
+
+
+def test_an_evaluation_has_the_figures_promised(evaluated):
+    result, text = evaluated["2"]
     assert result.keys() == {
         "success",
         "success_5s",
@@ -154,9 +121,9 @@ def test_an_evaluation_has_the_figures_promised(trained: Path, tmp_path: Path):
     about = {"standard": "2", "trained_on": "2", "bank_seed": 0, "mask": []}
     assert {key: result[key] for key in about} == about
     assert result["frames"] == 4 * BATCH
-    assert f"{4 * BATCH:,} frames on standard 2; standard 2, bank 0" in done.stdout
-    assert "no contact for 5 s" in done.stdout
-    assert "playing 32 episodes" in done.stderr
+    assert f"{4 * BATCH:,} frames on standard 2; standard 2, bank 0" in text
+    assert "success (no contact for 3 s)" in text
+    assert "no contact for 5 s" in text
     assert result["success_5s"]["mean"] <= result["success"]["mean"]
     assert result["success"].keys() == result["survival_time"].keys()
     assert result["success"].keys() == {"mean", "low", "high"}
@@ -167,22 +134,21 @@ def test_an_evaluation_has_the_figures_promised(trained: Path, tmp_path: Path):
 def test_an_evaluation_says_what_the_policy_does_and_at_another_physics_rate(
     trained: Path, tmp_path: Path
 ):
-    done = run(
-        "evaluate.py",
-        *(trained, "--episodes", "16", "--json", tmp_path / "out.json"),
+    out = succeed(
+        "evaluate",
+        *(trained, "--episodes", EPISODES, "--json", tmp_path / "out.json"),
         *("--behaviour", "--check-substeps", "8", "--standard", "run"),
     )
-    assert done.returncode == 0, done.stderr
-    assert "physics at 120 Hz" in done.stdout
-    assert "physics at 480 Hz" in done.stdout
-    assert "success lost by the other physics rate" in done.stdout
+    assert "physics at 120 Hz" in out
+    assert "physics at 480 Hz" in out
+    assert "success lost by the other physics rate" in out
     # On the throws of its training it waits for the first.
-    assert "before the first throw, from 0.5 s on" in done.stdout
-    assert "speed at arrival" in done.stdout
-    assert "mechanical power" in done.stdout
+    assert "before the first throw, from 0.5 s on" in out
+    assert "speed at arrival" in out
+    assert "mechanical power" in out
     result = json.loads((tmp_path / "out.json").read_text())
     assert result["check_substeps"] == 8
-    assert result["checked"]["episodes"] == result["episodes"] == 16
+    assert result["checked"]["episodes"] == result["episodes"] == EPISODES
     assert 0 < result["behaviour"]["waiting"]["base_speed"] < 1
     # Another rate is another course of events.
     assert result["checked"]["survival_time"] != result["survival_time"]
@@ -190,21 +156,12 @@ def test_an_evaluation_says_what_the_policy_does_and_at_another_physics_rate(
     assert [g["name"] for g in numbers] == ["first", "second", "third", "later"]
     groups = result["behaviour"]["throws"]["direction"]
     assert [g["name"] for g in groups] == ["front", "left", "back", "right"]
-    assert sum(g["episodes"] for g in groups) == 16
+    assert sum(g["episodes"] for g in groups) == EPISODES
 
 
-def figures_of(folder: Path, *args: str | Path) -> tuple[dict, str]:
-    """(JSON, text) of an evaluation."""
-    out = folder / "out.json"
-    done = run("evaluate.py", *args, "--episodes", "16", "--json", out)
-    assert done.returncode == 0, done.stderr
-    return json.loads(out.read_text()), done.stdout
-
-
-def test_an_evaluation_says_by_which_standard_it_judges(trained: Path, tmp_path: Path):
+def test_an_evaluation_says_by_which_standard_it_judges(evaluated):
     results = {}
-    for standard in ("1", "2", "paper", "run"):
-        result, text = figures_of(tmp_path, trained, "--standard", standard)
+    for standard, (result, text) in evaluated.items():
         assert result["trained_on"] == "2"
         judged = "2" if standard == "run" else standard
         assert result["standard"] == judged
@@ -222,9 +179,8 @@ def test_an_evaluation_may_mask_all_sensors_or_those_of_some_links(
     policy = egoskin.load_policy(trained)
     task = standard_task(policy.env_config)
     links = ["torso_link", "left_elbow_link"]
-    for names, mask in (([], ["all"]), (["all"], ["all"]), (links, links)):
-        args = ["--mask", *names]
-        result, text = figures_of(tmp_path, trained, *args)
+    for names, mask in (([], ["all"]), (links, links)):
+        result, text = figures_of(tmp_path, trained, "--mask", *names)
         assert result["mask"] == mask
         assert f"sensors masked: {', '.join(mask)}" in text
         # Its success is that of the policy whose sensors are masked.
@@ -232,12 +188,13 @@ def test_an_evaluation_may_mask_all_sensors_or_those_of_some_links(
             policy,
             *(task, policy.skin),
             bank_seed=0,
-            episodes=16,
+            episodes=EPISODES,
             num_workers=1,
             mask=mask,
         )
         assert result["survival_time"] == asdict(played.survival_time)
         assert result["success"] == asdict(played.success)
+    assert EvaluateConfig(policy=trained, mask=("all",)).masked == MASK_ALL
 
 
 @pytest.mark.parametrize(
@@ -252,6 +209,7 @@ def test_an_evaluation_may_mask_all_sensors_or_those_of_some_links(
         (["--map", "no/map.png"], "no folder no"),
         (["--bank-seed", str(2**32)], "bank_seed must be in [0, 2**32)"),
         (["--episodes", "0"], "episodes must be at least 1"),
+        (["--check-substeps", "0"], "check_substeps must be at least 1, got 0"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
@@ -260,11 +218,8 @@ def test_bad_input_to_an_evaluation_is_one_clear_message(
 ):
     pytest.importorskip("matplotlib")
     monkeypatch.chdir(tmp_path)
-    done = run("evaluate.py", trained, *args)
-    assert done.returncode == 2
-    text = " ".join(done.stderr.replace("│", " ").split())
+    text = fail("evaluate", trained, *args)
     assert expected in text
-    assert "Traceback" not in text
     assert "playing" not in text
     assert not list(tmp_path.iterdir())
 
@@ -291,8 +246,8 @@ def test_a_ceiling_counts_what_policy_and_search_avoid(tmp_path: Path):
     out = tmp_path / "ceiling.json"
     search = ("--search.samples", "4", "--search.iterations", "1")
     # So long that each plan sees its ball arrive, so short that it takes seconds.
-    done = run(
-        "ceiling.py",
+    done = call(
+        "upper-bound",
         *("field_proximity", "--throws", "12", "--json", out),
         *(*search, "--search.stand-s", "0.75"),
     )
@@ -303,15 +258,8 @@ def test_a_ceiling_counts_what_policy_and_search_avoid(tmp_path: Path):
     assert sum(row["throws"] for row in rows) == 12
     avoided = sum(row["policy_avoids"] for row in rows)
     assert 0 < avoided <= sum(row["search_avoids"] for row in rows)
-    bad = run("ceiling.py", "field_proximity", "--reach", "0")
-    assert bad.returncode == 2
-    assert "reach must be positive" in bad.stderr
-
-
-def test_physics_steps_that_are_none_are_refused(trained: Path):
-    done = run("evaluate.py", trained, "--check-substeps", "0")
-    assert done.returncode == 2
-    assert "check_substeps must be at least 1, got 0" in done.stderr
+    bad = fail("upper-bound", "field_proximity", "--reach", "0")
+    assert "reach must be positive" in bad
 
 
 def test_a_policy_file_runs_on_a_tensordict_without_any_environment(trained: Path):
@@ -320,8 +268,6 @@ def test_a_policy_file_runs_on_a_tensordict_without_any_environment(trained: Pat
     td = policy.env_config.sensor
     assert (td.coverage, td.signal, td.range) == ("field", "proximity", 2.0)
     assert len(policy.skin) == 64
-    from tensordict import TensorDict
-
     batch = TensorDict(
         {"observation": torch.zeros(7, 48), "signal": torch.ones(7, 64)}, [7]
     )
@@ -353,12 +299,9 @@ CELLS = [
 
 
 @pytest.mark.parametrize("sensor", CELLS, ids=lambda args: "-".join(args[1::2]))
-def test_every_sensor_trains(sensor: list[str], tmp_path: Path, monkeypatch):
-    size = [*SMALL, "--total-frames", str(2 * BATCH)]
-    args = [*size, "--run-dir", str(tmp_path / "run"), *sensor]
-    monkeypatch.setattr(sys, "argv", ["ppo.py", *args])
-    # As a user calls it, but in this process: importing takes most of a call.
-    runpy.run_path(str(ROOT / "scripts" / "ppo.py"), run_name="__main__")
+def test_every_sensor_trains(sensor: list[str], tmp_path: Path):
+    size = (*SMALL, "--num-workers", "1", "--total-frames", 2 * BATCH)
+    succeed("train", *size, "--run-dir", tmp_path / "run", *sensor)
     assert egoskin.load_policy(tmp_path / "run").policy_spec.frames == 2 * BATCH
 
 
@@ -384,96 +327,26 @@ BAD_SKIN = """{"format": "egoskin-skin-1", "robot": "h1_2", "sensors": [
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
 def test_bad_input_to_training_is_one_clear_message(
-    args: list[str], expected: str, tmp_path: Path, monkeypatch, capsys
+    args: list[str], expected: str, tmp_path: Path, monkeypatch
 ):
     (tmp_path / "skin.json").write_text(BAD_SKIN)
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "notes.txt").write_text("mine")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["ppo.py", *args])
-    # As a user calls it, but in this process: importing takes most of a call.
-    with pytest.raises(SystemExit) as ended:
-        runpy.run_path(str(ROOT / "scripts" / "ppo.py"), run_name="__main__")
-    assert ended.value.code == 2
-    # tyro draws boxes: take the lines together.
-    text = " ".join(capsys.readouterr().err.replace("│", " ").split())
-    assert expected in text
-    assert "Traceback" not in text
+    assert expected in fail("train", *args)
     assert sorted(os.listdir(tmp_path)) == ["full", "skin.json"]
     assert (tmp_path / "full" / "notes.txt").read_text() == "mine"
 
 
 def test_a_changed_field_is_refused_by_name_on_resume(trained: Path):
     before = (trained / "checkpoint.safetensors").read_bytes()
-    done = run("ppo.py", "--resume", trained, "--seed", "1", "--sensor.range", "1")
-    assert done.returncode == 2
-    assert "changed: sensor.range, seed" in done.stderr
+    text = fail("train", "--resume", trained, "--seed", "1", "--sensor.range", "1")
+    assert "changed: sensor.range, seed" in text
     assert (trained / "checkpoint.safetensors").read_bytes() == before
 
 
 def test_a_truncated_checkpoint_is_refused(trained: Path, tmp_path: Path):
     content = (trained / "checkpoint.safetensors").read_bytes()
     (tmp_path / "cut.safetensors").write_bytes(content[: len(content) // 2])
-    done = run("evaluate.py", tmp_path / "cut.safetensors")
-    assert done.returncode == 2
-    assert "cut.safetensors is truncated" in done.stderr
-    assert "Traceback" not in done.stderr
-
-
-def test_bench_loop_gives_its_rows(tmp_path: Path):
-    done = run(
-        "bench.py",
-        "loop",
-        *("--num-envs", "32", "--num-workers", "1", "--warmup", "1", "--rounds", "1"),
-        *("--json", tmp_path / "loop.json"),
-    )
-    assert done.returncode == 0, done.stderr
-    rows = json.loads((tmp_path / "loop.json").read_text())["rows"]
-    by_name = {row["name"]: row for row in rows}
-    speeds = [
-        "raw",
-        "task",
-        "env",
-        "sensors",
-        "policy",
-        "train_field",
-        "train_ray_grid",
-    ]
-    others = [
-        f"{name}_{kind}" for name in ("memory", "serial") for kind in ("field", "ray")
-    ]
-    for name in [*speeds, *others]:
-        assert by_name[name]["value"] > 0
-    assert rows[0]["name"] == "raw"
-    assert rows[0]["ratio"] == 1.0
-    # The parts of the wall time are what the whole of a step takes.
-    parts = [row["value"] for row in rows if row["name"].endswith("_wall")]
-    assert len(parts) == 7
-    assert sum(parts) == pytest.approx(1e6 / by_name["train_field"]["value"])
-
-
-def test_bench_gradients_compares_rollouts_and_leaves_the_run_alone(
-    trained: Path, tmp_path: Path
-):
-    before = {p: p.read_bytes() for p in trained.rglob("*") if p.is_file()}
-    args = ("--run", trained, "--rollouts", "3", "--json", tmp_path / "g.json")
-    done = run("bench.py", "gradients", *args)
-    assert done.returncode == 0, done.stderr
-    rows = json.loads((tmp_path / "g.json").read_text())["rows"]
-    # The run's own decay comes first.
-    names = [row["name"] for row in rows]
-    assert names[:3] == ["lambda_0.8", "lambda_0", "lambda_0.5"]
-    assert rows[0]["ratio"] == 1.0
-    assert all(-1 < row["value"] < 1 for row in rows)
-    assert {p: p.read_bytes() for p in trained.rglob("*") if p.is_file()} == before
-
-
-def test_bench_accuracy_compares_two_rates(tmp_path: Path):
-    args = ("--throws", "6", "--json", tmp_path / "accuracy.json")
-    done = run("bench.py", "accuracy", *args)
-    assert done.returncode == 0, done.stderr
-    rows = json.loads((tmp_path / "accuracy.json").read_text())["rows"]
-    by_name = {row["name"]: row for row in rows}
-    # Standing shows the same forces; the ball is met within a control step.
-    assert by_name["stand_floor_force"]["ratio"] < 0.01
-    assert 0 < by_name["impact_time"]["ratio"] < 1
+    text = fail("evaluate", tmp_path / "cut.safetensors")
+    assert "cut.safetensors is truncated" in text

@@ -1,0 +1,105 @@
+"""The command line: what `egoskin NAME`, `python -m egoskin NAME` and the scripts do.
+
+Contract: a command is the module of its name, with a function ``main(args)``, and
+nothing heavy is imported before the name is known to be one: help comes at once.
+"""
+
+from __future__ import annotations
+
+import difflib
+import sys
+from collections.abc import Iterable, Mapping
+from importlib import import_module
+
+from egoskin import __version__
+from egoskin.interrupts import end_quietly
+from egoskin.viewer import draw_without_display
+
+COMMANDS = {
+    "train": "train a robot to dodge, or go on with a run",
+    "evaluate": "play a policy on a fixed set of throws",
+    "film": "film an episode, with a contact sheet of its moments",
+    "skin": "place, import, export and show skins",
+    "visibility": "show what a skin sees, before any training",
+    "upper-bound": "search what the body could still do when a ball is in reach",
+    "replay": "replay an update that was not finite",
+    "study": "plan, run and report many trainings",
+    "verify": "check that training is exact on this machine",
+    "bench": "measure speed and accuracy",
+}
+"""What each command does, by name."""
+# What else may be meant: names of scripts that are older.
+_OTHER_NAMES = {
+    "ppo": "train",
+    "render": "film",
+    "coverage": "visibility",
+    "ceiling": "upper-bound",
+    "--help": "--help",
+    "--version": "--version",
+}
+
+# Commands that draw the robot.
+_PICTURES = ("film", "skin")
+
+
+def main() -> None:
+    """Run the command that the first argument of this process names."""
+    name, *args = sys.argv[1:] or ["--help"]
+    if name in ("--help", "-h"):
+        print(_page())
+    elif name == "--version":
+        print(f"egoskin {__version__}")
+    elif name in COMMANDS:
+        # Help and the record of a run show how it was called.
+        sys.argv = [f"egoskin {name}", *args]
+        run(name)
+    else:
+        print(f"error: {unknown(name, COMMANDS, _OTHER_NAMES)}", file=sys.stderr)
+        raise SystemExit(2)
+
+
+def run(name: str) -> None:
+    """Run a command on the arguments of this process, with clear errors."""
+    end_quietly()
+    if name in _PICTURES:
+        draw_without_display()
+    command = import_module(f"egoskin.commands.{name.replace('-', '_')}")
+    # Only now: it imports torch.
+    from egoskin.commands.errors import clear_errors
+
+    with clear_errors():
+        command.main(sys.argv[1:])
+
+
+def _page() -> str:
+    """Return the help of the whole."""
+    width = max(map(len, COMMANDS))
+    lines = [f"  {name:<{width}}  {text}" for name, text in COMMANDS.items()]
+    return "\n".join(
+        [
+            "usage: egoskin COMMAND [OPTIONS]",
+            "",
+            "Proximity skins for robots: which skin makes avoidance easy to learn?",
+            "",
+            *lines,
+            "",
+            "egoskin COMMAND --help lists the options of a command. For example:",
+            "",
+            "  egoskin evaluate field_proximity --episodes 256",
+            "  egoskin film field_proximity --longest-of 16 --out dodge.mp4",
+            "  egoskin train --sensor.signal binary --sensor.range 1 --seed 1",
+        ]
+    )
+
+
+def unknown(name: str, known: Iterable[str], other: Mapping[str, str] = {}) -> str:
+    """Return what to say of a name that is none, with the nearest that is one.
+
+    Args:
+        name: What was given.
+        known: The names that there are.
+        other: Other names that may have been meant, and what each stands for.
+    """
+    near = difflib.get_close_matches(name, [*known, *other], n=1)
+    hint = f", did you mean {other.get(near[0], near[0])!r}?" if near else ""
+    return f"there is no command {name!r}{hint} (commands: {', '.join(known)})"

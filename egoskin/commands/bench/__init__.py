@@ -1,0 +1,43 @@
+"""Measure how fast and how exact the parts of the project are.
+
+egoskin bench loop --json loop.json
+egoskin bench sensors
+egoskin bench physics
+egoskin bench accuracy
+egoskin bench gradients --run runs/NAME
+"""
+
+from __future__ import annotations
+
+from egoskin.commands.bench.accuracy import AccuracyBench, accuracy_rows
+from egoskin.commands.bench.gradients import GradientBench, gradient_rows
+from egoskin.commands.bench.loop import LoopConfig, loop
+from egoskin.commands.bench.physics import PhysicsBench, physics_rows
+from egoskin.commands.bench.report import report
+from egoskin.commands.bench.sensors import SensorBench, sensor_rows
+from egoskin.commands.errors import parse_subcommand
+from egoskin.storage.files import check_output
+
+
+def main(args: list[str]) -> None:
+    """Run the command."""
+    benches = {
+        "loop": LoopConfig,
+        "physics": PhysicsBench,
+        "sensors": SensorBench,
+        "accuracy": AccuracyBench,
+        "gradients": GradientBench,
+    }
+    config = parse_subcommand(benches, args)
+    check_output(config.json, "--json")
+    if isinstance(config, LoopConfig):
+        rows = loop(config)
+    elif isinstance(config, PhysicsBench):
+        rows = physics_rows(config)
+    elif isinstance(config, AccuracyBench):
+        rows = accuracy_rows(config)
+    elif isinstance(config, GradientBench):
+        rows = gradient_rows(config)
+    else:
+        rows = sensor_rows(config)
+    report(rows, config.json)

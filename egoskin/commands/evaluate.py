@@ -1,0 +1,264 @@
+"""Evaluate a policy on a fixed bank of throws.
+
+egoskin evaluate runs/NAME
+egoskin evaluate localization
+egoskin evaluate runs/NAME/policies/000005046272.safetensors --json out.json
+egoskin evaluate runs/NAME --behaviour --check-substeps 8
+egoskin evaluate runs/NAME --mask
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from egoskin.evaluation.behaviour import Behaviour, Motion, behave
+from egoskin.evaluation.operating_map import check_map, draw_map, operating_map
+from egoskin.evaluation.throw_set import Estimate, Evaluation, evaluate, standard_task
+from egoskin.make import MASK_ALL, EnvConfig, check_mask, check_num_workers
+from egoskin.policies.policy import load_policy
+from egoskin.progress import StatusLine, counted
+from egoskin.rng import check_seed
+from egoskin.storage.files import check_output
+from egoskin.storage.serialization import check_counts
+from egoskin.viewer.film import check_path
+
+PICTURE_SUFFIXES = (".png", ".svg", ".pdf")
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateConfig:
+    """Play a bank of throws with the mean action of a trained policy."""
+
+    policy: Annotated[Path, tyro.conf.Positional]
+    """Run folder (its latest checkpoint), checkpoint, policy file, or the name of a
+    policy that comes with the package."""
+    bank_seed: int = 0
+    """Seed of the bank of throws."""
+    episodes: int = 1024
+    """Throw sequences in the bank."""
+    standard: Literal["2", "1", "paper", "run"] = "2"
+    """Version of the standard throw to judge by, whatever the policy was trained on;
+    run: the throws and ends of its training."""
+    mask: tuple[str, ...] | None = None
+    """Links whose sensors detect nothing; alone: all sensors. What is left of the
+    success is not owed to them."""
+    num_workers: int | None = None
+    """Processes that simulate; None: the largest divisor of episodes <= cores."""
+    behaviour: bool = False
+    """Also say what the policy does: hits by kind of throw, displacement, effort."""
+    check_substeps: int | None = None
+    """Play the bank once more with this many physics steps in each control step, and
+    say what is lost (8: 480 Hz)."""
+    map: Path | None = None
+    """Picture to draw of success against speed, tempo, height and direction of the
+    throws, within and beyond what is trained on (a quarter of the episodes each)."""
+    json: Path | None = None
+    """File to write the figures to."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for values with which nothing can be played."""
+        check_seed(self.bank_seed, "bank_seed")
+        check_counts(self, "episodes", "check_substeps")
+        check_num_workers(self.episodes, self.num_workers, "episodes")
+        check_output(self.json, "--json")
+        if self.map is not None:
+            check_path(self.map, PICTURE_SUFFIXES)
+            check_matplotlib()
+
+    @property
+    def masked(self) -> tuple[str, ...]:
+        """The mask as `egoskin.evaluation.throw_set` takes it."""
+        if self.mask is None:
+            return ()
+        return self.mask or MASK_ALL
+
+
+def check_matplotlib() -> None:
+    """Raise ValueError if the map's picture cannot be drawn here."""
+    if importlib.util.find_spec("matplotlib") is None:
+        raise ValueError("--map needs matplotlib: `pip install 'egoskin[plot]'`")
+
+
+def share(value: float | None) -> str:
+    """Return a share as text, a dash for None."""
+    return "     -" if value is None else f"{100 * value:6.2f} %"
+
+
+def table(result: Evaluation, title: str, age: float) -> str:
+    """Return the figures as text, with the age of success [s]."""
+
+    def interval(value: Estimate, scale: float, unit: str) -> str:
+        mean, low, high = (scale * v for v in (value.mean, value.low, value.high))
+        return f"{mean:6.2f} {unit}  ({low:.2f} to {high:.2f})"
+
+    ends = {
+        "a ball": result.ended_by_ball,
+        "a fall": result.ended_by_fall,
+        "self-contact": result.ended_by_self_contact,
+        "divergence": result.diverged,
+    }
+    rows = [
+        (f"success (no contact for {age:g} s)", interval(result.success, 100, "%")),
+        ("  no contact for 5 s", interval(result.success_5s, 100, "%")),
+        ("  same bank, robot held rigid", share(result.rigid_success)),
+        ("survival time (at most 10 s)", interval(result.survival_time, 1, "s")),
+        *((f"ended within {age:g} s by {how}", share(x)) for how, x in ends.items()),
+        ("first balls avoided", share(result.avoided.first_ball)),
+        ("later balls avoided", share(result.avoided.later_balls)),
+    ]
+    lines = [f"  {name:<32} {value}" for name, value in rows]
+    return "\n".join([title, *lines, "  (95 % intervals in brackets)"])
+
+
+def _metres(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f} m"
+
+
+def behaviour_table(result: Behaviour) -> str:
+    """Return what the policy does as text."""
+    lines = []
+    for kind, groups in result.throws.items():
+        lines += ["", f"  {kind:<20} {'success':>8}   of  first hits  later hits   of"]
+        for group in groups:
+            success = None if group.success is None else group.success.mean
+            lines.append(
+                f"    {group.name:<18} {share(success)} {group.episodes:4}    "
+                f"{share(group.first_hits)}    {share(group.later_hits)} "
+                f"{group.later_balls:4}"
+            )
+    if result.waiting is not None:
+        waiting = result.waiting
+        lines += [
+            "",
+            "  before the first throw, from 0.5 s on",
+            f"    base speed       {waiting.base_speed:7.3f} m/s",
+            f"    mechanical power {waiting.power:7.1f} W",
+            f"    fallen           {share(waiting.fallen)}",
+        ]
+    lines += ["", "  way from the start     mean   a tenth exceeds  base height     of"]
+    for way in result.displacement:
+        lines.append(
+            f"    after {way.age:g} s       {_metres(way.mean):>8} "
+            f"{_metres(way.largest_tenth):>16} {_metres(way.height):>12} "
+            f"{way.episodes:6}"
+        )
+    lines += ["", f"  {'':<32}{'policy':>10} {'zero action':>13}"]
+
+    def row(name: str, unit: str, show: Callable[[Motion], float]) -> str:
+        own, zero = show(result.motion), show(result.motion_zero_action)
+        return f"  {name:<32}{own:10.3g} {zero:13.3g} {unit}"
+
+    return "\n".join(
+        [
+            *lines,
+            row("mechanical power", "W", lambda m: m.power),
+            row("joint acceleration, rms", "rad/s^2", lambda m: m.joint_acceleration),
+            row("torques at their limit", "%", lambda m: 100 * m.torque_saturation),
+            row("feet slide, while on the floor", "cm/s", lambda m: 100 * m.foot_slip),
+            row("steps without floor contact", "%", lambda m: 100 * m.airborne),
+            row("steps with self-contact", "%", lambda m: 100 * m.self_contact),
+        ]
+    )
+
+
+def with_substeps(config: EnvConfig, substeps: int) -> EnvConfig:
+    """Return the configuration with another number of physics steps."""
+    physics = dataclasses.replace(config.task.physics, substeps=substeps)
+    task = dataclasses.replace(config.task, physics=physics)
+    return dataclasses.replace(config, task=task)
+
+
+def physics_rate(config: EnvConfig) -> str:
+    """Return the physics rate as text."""
+    return f"{1 / config.task.physics.timestep:g} Hz"
+
+
+def main(args: list[str]) -> None:
+    """Run the command."""
+    config = tyro.cli(EvaluateConfig, args=args)
+    policy = load_policy(config.policy)
+    env_config = policy.env_config
+    if config.standard != "run":
+        env_config = standard_task(env_config, config.standard)
+    check_mask(env_config, policy.skin, config.masked)
+    if config.map is not None:
+        check_map(env_config)
+    line = StatusLine(f"playing {counted(config.episodes, 'episode')}")
+    hz = env_config.task.physics.control_hz
+
+    def on_step(step: int, running: int) -> None:
+        line.show(f"{step / hz:.2f} s played, {running} episodes still running")
+
+    def on_point(done: int, total: int) -> None:
+        line.show(f"map: {done} of {total} points")
+
+    bank: dict[str, Any] = {
+        "bank_seed": config.bank_seed,
+        "episodes": config.episodes,
+        "num_workers": config.num_workers,
+        "mask": config.masked,
+        "on_step": on_step,
+    }
+    behaviour = checked = None
+    substeps = config.check_substeps or env_config.task.physics.substeps
+    finer = with_substeps(env_config, substeps)
+    if config.behaviour:
+        result, behaviour = behave(policy, env_config, policy.skin, **bank)
+    else:
+        result = evaluate(policy, env_config, policy.skin, **bank)
+    if config.check_substeps is not None:
+        checked = evaluate(policy, finer, policy.skin, **bank)
+    line.finish()
+    trained = policy.env_config.standard
+    played = trained if config.standard == "run" else config.standard
+    title = (
+        f"{config.policy}: {policy.policy_spec.frames:,} frames on standard {trained}; "
+        f"standard {played}, bank {config.bank_seed} of "
+        f"{counted(config.episodes, 'episode')}"
+    )
+    if config.masked:
+        title += f", sensors masked: {', '.join(config.masked)}"
+    title += ", physics at "
+    age = env_config.task.success_s
+    print(table(result, title + physics_rate(env_config), age))
+    content = {
+        **dataclasses.asdict(result),
+        "standard": played,
+        "trained_on": trained,
+        "bank_seed": config.bank_seed,
+        "frames": policy.policy_spec.frames,
+        "mask": config.masked,
+    }
+    if behaviour is not None:
+        print(behaviour_table(behaviour))
+        content["behaviour"] = dataclasses.asdict(behaviour)
+    if checked is not None:
+        print("\n" + table(checked, title + physics_rate(finer), age))
+        lost = 100 * (result.success.mean - checked.success.mean)
+        print(f"  success lost by the other physics rate: {lost:.2f} points")
+        content["check_substeps"] = config.check_substeps
+        content["checked"] = dataclasses.asdict(checked)
+    if config.map is not None:
+        lines = operating_map(
+            policy,
+            env_config,
+            policy.skin,
+            bank_seed=config.bank_seed,
+            episodes=max(config.episodes // 4, 1),
+            mask=config.masked,
+            on_point=on_point,
+        )
+        line.finish()
+        draw_map(config.map, lines, title.removesuffix(", physics at "))
+        content["map"] = [dataclasses.asdict(line) for line in lines]
+        print(f"\n{config.map}: success against speed, tempo, height and direction")
+    if config.json is not None:
+        config.json.write_text(json.dumps(content, indent=2) + "\n")

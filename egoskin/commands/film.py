@@ -1,0 +1,159 @@
+"""Render an episode: a film, and a contact sheet of the moments that tell it best.
+
+egoskin film runs/NAME --longest-of 16 --out dodge.mp4
+egoskin film runs/NAME --bank-seed 0 --episode 7 --standard run
+egoskin film --hold --sensor.range 1 --out rigid.gif
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+try:
+    import mujoco  # noqa: F401
+except (AttributeError, ImportError, RuntimeError) as fault:
+    # MuJoCo loads the library that MUJOCO_GL names at once; the fault's own text is
+    # PyOpenGL's and does not say so.
+    backend = os.environ.get("MUJOCO_GL", "")
+    print(
+        f"error: MuJoCo cannot be imported with MUJOCO_GL={backend!r} ({fault}); "
+        "install the library (Debian: `apt-get install libegl1` for egl, `apt-get "
+        "install libosmesa6` for osmesa)",
+        file=sys.stderr,
+    )
+    raise SystemExit(2) from None
+
+from egoskin.evaluation.throw_set import standard_task
+from egoskin.make import EnvConfig
+from egoskin.policies.policy import load_policy
+from egoskin.progress import StatusLine, counted
+from egoskin.rng import check_seed
+from egoskin.storage.serialization import check_counts
+from egoskin.viewer.film import (
+    FILM_SUFFIXES,
+    check_path,
+    contact_sheet,
+    save_film,
+    save_picture,
+)
+from egoskin.viewer.offscreen import (
+    CameraConfig,
+    check_film,
+    painter_of,
+    record_episodes,
+    render_recording,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderConfig:
+    """Render an episode of a trained policy, or of the zero action without one."""
+
+    policy: Annotated[Path | None, tyro.conf.Positional] = None
+    """Run folder (its latest checkpoint), checkpoint, policy file, or the name of a
+    policy that comes with the package; None: action 0, which asks the motors for the
+    default pose."""
+    out: Path = Path("episode.mp4")
+    """Film to write, .mp4 or .gif."""
+    sheet: Path | None = None
+    """Contact sheet to write, .png; None: beside the film, under the same name."""
+    bank_seed: int = 0
+    """Seed of the bank of throws, as in evaluate.py."""
+    episode: int = 0
+    """Which episode of the bank."""
+    longest_of: int = 1
+    """Of this many episodes, from --episode on, show the one that lasts longest."""
+    standard: Literal["2", "1", "paper", "run"] = "2"
+    """Version of the standard throw; run: the throws and ends of the training."""
+    seconds: float | None = None
+    """Stop at this age at the latest [s]; None: the whole episode."""
+    fps: float = 30.0
+    """Pictures for each second of the episode, at most the control rate."""
+    slowdown: float = 1.0
+    """The film plays this many times slower than real time."""
+    size: tuple[int, int] = (960, 540)
+    """Width and height of the film [px]."""
+    hold: bool = False
+    """Hold the robot rigid in its default pose."""
+    camera: CameraConfig = field(default_factory=CameraConfig)
+    """Where the camera is."""
+    env: Annotated[EnvConfig, tyro.conf.arg(name="")] = field(default_factory=EnvConfig)
+    """Robot, task, skin, sensors; a policy brings its own."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for what cannot be rendered or written."""
+        check_path(self.out, FILM_SUFFIXES)
+        check_path(self.sheet_path, (".png",))
+        check_seed(self.bank_seed, "bank_seed")
+        check_counts(self, "longest_of")
+        if self.episode < 0:
+            raise ValueError(f"episode must not be negative, got {self.episode}")
+        if not 0 < self.slowdown <= 100:
+            raise ValueError(f"slowdown must be in (0, 100], got {self.slowdown}")
+        if self.policy is not None and self.env != EnvConfig():
+            raise ValueError(
+                "a policy brings its own robot, task, skin and sensors: leave their "
+                "options out, or leave out the policy"
+            )
+
+    @property
+    def sheet_path(self) -> Path:
+        """Where the contact sheet goes."""
+        return self.out.with_suffix(".png") if self.sheet is None else self.sheet
+
+
+def main(args: list[str]) -> None:
+    """Run the command."""
+    config = tyro.cli(RenderConfig, args=args)
+    if config.policy is None:
+        policy, env_config = None, config.env
+        skin = env_config.skin.build(env_config.robot_config)
+    else:
+        policy = load_policy(config.policy)
+        env_config, skin = policy.env_config, policy.skin
+    if config.standard != "run" and config.policy is not None:
+        env_config = standard_task(env_config, config.standard)
+    hz = env_config.task.physics.control_hz
+    check_film(hz, config.fps, config.seconds)
+    # Whether it can be drawn is known before anything is played.
+    painter = painter_of(env_config, skin, size=config.size, camera=config.camera)
+    line = StatusLine(f"playing {counted(config.longest_of, 'episode')}")
+    with painter:
+        recordings = record_episodes(
+            env_config,
+            skin,
+            policy,
+            bank_seed=config.bank_seed,
+            first=config.episode,
+            episodes=config.longest_of,
+            hold=config.hold,
+            on_step=lambda step, running: line.show(
+                f"{step / hz:.2f} s played, {running} still running"
+            ),
+        )
+        recording = max(recordings, key=lambda recording: len(recording.states))
+        frames = render_recording(
+            painter,
+            env_config,
+            skin,
+            recording,
+            max_seconds=config.seconds,
+            fps=config.fps,
+            on_picture=lambda done, total: line.show(f"{done} of {total} pictures"),
+        )
+    sheet = contact_sheet(frames)
+    save_film(config.out, frames, config.fps / config.slowdown)
+    save_picture(config.sheet_path, sheet)
+    line.finish()
+    last = frames[-1]
+    print(
+        f"episode {recording.row} of bank {config.bank_seed}: {last.time:.2f} s, "
+        f"{counted(last.num_avoided, 'ball')} avoided, ends with: {last.ending}; film "
+        f"{config.out}, contact sheet {config.sheet_path}"
+    )

@@ -1,0 +1,317 @@
+"""Make, convert and look at skins.
+
+egoskin skin place --num-sensors 64 --method poisson_disk --out skin.json
+egoskin skin import gentact.xacro --parent torso_link --out skin.json
+egoskin skin import *.csv --robot panda.urdf --out skin.json
+egoskin skin export skin.json --out gentact.csv
+egoskin skin show skin.json --picture skin.png
+"""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import torch
+import tyro
+from tensordict import TensorDict
+
+from egoskin.commands.errors import parse_subcommand
+from egoskin.progress import counted
+from egoskin.robots.config import ROBOTS, Primitive, RobotConfig, RobotName, read_robot
+from egoskin.robots.kinematics import LinkKinematics
+from egoskin.sensors import Skin
+from egoskin.sensors.skin.coverage import Coverage
+from egoskin.sensors.skin.gentact import load_gentact, save_gentact
+from egoskin.sensors.skin.mesh_surface import Meshes, meshes_in_folder, meshes_of_mjcf
+from egoskin.sensors.skin.placement import place_sensors
+from egoskin.viewer.film import check_path, save_picture
+from egoskin.viewer.offscreen import CameraConfig, Painter
+
+# So many sensors take long enough to say so.
+_MANY = 10_000
+# Sensors farther from the robot than this are told of [m].
+_FAR_OFF = 0.15
+# The picture: size of each of its two views [px], and how normals are drawn [m].
+_VIEW_SIZE = (640, 960)
+_NORMAL_LENGTH, _NORMAL_RADIUS = 0.08, 0.003
+_NORMAL_RGBA = (0.1, 0.95, 1.0, 1.0)
+
+
+def _pairs(values: Sequence[str], option: str) -> dict[str, str]:
+    """Return what options of the form ``name=value`` say."""
+    for value in values:
+        if not all(value.rpartition("=")[::2]):
+            raise ValueError(f"{option} takes name=value, got {value!r}")
+    return {v.rpartition("=")[0]: v.rpartition("=")[2] for v in values}
+
+
+def _meshes(path: Path, robot: RobotConfig) -> Meshes:
+    """Return the meshes of a folder or of a MuJoCo model."""
+    try:
+        if path.is_dir():
+            return meshes_in_folder(path, robot.links)
+        return meshes_of_mjcf(path)
+    except ImportError as error:
+        # It says which package is missing: the user's to mend, not a fault of ours.
+        raise ValueError(f"--meshes: {error}") from error
+
+
+@dataclass(frozen=True, kw_only=True)
+class Place:
+    """Place sensors at random on a robot's surface."""
+
+    out: Path
+    """Skin file to write (JSON)."""
+    robot: RobotName = "h1_2"
+    """Robot by name."""
+    num_sensors: int | None = 64
+    """Number of sensors; None: as many as the spacing lets in."""
+    method: Literal["area_uniform", "poisson_disk"] = "area_uniform"
+    """Independent of each other, or with distances kept between them."""
+    seed: int = 0
+    """Seed of the placement."""
+    links: tuple[str, ...] | None = None
+    """Links to cover; None: the robot's upper body."""
+    density: tuple[str, ...] = ()
+    """Relative density of sensors on links, LINK=WEIGHT, where LINK may be a shell
+    pattern; 1 on the others."""
+    spacing: float | None = None
+    """Least distance between sensors [m] (poisson_disk); None: as far as they go."""
+    stand_off: float = 0.0
+    """Height of the sensors above the surface [m]."""
+    meshes: Path | None = None
+    """Folder of meshes named after links, or MJCF with meshes; None: the robot's
+    primitives."""
+
+    def run(self) -> None:
+        """Write the skin."""
+        check_path(self.out, (".json",))
+        density = {}
+        for link, weight in _pairs(self.density, "--density").items():
+            try:
+                density[link] = float(weight)
+            except ValueError:
+                raise ValueError(
+                    f"--density: the weight of {link} must be a number, got {weight!r}"
+                ) from None
+        robot = ROBOTS[self.robot]
+        if self.num_sensors is None or self.num_sensors >= _MANY:
+            print("placing many sensors: this may take some minutes", flush=True)
+        skin = place_sensors(
+            robot,
+            self.num_sensors,
+            self.seed,
+            method=self.method,
+            links=self.links,
+            density=density or None,
+            spacing=self.spacing,
+            stand_off=self.stand_off,
+            meshes=None if self.meshes is None else _meshes(self.meshes, robot),
+        )
+        skin.save(self.out)
+        print(table(skin, str(self.out)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Import:
+    """Turn an export of GenTact's (CSV, xacro, URDF) into a skin file."""
+
+    files: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Files exported from GenTact; their sensors come one after the other."""
+    out: Path
+    """Skin file to write (JSON)."""
+    robot: str = "h1_2"
+    """Robot by name, or the path of its MJCF or URDF."""
+    scale: float | None = None
+    """Metres of one unit of the files; None: that of the dialect."""
+    link_map: tuple[str, ...] = ()
+    """Link for a part of a Parent path, for a whole path, a link of the URDF or the
+    name of a xacro's macro, PART=LINK."""
+    parent: str | None = None
+    """Link of the sensors in a file that names none (xacro)."""
+    skip_invalid: bool = False
+    """Leave out sensors that cannot be read for certain, and list them."""
+
+    def run(self) -> None:
+        """Write the skin."""
+        check_path(self.out, (".json",))
+        robot = _robot(self.robot)
+        skin = load_gentact(
+            self.files,
+            robot_name=robot.name,
+            links=robot.links,
+            primitives=_known_shapes(robot),
+            scale=self.scale,
+            link_map=_pairs(self.link_map, "--link-map"),
+            parent=self.parent,
+            skip_invalid=self.skip_invalid,
+        )
+        skin.save(self.out)
+        print(table(skin, str(self.out)))
+        for name in skin.provenance.get("unused_link_map", ()):
+            print(f"remark: no file needs {name!r} of --link-map")
+        for text in skin.provenance.get("left_out", ()):
+            print(f"left out: {text}")
+        files = skin.provenance.get("files", [skin.provenance])
+        extents = [f.get("distance_to_primitives", (0, 0)) for f in files]
+        off = max(abs(end) for extent in extents for end in extent)
+        if off > _FAR_OFF:
+            print(
+                f"warning: a sensor is {off:.2f} m off the robot's surface: is it the "
+                "right --scale and --link-map? Look at: egoskin skin "
+                f"show {self.out} --picture skin.png"
+            )
+
+
+def _robot(name: str) -> RobotConfig:
+    """Return the robot of a name or of a file."""
+    if name in ROBOTS:
+        return ROBOTS[name]
+    try:
+        return read_robot(name)
+    except FileNotFoundError:
+        raise ValueError(
+            f"--robot must be one of {', '.join(ROBOTS)}, or the path of an MJCF or "
+            f"URDF; there is no {name}"
+        ) from None
+
+
+def _known_shapes(robot: RobotConfig) -> list[Primitive]:
+    """Return the shapes of those links whose shapes are all primitives."""
+    shapes: list[Primitive] = []
+    for link in robot.links:
+        # Beside a shape that is unknown the others do not tell where the surface is.
+        with suppress(ValueError):
+            shapes += robot.primitives_on([link])
+    return shapes
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export:
+    """Write a skin file as GenTact's CSV."""
+
+    skin: Annotated[Path, tyro.conf.Positional]
+    """Skin file (JSON)."""
+    out: Path
+    """CSV file to write."""
+
+    def run(self) -> None:
+        """Write the CSV."""
+        check_path(self.out, (".csv",))
+        skin = Skin.load(self.skin)
+        lost = save_gentact(skin, self.out)
+        note = f"; GenTact's format does not hold {', '.join(lost)}" if lost else ""
+        print(f"{self.out}: {counted(len(skin), 'sensor')}{note}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Show:
+    """Say what is in a skin file, and draw it."""
+
+    skin: Annotated[Path, tyro.conf.Positional]
+    """Skin file (JSON)."""
+    picture: Path | None = None
+    """Picture to write, .png: the robot from the front and from behind."""
+
+    def run(self) -> None:
+        """Print the summary; write the picture."""
+        if self.picture is not None:
+            check_path(self.picture, (".png",))
+        skin = Skin.load(self.skin)
+        robot = ROBOTS.get(skin.robot)
+        if robot is not None:
+            skin.check_links(robot.links)
+        print(table(skin, str(self.skin)))
+        if self.picture is not None:
+            if robot is None:
+                raise ValueError(
+                    f"{self.skin} is for the robot {skin.robot!r}; pictures can be "
+                    f"drawn of {', '.join(ROBOTS)}"
+                )
+            save_picture(self.picture, views(robot, skin))
+
+
+def describe(coverage: Coverage | None) -> str:
+    """Return a sensor's type in words: its kind, and what is not the default."""
+    if coverage is None:
+        return "as configured"
+    default = type(coverage)()
+    changed = [
+        f"{f.name}={getattr(coverage, f.name)}"
+        for f in fields(coverage)
+        if getattr(coverage, f.name) != getattr(default, f.name)
+    ]
+    return " ".join([type(coverage).__name__.lower(), *changed])
+
+
+def table(skin: Skin, title: str) -> str:
+    """Return how many sensors of which type and range there are on each link."""
+
+    def distance(value: float) -> str:
+        return "as configured" if math.isnan(value) else f"{value:g} m"
+
+    kinds = [describe(c) for c in skin.coverage]
+    ranges = [distance(float(r)) for r in skin.range]
+    groups = Counter(zip(skin.links, kinds, ranges, strict=True))
+    rows = [("link", "sensors", "type", "range")]
+    rows += [(link, str(n), kind, r) for (link, kind, r), n in sorted(groups.items())]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = [
+        f"  {link:<{widths[0]}}  {number:>{widths[1]}}  {kind:<{widths[2]}}  {reach}"
+        for link, number, kind, reach in rows
+    ]
+    head = f"{title}: {counted(len(skin), 'sensor')} on links of {skin.robot}"
+    notes = [
+        "  " + textwrap.shorten(f"{name}: {value}", 100, placeholder=" ...")
+        for name, value in skin.provenance.items()
+    ]
+    return "\n".join([head, *lines, *notes])
+
+
+def views(robot: RobotConfig, skin: Skin) -> np.ndarray:
+    """Return the robot in its default pose with sensors and normals.
+
+    Returns:
+        Front and back view side by side, ``[height, width, 3]`` uint8.
+    """
+    joint_pos = torch.from_numpy(robot.default_joint_pos)
+    base = np.array([0.0, 0.0, robot.default_base_height])
+    state = TensorDict(
+        {
+            "base_pose": torch.tensor([*base, 1.0, 0.0, 0.0, 0.0]),
+            "joint_pos": joint_pos,
+            "object_pose": torch.zeros(0, 7),
+            "object_active": torch.zeros(0, dtype=torch.bool),
+        }
+    )
+    position, rotation = LinkKinematics(robot.chain, skin.links).poses_b(
+        joint_pos[None]
+    )
+    turn, shift = rotation[0].numpy(), base + position[0].numpy()
+    starts = shift + (turn @ skin.position[:, :, None])[..., 0]
+    ends = starts + _NORMAL_LENGTH * (turn @ skin.normal[:, :, None])[..., 0]
+    images = []
+    for azimuth in (0.0, 180.0):
+        camera = CameraConfig(distance=3.4, azimuth_deg=azimuth, elevation_deg=12.0)
+        painter = Painter(robot, skin, (), size=_VIEW_SIZE, camera=camera)
+        with painter:
+            painter.draw(state, time=0.0)
+            for start, end in zip(starts, ends, strict=True):
+                painter.draw_line(start, end, _NORMAL_RADIUS, _NORMAL_RGBA)
+            images.append(painter.image())
+    return np.concatenate(images, axis=1)
+
+
+def main(args: list[str]) -> None:
+    """Run the command."""
+    commands = {"place": Place, "import": Import, "export": Export, "show": Show}
+    config = parse_subcommand(commands, args)
+    config.run()

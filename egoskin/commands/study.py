@@ -1,0 +1,401 @@
+"""Run a study: many trainings that differ in a few fields, and what they tell.
+
+egoskin study plan findings --dir studies/findings    # what it will cost
+egoskin study run findings --dir studies/findings     # Ctrl-C; run goes on
+egoskin study status studies/findings
+egoskin study report studies/findings
+egoskin study slurm studies/findings > study.sh
+egoskin study adopt studies/findings runs/NAME        # it is one of them
+
+NAME is paper, paper-1000, findings, smoke, or a JSON file with the fields of
+egoskin.study.manifest.Study.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from egoskin.commands.errors import parse_subcommand
+from egoskin.evaluation.visibility import analyse
+from egoskin.parallel import available_cores
+from egoskin.progress import counted
+from egoskin.storage.serialization import check_counts, to_plain
+from egoskin.storage.tensor_file import write_file
+from egoskin.study.cost import Speed, cost, measure_all
+from egoskin.study.manifest import Manifest, load_study, resolve
+from egoskin.study.runner import LocalRunner, Progress, Runner, slurm_script
+from egoskin.study.shipped import STUDIES
+from egoskin.study.store import RunStatus, StudyFolder, duration
+
+# A server that many have.
+_MANY_CORES = 64
+# Environment steps of a study that is long enough to look for its best settings.
+_WORTH_MEASURING = 50_000_000
+# Cells whose warning differs for fewer hits than this see alike.
+_ALIKE = 0.05
+
+Name = Annotated[str, tyro.conf.Positional]
+Folder = Annotated[Path, tyro.conf.Positional]
+
+
+def find_study(name: str) -> Manifest:
+    """Return the manifest of a shipped study or of a file.
+
+    Raises:
+        ValueError: If there is none; the text lists the shipped ones.
+    """
+    if name in STUDIES:
+        return resolve(STUDIES[name])
+    if not name.endswith(".json"):
+        raise ValueError(
+            f"no study {name!r}; there are {', '.join(STUDIES)}, or name a .json file"
+        )
+    if not Path(name).is_file():
+        raise ValueError(f"there is no file {name}")
+    return resolve(load_study(Path(name)))
+
+
+def check_packages(what: str, extra: str, *packages: str) -> None:
+    """Raise ValueError if a package is missing that something needs."""
+    for package in packages:
+        if importlib.util.find_spec(package) is None:
+            raise ValueError(
+                f"{what} needs {package}: `pip install 'egoskin[{extra}]'`"
+            )
+
+
+def fastest(speeds: list[Speed]) -> Speed:
+    """Print how fast runs are side by side; return the fastest way."""
+    for speed in speeds:
+        print(f"  {speed}")
+    return max(speeds, key=lambda speed: speed.per_s)
+
+
+def _tell(text: str) -> None:
+    print(text, flush=True)
+
+
+def check_parent(folder: Path) -> None:
+    """Raise ValueError if the folder that a study is to be in is not there."""
+    if not folder.absolute().parent.is_dir():
+        raise ValueError(f"--dir: there is no folder {folder.absolute().parent}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """Say what a study runs and costs; write its manifest, or add to it."""
+
+    name: Name
+    """Study: paper, paper-1000, findings, smoke, or a JSON file."""
+    dir: Path | None = None
+    """Folder to begin the study in, or to add cells and seeds to; None: only tell."""
+    steps_per_s: float | None = None
+    """Environment steps per second and core; None: measured now, in half a minute for
+    each way to share the cores among runs."""
+    coverage: bool = False
+    """Also say what each coverage and range sees before any training (minutes)."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a speed that is none."""
+        if self.steps_per_s is not None and not self.steps_per_s > 0:
+            raise ValueError(f"steps_per_s must be positive, got {self.steps_per_s}")
+
+    def execute(self) -> None:
+        """Tell, and write the manifest."""
+        if self.dir is not None:
+            check_parent(self.dir)
+        manifest = find_study(self.name)
+        if self.dir is not None:
+            manifest = StudyFolder(self.dir).plan(manifest)
+        describe(manifest)
+        per_s, source, cores = self.steps_per_s, "as given", available_cores()
+        if per_s is None:
+            run = manifest.runs[0]
+            best = fastest(measure_all(run, cores, _tell))
+            per_s = best.per_s / cores
+            source = f"measured on {run.cell.name}; full ray grids take longer"
+        total = cost(manifest, per_s)
+        print(
+            f"{total.runs} runs, {total.frames / 1e6:,.1f} M frames, "
+            f"{total.core_s / 3600:,.1f} core-hours ({per_s:,.0f} steps/s and core, "
+            f"{source}):\n"
+            f"  {duration(total.wall_s(cores))} on the {counted(cores, 'core')} here, "
+            f"{duration(total.wall_s(_MANY_CORES))} on {_MANY_CORES}; evaluation adds "
+            f"minutes a run\n"
+            f"  {total.disk / 1e9:,.2f} GB of disk"
+        )
+        if self.coverage:
+            seen = what_is_seen(manifest)
+            if self.dir is not None:
+                text = json.dumps(seen, indent=2, allow_nan=False) + "\n"
+                write_file(self.dir / "coverage.json", text.encode())
+        if self.dir is not None:
+            print(f"manifest {StudyFolder(self.dir).manifest_path}")
+
+
+def describe(manifest: Manifest) -> None:
+    """Print what a study runs."""
+    print(f"study {manifest.study}: {manifest.purpose}")
+    for name, value in manifest.not_default().items():
+        print(f"  not the default: {name.removeprefix('env.')} = {value}")
+    for cell in manifest.cells:
+        own = manifest.overrides(cell).items()
+        text = ", ".join(f"{k.removeprefix('env.')}={v}" for k, v in own)
+        print(f"  {cell.name:<32} {text or 'nothing else'}")
+    seeds = ", ".join(map(str, manifest.seeds))
+    print(
+        f"  seeds {seeds}; judged on standard {manifest.evaluation.standard}, throw "
+        f"set {manifest.evaluation.throw_set} of {manifest.evaluation.episodes}"
+    )
+
+
+def what_is_seen(manifest: Manifest) -> dict[str, Any]:
+    """Print and return what the coverages and ranges of a study see of thrown balls."""
+    sensors = [
+        c.config.env.sensor for c in manifest.cells if c.config.env.sensor.uses_skin
+    ]
+    if not sensors:
+        print("no cell has a skin: nothing is seen")
+        return {}
+    coverages = {s.coverage: s.ray if s.coverage == "ray" else s.field for s in sensors}
+    base = manifest.base.env
+    analysis = analyse(
+        base.robot_config,
+        base.skin.build(base.robot_config),
+        coverages,
+        sorted({s.range for s in sensors}),
+        base.task.throws,
+        timestep=base.task.physics.timestep,
+        control_period=1 / base.task.physics.control_hz,
+    )
+    report = analysis.report()
+    print("before any training: of the thrown balls that hit a standing robot")
+    for cell, row in zip(analysis.cells, report["cells"], strict=True):
+        warning = row["warning"]
+        times = [warning[key] for key in ("5%", "median", "95%")]
+        text = " / ".join("-" if t is None else f"{1e3 * t:.0f}" for t in times)
+        seen = "-" if warning["seen"] is None else f"{warning['seen']:.1%}"
+        print(f"  {cell!s:<14} sees {seen:>6}, {text} ms before (5 / 50 / 95 %)")
+    shares = report["differing_share"] or []
+    for a, one in enumerate(analysis.cells):
+        for b, other in enumerate(analysis.cells[:a]):
+            if shares and shares[a][b] < _ALIKE:
+                print(f"  {other} and {one} see alike")
+    return {"config": to_plain(base), **report}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run:
+    """Run a study on this machine, or go on with it; runners may share a folder."""
+
+    name: Annotated[str | None, tyro.conf.Positional] = None
+    """Study to begin or add to; None: what the folder's manifest says."""
+    dir: Path
+    """Folder of the study."""
+    on: Literal["local", "ray"] = "local"
+    """Where: the cores of this machine, or an existing Ray cluster (extra `ray`)."""
+    ray_address: str = "auto"
+    """Address of the Ray cluster, ``host:port``; auto: the one of this machine."""
+    parallel: int | None = None
+    """Runs side by side; None: as many as fill the cores."""
+    cores_per_run: int | None = None
+    """Workers and learner threads of each run; None: measured, half a minute for each
+    choice, unless the whole study is short (results do not depend on it)."""
+    tries: int = 3
+    """How often a run that fails is tried, in all."""
+    again: bool = False
+    """Whether runs that failed too often are tried again."""
+    nice: int = 5
+    """Niceness of the runs."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for counts that are none."""
+        check_counts(self, "parallel", "cores_per_run", "tries")
+        if not 0 <= self.nice < 20:
+            raise ValueError(f"nice must be from 0 to 19, got {self.nice}")
+
+    def execute(self) -> None:
+        """Run what is left to be run."""
+        check_parent(self.dir)
+        folder = StudyFolder(self.dir)
+        if self.name is not None:
+            folder.plan(find_study(self.name))
+        manifest = folder.manifest()
+        if self.again:
+            folder.forget_failures()
+        live = sys.stdout.isatty()
+
+        def show(text: str) -> None:
+            start, end = ("\r", "\x1b[K") if live else ("", "\n")
+            print(f"{start}{text}", end=end, flush=True)
+
+        kind, cores = self._where()
+        per_run = self.cores_per_run or self._cores_per_run(folder, cores)
+        runner = kind(
+            folder,
+            parallel=self.parallel or max(cores // per_run, 1),
+            cores_per_run=per_run,
+            tries=self.tries,
+            nice=self.nice,
+            show=show,
+        )
+        status = runner.run()
+        print("\r\x1b[K" * live, end="")
+        print_status(manifest, status)
+        if any(each.state != "done" for each in status):
+            raise SystemExit(1)
+        print(f"done; now: egoskin study report {self.dir}")
+
+    def _cores_per_run(self, folder: StudyFolder, cores: int) -> int:
+        """Return with how many cores for each run this machine does most."""
+        status = folder.status(folder.manifest())
+        left = [each for each in status if each.state != "done"]
+        frames = sum(each.run.end - each.frames for each in left)
+        if self.on != "local" or self.parallel or frames < _WORTH_MEASURING:
+            return 1
+        return fastest(measure_all(left[0].run, cores, _tell)).cores_per_run
+
+    def _where(self) -> tuple[type[Runner], int]:
+        """Return what runs the study, and the cores it has."""
+        if self.on == "local":
+            return LocalRunner, available_cores()
+        check_packages("--on ray", "ray", "ray")
+        # Only here: nothing else needs it.
+        from egoskin.study.ray_runner import RayRunner, connect
+
+        return RayRunner, connect(self.ray_address)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Status:
+    """Say how far a study is, from its folder alone."""
+
+    dir: Folder
+    """Folder of the study."""
+
+    def execute(self) -> None:
+        """Print a table by cell and seed."""
+        folder = StudyFolder(self.dir)
+        manifest = folder.manifest()
+        print_status(manifest, folder.status(manifest))
+
+
+def print_status(manifest: Manifest, status: list[RunStatus]) -> None:
+    """Print how far each run is, by cell and seed, and what has failed."""
+    told = {(each.run.cell.name, each.run.seed): entry(each) for each in status}
+    width = max(len(cell.name) for cell in manifest.cells)
+    wide = max(map(len, told.values())) + 2
+    seeds = "".join(f"{f'seed {seed}':<{wide}}" for seed in manifest.seeds)
+    print(f"{'':{width}}  {seeds.rstrip()}")
+    for cell in manifest.cells:
+        row = "".join(f"{told[cell.name, seed]:<{wide}}" for seed in manifest.seeds)
+        print(f"{cell.name:{width}}  {row.rstrip()}")
+    for each in status:
+        if each.failure is not None:
+            print(
+                f"{each.run.name}: failed {counted(each.failure.tries, 'time')}, "
+                f"last: {each.failure.error}"
+            )
+    print(Progress.of(status))
+
+
+def entry(status: RunStatus) -> str:
+    """Return how far a run is, in a few words."""
+    share = status.frames / status.run.end
+    match status.state:
+        case "done":
+            return "done" if status.success is None else f"done {status.success:.1%}"
+        case "running":
+            return f"{share:.0%}, {duration(status.left_s)} left"
+        case "failed":
+            return f"FAILED at {share:.0%}"
+        case "begun":
+            return f"stopped at {share:.0%}"
+        case _:
+            return "-"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """Write report.md, index.html, runs.csv and the figures of a study."""
+
+    dir: Folder
+    """Folder of the study."""
+    out: Path | None = None
+    """Folder to write to; None: report/ in the study's."""
+
+    def execute(self) -> None:
+        """Write the report."""
+        check_packages("a report", "study", "scipy", "matplotlib")
+        # Only here: the rest of this script needs neither.
+        from egoskin.study.report import write_report
+
+        folder = StudyFolder(self.dir)
+        out = self.out or self.dir / "report"
+        if not out.absolute().parent.is_dir():
+            raise ValueError(f"--out: there is no folder {out.absolute().parent}")
+        write_report(folder, out)
+        print(f"{out / 'report.md'}, {out / 'index.html'}, {out / 'runs.csv'}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Slurm:
+    """Print a job array for Slurm whose elements share the work on a study."""
+
+    dir: Folder
+    """Folder of the study, which all nodes see."""
+    cores: int = 16
+    """Cores of each element, and runs side by side."""
+    elements: int | None = None
+    """Elements of the array; None: as many as have a run for each core."""
+    hours: float = 24.0
+    """Time limit of each [h]."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for counts that are none."""
+        check_counts(self, "cores", "elements")
+        if not self.hours > 0:
+            raise ValueError(f"hours must be positive, got {self.hours}")
+
+    def execute(self) -> None:
+        """Print the script."""
+        folder = StudyFolder(self.dir)
+        manifest = folder.manifest()
+        # Slurm writes its logs there, and makes no folder.
+        (self.dir / "logs").mkdir(exist_ok=True)
+        elements = self.elements or -(-len(manifest.runs) // self.cores)
+        path = self.dir.absolute()
+        shared: dict[str, Any] = {"cores": self.cores, "elements": elements}
+        print(slurm_script(manifest, path, hours=self.hours, **shared), end="")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Adopt:
+    """Take runs into a study that were made before, by links to their folders."""
+
+    dir: Folder
+    """Folder of the study."""
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Run folders; which of the study's each is follows from its configuration."""
+
+    def execute(self) -> None:
+        """Link to the runs."""
+        if not self.runs:
+            raise ValueError("name the run folders to adopt")
+        folder = StudyFolder(self.dir)
+        manifest = folder.manifest()
+        for source in self.runs:
+            print(f"{source} is {folder.adopt(manifest, source).name}")
+
+
+def main(args: list[str]) -> None:
+    """Run the command."""
+    kinds = {k.__name__.lower(): k for k in (Plan, Run, Status, Report, Slurm, Adopt)}
+    parse_subcommand(kinds, args, __doc__).execute()

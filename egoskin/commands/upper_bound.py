@@ -1,0 +1,142 @@
+"""Ask what the body could still do when a ball is in reach of the skin.
+
+egoskin upper-bound field_proximity
+egoskin upper-bound runs/NAME --throws 64 --ball 2 --json ceiling.json
+
+The first ball of each episode of a bank (--ball 2: the second) is played by a policy
+until it is in reach of a sensor. From there on actions are searched that, added to the
+policy's, avoid the ball, and then that it does not fall. What the search finds the body
+and the warning time allow (it may miss what is possible); what the policy misses of it
+is a matter of learning, or of what its sensors do not tell.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from torch import Tensor
+
+from egoskin.evaluation.throw_set import standard_task
+from egoskin.evaluation.upper_bound import Ceiling, Outcome, SearchConfig, find_ceiling
+from egoskin.policies.policy import load_policy
+from egoskin.progress import counted
+from egoskin.rng import check_seed
+from egoskin.storage.files import check_output
+from egoskin.storage.serialization import check_counts
+
+# Bounds of the groups by height aimed at [m].
+BOUNDS = (0.0, 0.7, 0.9, 1.1, 1.3, 2.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CeilingConfig:
+    """Search the actions with which the balls of a bank would be avoided."""
+
+    policy: Annotated[Path, tyro.conf.Positional]
+    """Run folder (its latest checkpoint), checkpoint, policy file, or the name of a
+    policy that comes with the package."""
+    bank_seed: int = 0
+    """Seed of the bank of standard throws."""
+    throws: int = 32
+    """Episodes of the bank."""
+    ball: int = 1
+    """Which ball of each episode; none is thrown after it."""
+    reach: float = 2.0
+    """Distance from a sensor to the ball's surface at which the search starts [m]."""
+    search: SearchConfig = field(default_factory=SearchConfig)
+    """The search."""
+    json: Path | None = None
+    """File to write the figures to."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for values with which nothing can be searched."""
+        check_seed(self.bank_seed, "bank_seed")
+        check_counts(self, "throws", "ball")
+        if not self.reach > 0:
+            raise ValueError(f"reach must be positive, got {self.reach}")
+        check_output(self.json, "--json")
+
+
+def groups(result: Ceiling) -> list[dict[str, float | int]]:
+    """Return counts by height aimed at: throws, and what becomes of them."""
+    rows = []
+    for low, high in zip(BOUNDS, BOUNDS[1:], strict=False):
+        member = (result.height >= low) & (result.height < high)
+
+        def count(which: Tensor, member: Tensor = member) -> int:
+            return int((which & member).sum())
+
+        rows.append(
+            {
+                "from_m": low,
+                "to_m": high,
+                "throws": int(member.sum()),
+                "policy_avoids": count(result.policy.avoided),
+                "policy_stands": count(result.policy.stood),
+                "search_avoids": count(result.best.avoided),
+                "search_stands": count(result.best.stood),
+            }
+        )
+    return rows
+
+
+def table(result: Ceiling, title: str) -> str:
+    """Return the counts as text."""
+    lines = [
+        title,
+        f"  {'':<16} {'':>6}  {'policy':^17}  {'best found':^17}",
+        f"  {'height aimed at':<16} {'throws':>6}  {'avoids':>8} {'and stands':>10}"
+        f"  {'avoids':>8} {'and stands':>10}",
+    ]
+    rows = groups(result)
+    total = {key: sum(row[key] for row in rows) for key in rows[0]}
+    for row in [*rows, total]:
+        name = "all" if row is total else f"{row['from_m']:g} to {row['to_m']:g} m"
+        lines.append(
+            f"  {name:<16} {row['throws']:>6}  {row['policy_avoids']:>8} "
+            f"{row['policy_stands']:>10}  {row['search_avoids']:>8} "
+            f"{row['search_stands']:>10}"
+        )
+    return "\n".join(lines)
+
+
+def main(args: list[str]) -> None:
+    """Run the command."""
+    config = tyro.cli(CeilingConfig, args=args)
+    policy = load_policy(config.policy)
+    began = time.perf_counter()
+
+    def show(iteration: int, best: Outcome) -> None:
+        print(
+            f"iteration {iteration} of {config.search.iterations}, "
+            f"{time.perf_counter() - began:.0f} s: of {len(best.avoided)} throws "
+            f"{int(best.avoided.sum())} avoided, {int(best.stood.sum())} and standing",
+            file=sys.stderr,
+            flush=True,
+        )
+
+    result = find_ceiling(
+        policy,
+        standard_task(policy.env_config),
+        config.search,
+        bank_seed=config.bank_seed,
+        throws=config.throws,
+        reach=config.reach,
+        ball=config.ball,
+        on_iteration=show,
+    )
+    title = (
+        f"{config.policy}: {policy.policy_spec.frames:,} frames; "
+        f"{counted(len(result.height), 'throw')} (ball {config.ball} of the episodes) "
+        f"of bank {config.bank_seed} that came within {config.reach:g} m of a sensor"
+    )
+    print(table(result, title))
+    if config.json is not None:
+        content = {"by_height_m": groups(result)}
+        config.json.write_text(json.dumps(content, indent=2) + "\n")

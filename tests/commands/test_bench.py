@@ -1,0 +1,65 @@
+"""Benchmarks: their rows, and that they leave alone what they measure."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from calling import succeed
+
+
+def test_bench_loop_gives_its_rows(tmp_path: Path):
+    succeed(
+        *("bench", "loop"),
+        *("--num-envs", "32", "--num-workers", "1", "--warmup", "0", "--rounds", "1"),
+        *("--json", tmp_path / "loop.json"),
+    )
+    rows = json.loads((tmp_path / "loop.json").read_text())["rows"]
+    by_name = {row["name"]: row for row in rows}
+    speeds = [
+        "raw",
+        "task",
+        "env",
+        "sensors",
+        "policy",
+        "train_field",
+        "train_ray_grid",
+    ]
+    others = [
+        f"{name}_{kind}" for name in ("memory", "serial") for kind in ("field", "ray")
+    ]
+    for name in [*speeds, *others]:
+        assert by_name[name]["value"] > 0
+    assert rows[0]["name"] == "raw"
+    assert rows[0]["ratio"] == 1.0
+    # The parts of the wall time are what the whole of a step takes.
+    parts = [row["value"] for row in rows if row["name"].endswith("_wall")]
+    assert len(parts) == 7
+    assert sum(parts) == pytest.approx(1e6 / by_name["train_field"]["value"])
+
+
+def test_bench_gradients_compares_rollouts_and_leaves_the_run_alone(
+    trained: Path, tmp_path: Path
+):
+    before = {p: p.read_bytes() for p in trained.rglob("*") if p.is_file()}
+    args = ("--run", trained, "--rollouts", "3", "--json", tmp_path / "g.json")
+    succeed("bench", "gradients", *args)
+    rows = json.loads((tmp_path / "g.json").read_text())["rows"]
+    # The run's own decay comes first.
+    names = [row["name"] for row in rows]
+    assert names[:3] == ["lambda_0.8", "lambda_0", "lambda_0.5"]
+    assert rows[0]["ratio"] == 1.0
+    assert all(-1 < row["value"] < 1 for row in rows)
+    assert {p: p.read_bytes() for p in trained.rglob("*") if p.is_file()} == before
+
+
+def test_bench_accuracy_compares_two_rates(tmp_path: Path):
+    args = ("--throws", "6", "--json", tmp_path / "accuracy.json")
+    succeed("bench", "accuracy", *args)
+    rows = json.loads((tmp_path / "accuracy.json").read_text())["rows"]
+    by_name = {row["name"]: row for row in rows}
+    # Standing shows the same forces; the ball is met within a control step.
+    assert by_name["stand_floor_force"]["ratio"] < 0.01
+    assert 0 < by_name["impact_time"]["ratio"] < 1

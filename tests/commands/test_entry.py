@@ -1,0 +1,144 @@
+"""The command `egoskin`: help at once, the nearest name, and scripts that are it."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import resource
+import runpy
+import subprocess
+import sys
+from importlib import import_module
+from importlib.metadata import EntryPoint
+
+import pytest
+from setuptools.config.pyprojecttoml import read_configuration
+
+from calling import SCRIPTS, call, fail
+from egoskin import __version__, commands
+from egoskin.commands import COMMANDS
+from egoskin.commands.train import main as train
+
+ROOT = SCRIPTS.parent
+# Scripts that do what no installed package needs, and examples to be read.
+OWN = {"fit_shell", "results", "reuse_gymnasium", "reuse_recording", "reuse_urdf_arm"}
+
+
+def egoskin(monkeypatch, *args: str) -> None:
+    """Call the function that `[project.scripts]` names, as the command."""
+    project = read_configuration(ROOT / "pyproject.toml")["project"]
+    name, group = "egoskin", "console_scripts"
+    monkeypatch.setattr(sys, "argv", [name, *args])
+    EntryPoint(name, project["scripts"][name], group).load()()
+
+
+def test_help_comes_at_once_and_lists_the_commands():
+    before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
+    done = subprocess.run(
+        [sys.executable, "-X", "importtime", "-m", "egoskin", "--help"],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=ROOT,
+    )
+    for name, text in COMMANDS.items():
+        assert re.search(rf"^  {name} +{text}$", done.stdout, re.MULTILINE)
+    imported = {line.split()[-1].split(".")[0] for line in done.stderr.splitlines()}
+    assert "egoskin" in imported
+    assert not imported & {"torch", "numpy", "mujoco", "torchrl", "tyro"}
+    assert resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before < 1
+
+
+@pytest.mark.parametrize("args", [(), ("-h",), ("--help",)])
+def test_without_a_command_there_is_help(args, monkeypatch, capsys):
+    egoskin(monkeypatch, *args)
+    assert capsys.readouterr().out.startswith("usage: egoskin COMMAND")
+
+
+def test_the_command_says_its_version(monkeypatch, capsys):
+    egoskin(monkeypatch, "--version")
+    assert capsys.readouterr().out == f"egoskin {__version__}\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "nearest"),
+    [
+        ("evalute", "evaluate"),
+        ("upperbound", "upper-bound"),
+        ("--hepl", "--help"),
+        # Names of scripts, and of commands as they once were.
+        ("render", "film"),
+        ("ppo", "train"),
+        ("ceiling", "upper-bound"),
+    ],
+)
+def test_a_mistyped_command_is_answered_with_the_nearest(
+    name, nearest, monkeypatch, capsys
+):
+    with pytest.raises(SystemExit) as ended:
+        egoskin(monkeypatch, name)
+    assert ended.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"no command {name!r}, did you mean {nearest!r}?" in line
+
+
+def test_a_name_like_none_lists_all(monkeypatch, capsys):
+    with pytest.raises(SystemExit):
+        egoskin(monkeypatch, "xyz")
+    error = capsys.readouterr().err
+    assert "did you mean" not in error
+    assert ", ".join(COMMANDS) in error
+
+
+@pytest.mark.parametrize(
+    ("args", "nearest"),
+    [
+        (("study", "plna"), "'plan'"),
+        (("skin", "improt"), "'import'"),
+        (("bench", "lop"), "'loop'"),
+        (("evaluate", "blind", "--epsiodes", "3"), "--episodes"),
+        (("train", "--sensor.signl", "binary"), "--sensor.signal"),
+    ],
+)
+def test_a_mistyped_subcommand_or_option_is_answered_with_the_nearest(args, nearest):
+    assert nearest in fail(*args)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_help_that_names_it(name):
+    done = call(name, "--help")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith(f"usage: egoskin {name} ")
+
+
+def test_a_command_runs_as_if_it_were_a_program(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(commands, "end_quietly", lambda: None)
+    egoskin(monkeypatch, "skin", "place", "--num-sensors", "2", "--out", "a.json")
+    assert "a.json: 2 sensors" in capsys.readouterr().out
+    assert sys.argv[0] == "egoskin skin"
+
+
+def test_a_script_is_a_command_or_has_a_reason():
+    found = {}
+    for path in SCRIPTS.glob("*.py"):
+        text = path.read_text()
+        body = re.fullmatch(
+            r'"""[^"]+"""\n\nfrom __future__ import annotations\n\n'
+            r"from egoskin.commands import run\n\n"
+            r'if __name__ == "__main__":\n    run\("([\w-]+)"\)\n',
+            text,
+        )
+        if body:
+            found[path.stem] = body[1]
+    assert set(found.values()) == set(COMMANDS) - {"train"}
+    assert {path.stem for path in SCRIPTS.glob("*.py")} == {*found, "ppo", *OWN}
+    for name in found.values():
+        module = import_module(f"egoskin.commands.{name.replace('-', '_')}")
+        assert callable(module.main)
+
+
+def test_the_main_job_is_the_same_code_as_the_command():
+    # The script is there to be read and copied, so it holds the code itself.
+    script = runpy.run_path(str(SCRIPTS / "ppo.py"))["main"]
+    assert inspect.getsource(script) == inspect.getsource(train)

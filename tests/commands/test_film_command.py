@@ -1,0 +1,106 @@
+"""`egoskin film`: a film and a sheet, of the episode that is asked for; bad input."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from PIL import Image
+
+from calling import SCRIPTS, call, fail
+from egoskin.envs.throws import Thrower
+from egoskin.evaluation.throw_set import play_bank, throw_seed
+from egoskin.make import EnvConfig
+from egoskin.sensors import Skin
+
+
+def film(*args: str) -> str:
+    """Return what the command prints."""
+    done = call("film", *args)
+    if "OpenGL" in done.stderr:
+        pytest.skip(done.stderr)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_it_writes_a_film_and_a_sheet(tmp_path: Path):
+    out = tmp_path / "a.gif"
+    args = ("--out", str(out), "--seconds", "0.1", "--size", "160", "90")
+    assert "cut" in film(*args)
+    with Image.open(out) as made, Image.open(tmp_path / "a.png") as sheet:
+        assert made.size == (160, 90)
+        assert sheet.width > sheet.height
+    assert {p.name for p in tmp_path.iterdir()} == {"a.gif", "a.png"}
+
+
+def test_a_film_is_of_the_longest_of_the_episodes_that_are_evaluated(
+    skin: Skin, tmp_path: Path
+):
+    bank = {"bank_seed": 3, "episodes": 6, "num_workers": 1, "hold": True}
+    config = EnvConfig()
+    thrower = Thrower(config.task.throws, config.robot_config, 1 / 120)
+    row = torch.arange(6)
+    delay = thrower.first_delay(throw_seed(config, 3), row, row * 0)
+    ages = play_bank(None, config, skin, **bank).steps + (60 * delay).round().long()
+    longest = 2 + int(ages[2:].argmax())
+    args = ["--out", str(tmp_path / "a.gif"), "--size", "160", "90", "--fps", "4"]
+    args += ["--bank-seed", "3", "--episode", "2", "--longest-of", "4", "--hold"]
+    length = int(ages[longest]) / 60
+    expected = f"episode {longest} of bank 3: {length:.2f} s, 0 balls avoided, ends "
+    assert expected + "with: hit" in film(*args)
+
+
+@pytest.mark.parametrize(
+    ("args", "text"),
+    [
+        (["--out", "a.avi"], "must end in .mp4 or .gif"),
+        (["--out", "nowhere/a.mp4"], "no folder nowhere"),
+        (["--sheet", "a.jpg"], "must end in .png"),
+        (["--slowdown", "0"], "slowdown must be in (0, 100]"),
+        (["--slowdown", "inf"], "slowdown must be in (0, 100]"),
+        (["--bank-seed", "-1"], "bank_seed must be in"),
+        (["--episode", "-1"], "episode must not be negative"),
+        (["--longest-of", "0"], "longest_of must be at least 1"),
+        (["--fps", "61"], "fps must be in"),
+        (["--standard", "3"], "--standard"),
+        (["nothing.safetensors"], "nothing.safetensors"),
+        (["nothing", "--sensor.range", "1"], "a policy brings its own"),
+    ],
+)
+def test_bad_input_is_an_error_and_writes_nothing(
+    args: list, text: str, tmp_path: Path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    assert text in fail("film", *args)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "environment",
+    [
+        # PyOpenGL bound to another platform, as if EGL were not installed.
+        {"MUJOCO_GL": "", "PYOPENGL_PLATFORM": "osmesa"},
+        {"MUJOCO_GL": "no_such_backend"},
+    ],
+)
+def test_without_opengl_it_says_what_to_install(
+    tmp_path: Path, environment: dict[str, str]
+):
+    (tmp_path / "a.mp4").write_text("old")
+    # MuJoCo chooses its OpenGL when it is imported: in a process of its own.
+    done = subprocess.run(
+        [sys.executable, SCRIPTS / "render.py", "--out", "a.mp4", "--seconds", "0.1"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=200,
+        env={**os.environ, **environment},
+    )
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert "apt-get install libegl1" in done.stderr
+    assert (tmp_path / "a.mp4").read_text() == "old"
