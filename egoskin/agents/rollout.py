@@ -62,6 +62,7 @@ def collect(
     following = _value(agent, _readable(agent, root))
     next_value = torch.cat((rollout["state_value"][1:], following[None]))
     timed_out = torch.cat(ended)
+    assert isinstance(timed_out, TensorDict)
     if len(timed_out):
         next_value[_timed_out(rollout)] = _value(agent, timed_out)
     rollout["next_state_value"] = next_value
