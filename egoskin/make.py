@@ -21,6 +21,7 @@ from torchrl.envs import (
 from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
 from egoskin.envs.observations import HideObjects, Oracle, Privileged, Proprioception
 from egoskin.envs.standards import standard_of
+from egoskin.envs.state import STATE
 from egoskin.parallel import WorkerPool, default_num_workers
 from egoskin.robots.config import ROBOTS, RobotConfig, RobotName
 from egoskin.sensors import History, Skin
@@ -29,24 +30,8 @@ from egoskin.sensors.geometry import STATE_KEYS
 from egoskin.storage.tensor_file import part, prefixed
 from egoskin.transform import StatefulTransform
 
-# Raw state that neither the networks nor the metrics read: it stays in the workers.
-_RAW_KEYS = (
-    "base_pose",
-    "base_lin_vel_w",
-    "base_ang_vel_b",
-    "joint_pos",
-    "joint_vel",
-    "object_pose",
-    "object_lin_vel_w",
-    "object_active",
-    "tactile",
-    "displacement_w",
-    "previous_action",
-    "power",
-    "torque_saturation",
-    "object_hit",
-    "object_arrived",
-)
+# What neither the networks nor the metrics read.
+_RAW_KEYS = [key.name for key in STATE if key.stays_in_worker]
 MASK_ALL = ("all",)
 """Mask of all sensors, and of what an oracle is told."""
 # What the networks read of the transforms' results; the others stay as well.

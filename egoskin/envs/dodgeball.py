@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from dataclasses import dataclass, field
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from egoskin.envs.physics.mujoco import (
@@ -18,6 +19,7 @@ from egoskin.envs.physics.mujoco import (
     build_scene,
 )
 from egoskin.envs.rewards import TERMS, RewardConfig, reward_terms
+from egoskin.envs.state import STATE, state_spec, state_table
 from egoskin.envs.throws import ThrowConfig, Thrower
 from egoskin.rng import Stream, uniform
 from egoskin.robots.config import RobotConfig
@@ -94,34 +96,7 @@ class DodgeballEnv(EnvBase):
     **Observation**: the environment assembles none; it gives the state, from which
     transforms (`egoskin.make`) make what the actor and the critic see.
 
-    ====================== =============== ==========================================
-    key                    shape           content
-    ====================== =============== ==========================================
-    ``base_pose``          ``[B, 7]``      position [m], quaternion (w, x, y, z)
-    ``base_lin_vel_w``     ``[B, 3]``      velocity of the base's origin [m/s]
-    ``base_ang_vel_b``     ``[B, 3]``      angular velocity [rad/s]
-    ``joint_pos``          ``[B, J]``      joint positions [rad]
-    ``joint_vel``          ``[B, J]``      joint velocities [rad/s]
-    ``object_pose``        ``[B, O, 7]``   position [m], quaternion, in the world
-    ``object_lin_vel_w``   ``[B, O, 3]``   velocity of the objects [m/s]
-    ``object_active``      ``[B, O]``      whether the object is in play
-    ``tactile``            ``[B, L]``      whether each link touched ball or floor
-    ``displacement_w``     ``[B, 2]``      planar way from the start [m]
-    ``previous_action``    ``[B, J]``      action of the step before (0 at the start)
-    ``reward_terms``       ``[B, R]``      the weighted terms, in the order of TERMS
-    ``hit``                ``[B, 1]``      a ball touched the robot
-    ``fallen``             ``[B, 1]``      a link other than a foot touched the floor
-    ``diverged``           ``[B, 1]``      the simulation failed
-    ``self_contact``       ``[B, 1]``      the robot touched itself
-    ``power``              ``[B, 1]``      mechanical power of the joints [W]
-    ``torque_saturation``  ``[B, 1]``      share of the joints at their torque limit
-    ``object_hit``         ``[B, O]``      whether the ball touched the robot
-    ``object_arrived``     ``[B, O]``      ... or has passed, since it was thrown
-    ``balls_arrived``      ``[B, 2]``      first ball, later balls: arrived so far
-    ``balls_avoided``      ``[B, 2]``      ... of which without touching
-    ``episode_step``       ``[B, 1]``      age of the episode in control steps
-    ``first_throw_step``   ``[B, 1]``      age at which its first ball is thrown
-    ====================== =============== ==========================================
+    STATE
 
     **Reward**: the sum of ``reward_terms``; see `egoskin.envs.rewards`.
 
@@ -195,51 +170,22 @@ class DodgeballEnv(EnvBase):
             "avoided": torch.zeros(num_envs, 2),
             "previous_action": torch.zeros(num_envs, len(robot.joints)),
         }
-        self._make_specs(num_envs, balls)
+        self._sizes = {
+            "J": len(robot.joints),
+            "L": len(robot.links),
+            "O": balls,
+            "R": len(TERMS),
+        }
+        self._make_specs(num_envs)
 
-    def _make_specs(self, n: int, balls: int) -> None:
-        joints, links = len(self.robot.joints), len(self.robot.links)
-
-        def unbounded(*shape: int) -> Unbounded:
-            return Unbounded(shape=torch.Size((n, *shape)), dtype=torch.float32)
-
-        def flag(*shape: int) -> Binary:
-            return Binary(shape=torch.Size((n, *shape)), dtype=torch.bool)
-
-        def age(most: int) -> Bounded:
-            return Bounded(0, most, shape=torch.Size((n, 1)), dtype=torch.int64)
-
-        self.observation_spec = Composite(
-            base_pose=unbounded(7),
-            base_lin_vel_w=unbounded(3),
-            base_ang_vel_b=unbounded(3),
-            joint_pos=unbounded(joints),
-            joint_vel=unbounded(joints),
-            object_pose=unbounded(balls, 7),
-            object_lin_vel_w=unbounded(balls, 3),
-            object_active=flag(balls),
-            tactile=flag(links),
-            displacement_w=unbounded(2),
-            previous_action=unbounded(joints),
-            reward_terms=unbounded(len(TERMS)),
-            hit=flag(1),
-            fallen=flag(1),
-            diverged=flag(1),
-            self_contact=flag(1),
-            power=unbounded(1),
-            torque_saturation=unbounded(1),
-            object_hit=flag(balls),
-            object_arrived=flag(balls),
-            balls_arrived=unbounded(2),
-            balls_avoided=unbounded(2),
-            episode_step=age(self.config.delay_steps + self.config.episode_steps),
-            first_throw_step=age(self.config.delay_steps),
-            shape=torch.Size([n]),
-        )
-        self.action_spec = unbounded(joints)
-        self.reward_spec = unbounded(1)
+    def _make_specs(self, n: int) -> None:
+        self.observation_spec = state_spec(STATE, n, self._sizes)
+        self.action_spec = Unbounded(shape=torch.Size((n, self._sizes["J"])))
+        self.reward_spec = Unbounded(shape=torch.Size((n, 1)))
+        ends = ("done", "terminated", "truncated")
         self.done_spec = Composite(
-            done=flag(1), terminated=flag(1), truncated=flag(1), shape=torch.Size([n])
+            {key: Binary(shape=torch.Size((n, 1)), dtype=torch.bool) for key in ends},
+            shape=torch.Size([n]),
         )
 
     @property
@@ -282,18 +228,12 @@ class DodgeballEnv(EnvBase):
             at_once = rows[self._counters["first_throw_step"][rows] == 0]
             if len(at_once):
                 self._throw(at_once)
-        never = torch.zeros(self.batch_size[0], 1, dtype=torch.bool)
         out = self._state_td(self.physics.read())
-        out["reward_terms"] = torch.zeros(self.batch_size[0], len(TERMS))
-        out["tactile"] = never.repeat(1, len(self.robot.links))
-        for key in ("hit", "fallen", "diverged", "self_contact"):
-            out[key] = never.clone()
-        for key in ("power", "torque_saturation"):
-            out[key] = torch.zeros(self.batch_size[0], 1)
-        for key in ("object_hit", "object_arrived"):
-            out[key] = never.repeat(1, self.config.throws.num_balls)
-        for key in ("done", "terminated", "truncated"):
-            out[key] = never.clone()
+        for key in STATE:
+            if key.of_step:
+                out[key.name] = key.zeros(self.batch_size[0], self._sizes)
+        for key in self.done_keys:
+            out[key] = torch.zeros(self.batch_size[0], 1, dtype=torch.bool)
         return out
 
     def _start_episodes(self, rows: Tensor) -> None:
@@ -477,3 +417,9 @@ class DodgeballEnv(EnvBase):
         self.physics.load_state(state["physics"][mine])
         for key, value in self._counters.items():
             value.copy_(state[key][mine])
+
+
+if DodgeballEnv.__doc__:
+    DodgeballEnv.__doc__ = DodgeballEnv.__doc__.replace(
+        "    STATE\n", textwrap.indent(state_table(), "    ") + "\n"
+    )
