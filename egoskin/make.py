@@ -21,7 +21,6 @@ from torchrl.envs import (
 from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
 from egoskin.envs.observations import HideObjects, Oracle, Privileged, Proprioception
 from egoskin.envs.standards import standard_of
-from egoskin.envs.state import STATE
 from egoskin.parallel import WorkerPool, default_num_workers
 from egoskin.robots.config import ROBOTS, RobotConfig, RobotName
 from egoskin.sensors import History, Skin
@@ -30,8 +29,6 @@ from egoskin.sensors.geometry import STATE_KEYS
 from egoskin.storage.tensor_file import part, prefixed
 from egoskin.transform import StatefulTransform
 
-# What neither the networks nor the metrics read.
-_RAW_KEYS = [key.name for key in STATE if key.stays_in_worker]
 MASK_ALL = ("all",)
 """Mask of all sensors, and of what an oracle is told."""
 # What the networks read of the transforms' results; the others stay as well.
@@ -138,6 +135,8 @@ def make_worker_env(
         row_offset=row_offset,
         num_threads=num_threads,
         hold=hold,
+        # Only who keeps the raw state reads it.
+        tactile=keep_raw,
     )
     transforms: list[Transform] = []
     if not bare:
@@ -178,8 +177,9 @@ def make_worker_env(
     if not keep_raw:
         kept = {*_NETWORK_KEYS, *(k for t in transforms for k in _state_keys(t))}
         written = dict.fromkeys(key for t in transforms for key in t.out_keys)
-        between = [key for key in written if key not in {*kept, *_RAW_KEYS}]
-        unread = [key for key in _RAW_KEYS if not (sparse and key in STATE_KEYS)]
+        raw = [key.name for key in env.state_rows if key.stays_in_worker]
+        between = [key for key in written if key not in {*kept, *raw}]
+        unread = [key for key in raw if not (sparse and key in STATE_KEYS)]
         transforms.append(ExcludeTransform(*unread, *between))
     return TransformedEnv(env, Compose(transforms))
 
