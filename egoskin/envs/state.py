@@ -19,7 +19,6 @@ Reader = Literal["sensors", "observations", "trainer", "evaluation"]
 """Who reads a key, besides what watches every step where the environment is (behaviour,
 films): the worker's transforms, ``sensors`` and ``observations``; or, in the parent
 process, the metrics of a training and the figures of a throw set."""
-_IN_PARENT = {"trainer", "evaluation"}
 _FLAG, _COUNT, _NUMBER = torch.bool, torch.int64, torch.float32
 
 
@@ -44,7 +43,7 @@ class StateKey:
     @property
     def stays_in_worker(self) -> bool:
         """Whether nobody outside the worker reads it."""
-        return not _IN_PARENT & set(self.read_by)
+        return not set(_PARENT) & set(self.read_by)
 
     def zeros(self, num_envs: int, sizes: Mapping[str, int]) -> Tensor:
         """Return zeros, ``[B, ...]``."""
@@ -71,8 +70,9 @@ def _event(
     return StateKey(name, (size,), content, read_by, kind, of_step=True)
 
 
-_WORKER, _PARENT = ("sensors", "observations"), ("trainer", "evaluation")
+_WORKER: tuple[Reader, ...] = ("sensors", "observations")
 _OWN: tuple[Reader, ...] = ("observations",)
+_PARENT: tuple[Reader, ...] = ("trainer", "evaluation")
 STATE = (
     StateKey("base_pose", (7,), "position [m], quaternion (w, x, y, z)", _WORKER),
     StateKey("base_lin_vel_w", (3,), "velocity of the base's origin [m/s]", _OWN),

@@ -149,7 +149,9 @@ class MujocoPhysics(Physics):
         model: mujoco.MjModel | None = None,
     ) -> None:
         robot, config = scene.robot, scene.config
-        self.model = model = build_scene(scene) if model is None else model
+        if model is None:
+            model = build_scene(scene)
+        self.model = model
         self.scene, self.config = scene, config
         self._batch = mujoco.batch.Batch(model, num_envs, num_threads)
         bind = self._batch.bind
