@@ -149,16 +149,14 @@ class MujocoPhysics(Physics):
         model: mujoco.MjModel | None = None,
     ) -> None:
         robot, config = scene.robot, scene.config
-        if model is None:
-            model = build_scene(scene)
-        self.model = model
+        self.model = build_scene(scene) if model is None else model
         self.scene, self.config = scene, config
-        self._batch = mujoco.batch.Batch(model, num_envs, num_threads)
+        self._batch = mujoco.batch.Batch(self.model, num_envs, num_threads)
         bind = self._batch.bind
         self._qpos, self._qvel = bind("qpos"), bind("qvel")
         self._ctrl, self._sensordata = bind("ctrl"), bind("sensordata")
         self._torque = bind("actuator_force")
-        self._torque_limit = model.actuator_forcerange[:, 1]
+        self._torque_limit = self.model.actuator_forcerange[:, 1]
         self.num_envs, self.num_objects = num_envs, len(scene.objects)
         num_joints = len(robot.joints)
         kp, kd = robot.joint_gains(config.gains)
