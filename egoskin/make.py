@@ -29,24 +29,6 @@ from egoskin.sensors.geometry import STATE_KEYS
 from egoskin.storage.tensor_file import part, prefixed
 from egoskin.transform import StatefulTransform
 
-# Raw state that neither the networks nor the metrics read: it stays in the workers.
-_RAW_KEYS = (
-    "base_pose",
-    "base_lin_vel_w",
-    "base_ang_vel_b",
-    "joint_pos",
-    "joint_vel",
-    "object_pose",
-    "object_lin_vel_w",
-    "object_active",
-    "tactile",
-    "displacement_w",
-    "previous_action",
-    "power",
-    "torque_saturation",
-    "object_hit",
-    "object_arrived",
-)
 MASK_ALL = ("all",)
 """Mask of all sensors, and of what an oracle is told."""
 # What the networks read of the transforms' results; the others stay as well.
@@ -153,6 +135,8 @@ def make_worker_env(
         row_offset=row_offset,
         num_threads=num_threads,
         hold=hold,
+        # Only who keeps the raw state reads it.
+        tactile=keep_raw,
     )
     transforms: list[Transform] = []
     if not bare:
@@ -193,8 +177,9 @@ def make_worker_env(
     if not keep_raw:
         kept = {*_NETWORK_KEYS, *(k for t in transforms for k in _state_keys(t))}
         written = dict.fromkeys(key for t in transforms for key in t.out_keys)
-        between = [key for key in written if key not in {*kept, *_RAW_KEYS}]
-        unread = [key for key in _RAW_KEYS if not (sparse and key in STATE_KEYS)]
+        raw = [key.name for key in env.state_rows if key.stays_in_worker]
+        between = [key for key in written if key not in {*kept, *raw}]
+        unread = [key for key in raw if not (sparse and key in STATE_KEYS)]
         transforms.append(ExcludeTransform(*unread, *between))
     return TransformedEnv(env, Compose(transforms))
 

@@ -10,6 +10,7 @@ simulated, what a sensor measures) is in this file. All shapes offer the same:
   leaves the solid [m], signed, measured from p; (inf, -inf) for a miss. The surface
   belongs to the solid. `first_hit` turns it into what a beam measures.
 - ``bounding_radius``: of the sphere around the origin that holds the solid [m].
+- ``half_height``: how far the solid reaches above and below the origin, along z [m].
 - ``add_geom(body, **attributes)``: adds the shape to a MuJoCo specification.
 
 Coordinates are in the frame of the object [m], directions have length 1, all of them
@@ -75,6 +76,11 @@ class Sphere:
         """Radius of the sphere around the origin that holds the solid [m]."""
         return self.radius
 
+    @property
+    def half_height(self) -> float:
+        """How far the solid reaches above and below the origin [m]."""
+        return self.radius
+
     def add_geom(self, body: mujoco.MjsBody, **attributes: object) -> mujoco.MjsGeom:
         """Return the shape's geom, added to a body of a MuJoCo specification."""
         return body.add_geom(
@@ -126,6 +132,11 @@ class Box:
         """Radius of the sphere around the origin that holds the solid [m]."""
         return math.hypot(*self.half_extents)
 
+    @property
+    def half_height(self) -> float:
+        """How far the solid reaches above and below the origin [m]."""
+        return self.half_extents[2]
+
     def add_geom(self, body: mujoco.MjsBody, **attributes: object) -> mujoco.MjsGeom:
         """Return the shape's geom, added to a body of a MuJoCo specification."""
         return body.add_geom(
@@ -175,6 +186,11 @@ class Capsule:
     @property
     def bounding_radius(self) -> float:
         """Radius of the sphere around the origin that holds the solid [m]."""
+        return self.radius + self.half_length
+
+    @property
+    def half_height(self) -> float:
+        """How far the solid reaches above and below the origin [m]."""
         return self.radius + self.half_length
 
     def add_geom(self, body: mujoco.MjsBody, **attributes: object) -> mujoco.MjsGeom:
@@ -233,6 +249,11 @@ class Ellipsoid:
     def bounding_radius(self) -> float:
         """Radius of the sphere around the origin that holds the solid [m]."""
         return max(self.semi_axes)
+
+    @property
+    def half_height(self) -> float:
+        """How far the solid reaches above and below the origin [m]."""
+        return self.semi_axes[2]
 
     def add_geom(self, body: mujoco.MjsBody, **attributes: object) -> mujoco.MjsGeom:
         """Return the shape's geom, added to a body of a MuJoCo specification."""

@@ -117,3 +117,10 @@ def test_the_simulator_is_imported_in_few_places():
         if any(name.split(".")[0] == "mujoco" for name in imports(module))
     }
     assert uses == MUJOCO
+
+
+def test_only_the_room_of_the_engines_names_one():
+    engines = {f"egoskin.{m}" for m in MODULES if m.startswith("envs.physics.")}
+    engines -= {"egoskin.envs.physics.contract", "egoskin.envs.physics.__init__"}
+    naming = {m for m in MODULES if engines & imports(m)}
+    assert naming == {"envs.physics.__init__"}

@@ -424,6 +424,9 @@ def test_mujoco_knows_the_same_shape(kind):
     assert model.geom_type[0] == getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")
     assert model.geom("it").pos.tolist() == [1, 2, 3]
     assert shape.bounding_radius == pytest.approx(model.geom_rbound[0], rel=1e-12)
+    heights = torch.tensor([0.999, 1.001], dtype=torch.float64) * shape.half_height
+    above = shape.signed_distance(0 * heights, 0 * heights, heights)
+    assert (above > 0).tolist() == [False, True]
     assert shape_of(kind, model.geom_size[0]) == shape
 
 

@@ -37,7 +37,7 @@ except ImportError:
     )
     raise SystemExit(2) from None
 
-from egoskin.envs.physics.mujoco import PhysicsConfig
+from egoskin.envs.physics import PhysicsConfig
 from egoskin.envs.throws import ThrowConfig
 from egoskin.evaluation.visibility import Analysis, analyse
 from egoskin.progress import counted

@@ -21,7 +21,6 @@ CUSTOM = "custom"
 # What the versions share, and what they differ in.
 _SHARED = {
     "radius": 0.15,
-    "mass": 0.4,
     "num_balls": 2,
     "interval": (1.0, 2.0),
     "height": (2.0, 3.0),

@@ -8,7 +8,7 @@ pose the robot has at release. One bank of draws therefore serves every policy.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
@@ -28,14 +28,10 @@ _NUM_AIM_POINTS, _AIM_SEED = 4096, 0
 # A robot that runs away faster than this share of the ball's speed is led as if it
 # ran at it; otherwise no throw could reach it.
 _MAX_LEAD_RATIO = 0.9
-# Draws of a throw until one arrives at the total speed drawn. Half of those of the
-# default ranges do not: all of them, once in a thousand million throws.
-_MAX_TRIES = 32
 # Options that have an effect with one value of another alone.
 _ONLY_WITH = {
     "box_half_width": ("aim", "box"),
     "box_height": ("aim", "box"),
-    "speed_is": ("flight", "ballistic"),
 }
 
 
@@ -45,8 +41,6 @@ class ThrowConfig:
 
     radius: float = 0.15
     """Radius of the balls [m]."""
-    mass: float = 0.4
-    """Mass of each ball [kg] (a touch ends the episode, so it hardly matters)."""
     num_balls: int = 2
     """Balls thrown in turn, so that a slow one is not snatched away in flight."""
     first_delay: tuple[float, float] = (0.0, 2.0)
@@ -59,12 +53,7 @@ class ThrowConfig:
     distance: tuple[float, float] = (4.0, 6.0)
     """Horizontal distance of release from the base [m]."""
     speed: tuple[float, float] = (4.0, 8.0)
-    """Initial speed [m/s]: see speed_is if ballistic, else the whole."""
-    speed_is: Literal["horizontal", "total"] = "horizontal"
-    """For flight=ballistic: the horizontal part of the initial speed, or the whole of
-    it for the lower arc to a robot standing in its default pose (one that moves is
-    thrown at with the same horizontal speed). A draw that is too slow to arrive is
-    drawn again, 32 times at most; then the first is thrown as slowly as arrives."""
+    """Initial speed [m/s]: its horizontal part if ballistic, else the whole."""
     azimuth_deg: tuple[float, float] = (-180.0, 180.0)
     """Direction the ball comes from, relative to the robot's heading [deg]."""
     aim: Literal["skin", "body", "box"] = "skin"
@@ -78,8 +67,6 @@ class ThrowConfig:
     """Share of the base's planar velocity by which the aim is led."""
     flight: Literal["ballistic", "straight"] = "straight"
     """With gravity, or without weight at constant speed (the last 2 m take longer)."""
-    on_ground: Literal["inactive", "bounce"] = "inactive"
-    """A ball that has touched the ground is out of play, or rolls on and counts."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for what cannot be thrown, or has no effect."""
@@ -96,8 +83,6 @@ class ThrowConfig:
             )
         if self.num_balls < 1:
             raise ValueError(f"num_balls must be at least 1, got {self.num_balls}")
-        if not self.mass > 0:
-            raise ValueError(f"mass must be positive, got {self.mass}")
         for name in ("lead", "box_half_width"):
             if not getattr(self, name) >= 0:
                 raise ValueError(
@@ -246,18 +231,7 @@ class Thrower:
         Returns:
             Draws, a pure function of the arguments.
         """
-        what = (seed, Stream.THROW, row, episode, throw)
-        if self.config.speed_is == "horizontal":
-            return self._scaled(uniform(*what, 7))
-        # Whole blocks of random words: the first try is the draw above.
-        u = uniform(*what, 8 * _MAX_TRIES).unflatten(-1, (_MAX_TRIES, 8))
-        _, arrives = self._direct_throw(self._scaled(u.flatten(0, 1)))
-        first = arrives.reshape(-1, _MAX_TRIES).to(torch.uint8).argmax(-1)
-        draw = self._scaled(u[torch.arange(len(u)), first])
-        return replace(draw, speed=self._direct_throw(draw)[0])
-
-    def _scaled(self, u: Tensor) -> Draw:
-        """Return draws from uniform numbers, ``[n, 7]`` or more."""
+        u = uniform(seed, Stream.THROW, row, episode, throw, 7)
         config = self.config
 
         def scale(column: int, bounds: tuple[float, float]) -> Tensor:
@@ -272,29 +246,6 @@ class Thrower:
             interval=scale(4, config.interval),
             target=u[:, 5:7],
         )
-
-    def _direct_throw(self, draw: Draw) -> tuple[Tensor, Tensor]:
-        """Return how fast to throw for draws whose speed is the total one.
-
-        At the standing robot, so that it is a property of the draws alone.
-
-        Returns:
-            Horizontal speed of the lower throw [m/s], and whether the speed drawn
-            suffices (if not: that of the slowest throw that arrives), ``[n]`` each.
-        """
-        side = torch.stack((draw.azimuth.cos(), draw.azimuth.sin()), -1)
-        gap = self._target(draw, *self._standing, side)
-        rise = gap[:, 2] - draw.height
-        across = (gap[:, :2] - draw.distance[:, None] * side).square().sum(-1)
-        way = (across + rise.square()).sqrt()
-        # In time T: s^2 = (way / T)^2 + g rise + (g T / 2)^2, which is least where the
-        # terms with T are equal; of two times the shorter. What a physics step does to
-        # the parabola is left out.
-        excess = draw.speed.square() - GRAVITY * (rise + way)
-        above = excess.clamp(min=0.0)
-        root = (above * (above + 2 * GRAVITY * way)).sqrt()
-        horizontal = (across * (above + GRAVITY * way + root) / 2).sqrt() / way
-        return horizontal, excess >= 0
 
     def release(
         self, draw: Draw, base_pose: Tensor, base_lin_vel_w: Tensor, joint_pos: Tensor

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
-from egoskin.envs.dodgeball import PASSED_DISTANCE
+from egoskin.envs.balls import PASSED_DISTANCE
 from egoskin.envs.throws import ThrowConfig
 from egoskin.evaluation.throw_set import Estimate, play_bank, summarize
 from egoskin.make import EnvConfig

@@ -24,6 +24,7 @@ from egoskin.agents.networks import Agent
 from egoskin.agents.ppo import PPO, NonFiniteError
 from egoskin.agents.rollout import collect
 from egoskin.envs.rewards import TERMS
+from egoskin.envs.state import keys_read_by
 from egoskin.make import load_env_state, make_env, save_env_state
 from egoskin.parallel import WorkerPool, start_server
 from egoskin.policies.policy import (
@@ -44,17 +45,7 @@ from egoskin.storage.serialization import from_plain, to_plain
 from egoskin.storage.tensor_file import part, prefixed, save_tensors
 
 # What the metrics of an episode are made of.
-METRIC_KEYS = (
-    "diverged",
-    "episode_step",
-    "fallen",
-    "first_throw_step",
-    "hit",
-    "reward",
-    "reward_terms",
-    "self_contact",
-    "terminated",
-)
+METRIC_KEYS = (*keys_read_by("trainer"), "reward", "terminated")
 
 
 @dataclass(frozen=True, kw_only=True)

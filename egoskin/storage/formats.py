@@ -29,7 +29,7 @@ from torch import Tensor
 
 from egoskin.storage.serialization import read_json
 
-FORMAT = 2
+FORMAT = 3
 """Number of the format that is written."""
 _SEAL = ("format", "egoskin", "sha256")
 _ANY = object()
@@ -64,6 +64,17 @@ _MIGRATIONS = {
             "slow_start": _ANY,
             "compile_kernels": _ANY,
             "env.sensor.numb": False,
+        },
+    ),
+    2: Migration(
+        removed={
+            "env.task.one_action_scale": None,
+            "env.task.clip_targets": False,
+            "env.task.physics.self_collision": True,
+            "env.task.physics.solver_iterations": 10,
+            "env.task.throws.mass": 0.4,
+            "env.task.throws.speed_is": "horizontal",
+            "env.task.throws.on_ground": "inactive",
         },
     ),
 }

@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
 from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
-from egoskin.envs.physics.mujoco import PhysicsConfig
+from egoskin.envs.physics import PhysicsConfig
 from egoskin.envs.rewards import TERMS, RewardConfig, reward_terms
 from egoskin.envs.throws import ThrowConfig
 from egoskin.robots.config import H1_2
@@ -68,10 +68,10 @@ def assert_same_bits(a: TensorDict, b: TensorDict) -> None:
 
 def throw(env: DodgeballEnv, ball: int, position, velocity=(0.0, 0, 0), rows=None):
     """Put a ball somewhere, in all rows or in some."""
-    rows = np.arange(env.batch_size[0]) if rows is None else np.asarray(rows)
+    rows = torch.arange(env.batch_size[0]) if rows is None else torch.tensor(rows)
     env.physics.throw(
         rows,
-        np.full(len(rows), ball),
+        0 * rows + ball,
         torch.tensor(np.asarray(position)).float().expand(len(rows), 3),
         torch.tensor(velocity).float().expand(len(rows), 3),
     )
@@ -84,7 +84,7 @@ def names(flags: torch.Tensor) -> set[str]:
 def test_the_environment_keeps_its_specs():
     check_env_specs(make(6))
     check_env_specs(make(6, throws=ThrowConfig()))
-    check_env_specs(make(1, throws=ThrowConfig(num_balls=3, on_ground="bounce")))
+    check_env_specs(make(1, throws=ThrowConfig(num_balls=3)))
 
 
 # --- reproducibility ------------------------------------------------------------
@@ -404,8 +404,8 @@ def touch(env: DodgeballEnv, root, chest, ball=0) -> None:
     c, s = w * w - q * q, 2 * w * q
     place = torch.stack((c * x - s * y, s * x + c * y, z + 0 * c), -1)
     place = place + root["base_pose"][:, :3]
-    rows = np.arange(len(root))
-    env.physics.throw(rows, np.full(len(rows), ball), place, torch.zeros_like(place))
+    rows = torch.arange(len(root))
+    env.physics.throw(rows, 0 * rows + ball, place, torch.zeros_like(place))
 
 
 def test_a_ball_that_touches_ends_the_episode_as_a_hit(chest):
@@ -483,7 +483,7 @@ def test_self_contact_ends_an_episode_only_if_asked(ends):
     # The left arm of row 0 in the trunk, as it is from -0.2 rad on.
     joint_pos = DEFAULT.clone()
     joint_pos[H1_2.joints.index("left_shoulder_roll_joint")] = -0.4
-    env.physics.reset(np.array([0]), root["base_pose"][:1], joint_pos[None])
+    env.physics.reset(torch.tensor([0]), root["base_pose"][:1], joint_pos[None])
     step, root = advance(env, root)
     assert step["self_contact"][:, 0].tolist() == [True, False]
     assert step["terminated"][:, 0].tolist() == [ends, False]
@@ -550,18 +550,6 @@ def test_a_ball_on_the_ground_is_out_of_play_until_thrown_again(chest):
     assert (step["object_pose"][:, 0, 2] < 5).all()
     touch(env, root, chest)
     assert advance(env, root)[0]["hit"].all()
-
-
-def test_a_ball_that_bounces_stays_in_play():
-    throws = replace(MISS, on_ground="bounce", flight="ballistic")
-    env = make(2, hold=True, throws=throws)
-    root = env.reset()
-    throw(env, 0, (3.0, 3.0, 0.2), (0.0, 0, -3.0))
-    for _ in range(30):
-        step, root = advance(env, root)
-    assert step["object_active"][:, 0].all()
-    height = step["object_pose"][:, 0, 2]
-    assert ((height > 0.1) & (height < 0.6)).all()
 
 
 def counts(step: TensorDict) -> list[list[float]]:
@@ -764,13 +752,6 @@ def test_the_reward_does_not_depend_on_balls_that_do_not_touch():
         ({"episode_length_s": 0.01}, "at least one control step, got 0.01"),
         ({"episode_length_s": float("inf")}, "must be finite.*, got inf"),
         ({"start_joint_noise": -0.1}, "start_joint_noise must not be negative"),
-        (
-            {
-                "self_contact_ends": True,
-                "physics": PhysicsConfig(self_collision=False),
-            },
-            "self_contact_ends needs physics.self_collision",
-        ),
     ],
 )
 def test_a_task_that_makes_no_episode_is_refused(changes, message):
@@ -778,22 +759,13 @@ def test_a_task_that_makes_no_episode_is_refused(changes, message):
         DodgeballConfig(**changes)
 
 
-@pytest.mark.parametrize(
-    ("changes", "expected"),
-    [
-        # Ankle roll, gain set "real": 40 N m at 40 N m/rad; range +-0.2618 rad.
-        ({"action_scale": 1.0}, 0.5 * 40 / 40),
-        ({"action_scale": 0.3}, 0.3 * 0.5 * 40 / 40),
-        ({"one_action_scale": 0.2}, 0.5 * 0.2),
-        ({"action_scale": 1.0, "clip_targets": True}, 0.261799),
-    ],
-    ids=["torque over stiffness", "scaled", "one for all", "clipped"],
-)
-def test_position_targets_of_an_action_by_hand(changes: dict, expected: float):
-    config = DodgeballConfig(physics=PhysicsConfig(gains="real"), **changes)
+@pytest.mark.parametrize("scale", [1.0, 0.3])
+def test_position_targets_of_an_action_by_hand(scale):
+    config = DodgeballConfig(physics=PhysicsConfig(gains="real"), action_scale=scale)
     env = DodgeballEnv(H1_2, config, num_envs=2)
     td = env.reset()
     td["action"] = torch.full((2, 21), 0.5)
     env.step(td)
     joint = H1_2.joints.index("left_ankle_roll_joint")
-    assert env.physics._ctrl[0, joint] == pytest.approx(expected, abs=1e-6)
+    # Ankle roll, gain set "real": 40 N m at 40 N m/rad; not clipped to its +-0.26 rad.
+    assert env.physics._ctrl[0, joint] == pytest.approx(0.5 * scale * 40 / 40, abs=1e-6)

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import mujoco
 import numpy as np
 import pytest
 import torch
 
-from egoskin.envs.physics.mujoco import Physics, PhysicsConfig, build_scene
+from egoskin.envs.physics import PhysicsConfig, Scene
+from egoskin.envs.physics.mujoco import MujocoPhysics
 from egoskin.robots.config import H1_2
 from egoskin.shapes import Sphere
+from simple_physics import SimplePhysics
 
 BALLS = (Sphere(),) * 2
 DEFAULT = torch.from_numpy(H1_2.default_joint_pos).float()
@@ -25,42 +27,41 @@ def make(
     threads: int = 1,
     hold: bool = False,
     weightless: bool = False,
-    bounce: bool = False,
-) -> Physics:
+) -> MujocoPhysics:
     """Simulations of the standing robot, balls parked."""
-    model = build_scene(
-        H1_2,
-        BALLS,
-        config,
+    scene = Scene(
+        robot=H1_2,
+        objects=BALLS,
+        config=config,
         weightless_objects=weightless,
-        objects_bounce=bounce,
-        object_mass=0.4,
+        link_contacts=True,
+        hold=hold,
     )
-    physics = Physics(model, H1_2, num_envs, config, num_threads=threads, hold=hold)
+    physics = MujocoPhysics(scene, num_envs, num_threads=threads)
     put(physics)
     return physics
 
 
-def put(physics: Physics, height: float = 0.0, joint_pos=DEFAULT) -> None:
+def put(physics: MujocoPhysics, height: float = 0.0, joint_pos=DEFAULT) -> None:
     """Put all robots at rest, by default standing at the origin."""
-    n = len(physics._qpos)
+    n = physics.num_envs
     pose = torch.tensor([0, 0, H1_2.default_base_height + height, 1, 0, 0, 0])
-    physics.reset(np.arange(n), pose.expand(n, 7), joint_pos.expand(n, len(DEFAULT)))
+    physics.reset(torch.arange(n), pose.expand(n, 7), joint_pos.expand(n, len(DEFAULT)))
 
 
-def throw(physics: Physics, ball: int, position, velocity=(0.0, 0, 0)) -> None:
+def throw(physics: MujocoPhysics, ball: int, position, velocity=(0.0, 0, 0)) -> None:
     """Release one ball in all rows."""
-    n = len(physics._qpos)
+    n = physics.num_envs
     physics.throw(
-        np.arange(n),
-        np.full(n, ball),
+        torch.arange(n),
+        torch.full((n,), ball),
         torch.tensor(position).float().expand(n, 3),
         torch.tensor(velocity).float().expand(n, 3),
     )
 
 
-def step(physics: Physics, target=DEFAULT, active=(True, True)):
-    n = len(physics._qpos)
+def step(physics: MujocoPhysics, target=DEFAULT, active=(True, True)):
+    n = physics.num_envs
     return physics.step(
         target.expand(n, len(DEFAULT)), torch.tensor(active).expand(n, 2)
     )
@@ -89,61 +90,12 @@ def crown() -> np.ndarray:
 # --- the oracle -----------------------------------------------------------------
 
 
-class Single:
-    """One `MjData`, stepped and inspected contact by contact."""
-
-    def __init__(self, model: mujoco.MjModel) -> None:
-        self.model, self.data = model, mujoco.MjData(model)
-        links, bodies = H1_2.links, [model.body(i).name for i in range(model.nbody)]
-        body = [bodies[i] for i in model.geom_bodyid]
-        floor = model.geom("floor").id
-        self.kind = [
-            ("floor", 0)
-            if g == floor
-            else ("link", links.index(name))
-            if name in links
-            else ("object", int(name.removeprefix("object_")))
-            for g, name in enumerate(body)
-        ]
-
-    def step(self, ctrl: np.ndarray, substeps: int) -> dict[str, np.ndarray]:
-        links = len(H1_2.links)
-        result = {
-            "object_contact": np.zeros(links, bool),
-            "floor_contact": np.zeros(links, bool),
-            "object_hit": np.zeros(len(BALLS), bool),
-            "self_contact": np.zeros(1, bool),
-            "power": np.zeros(1),
-            "torque_saturation": np.zeros(1),
-        }
-        data = self.data
-        data.ctrl[:] = ctrl
-        for _ in range(substeps):
-            mujoco.mj_step(self.model, data)
-            for contact in data.contact:
-                pair = dict(sorted(self.kind[g] for g in contact.geom))
-                if set(pair) == {"link"}:
-                    result["self_contact"][0] = True
-                elif set(pair) == {"link", "floor"}:
-                    result["floor_contact"][pair["link"]] = True
-                elif set(pair) == {"link", "object"}:
-                    result["object_contact"][pair["link"]] = True
-                    result["object_hit"][pair["object"]] = True
-            joint_vel = data.qvel[6 : 6 + len(DEFAULT)]
-            result["power"] += np.abs(data.actuator_force * joint_vel).sum() / substeps
-            low, high = self.model.actuator_forcerange.T
-            force = data.actuator_force
-            limited = (force == low) | (force == high)
-            result["torque_saturation"] += limited.mean() / substeps
-        return result
-
-
 @pytest.mark.parametrize(("rate", "substeps"), [(120, 1), (60, 2), (60, 4)])
 def test_steps_equal_a_loop_over_single_simulations(rate, substeps):
     # Stiff enough to throw the arms against the body.
     config = PhysicsConfig(control_hz=rate, substeps=substeps, gains="real")
     physics = make(8, config)
-    single = [Single(physics.model) for _ in range(8)]
+    simple = SimplePhysics(physics.scene, 8)
     rng = np.random.default_rng(0)
     # Balls fly at the falling robots from all sides.
     side = rng.normal(size=(8, 2, 3)) * [1, 1, 0.2]
@@ -151,24 +103,21 @@ def test_steps_equal_a_loop_over_single_simulations(rate, substeps):
     for ball in range(2):
         position = torch.from_numpy([0, 0, 1.0] + 1.2 * side[:, ball])
         velocity = torch.from_numpy(-5.0 * side[:, ball])
-        physics.throw(np.arange(8), np.full(8, ball), position, velocity)
-    for row, one in enumerate(single):
-        one.data.qpos[:] = physics._qpos[row]
-        one.data.qvel[:] = physics._qvel[row]
+        physics.throw(torch.arange(8), torch.full((8,), ball), position, velocity)
+    simple.load_state(physics.state())
     seen = {}
-    for _ in range(60):
+    for _ in range(rate):
         noise = torch.from_numpy(rng.normal(size=(8, len(DEFAULT)))).float()
-        target = DEFAULT + 0.3 * noise
-        result = physics.step(target, torch.ones(8, 2, dtype=torch.bool))
-        for row, one in enumerate(single):
-            expected = one.step(target[row].numpy(), substeps)
-            for name, value in expected.items():
-                got = getattr(result, name)[row]
-                np.testing.assert_allclose(got, value.squeeze(), rtol=1e-6)
-                seen[name] = seen.get(name, False) | value.any()
-            np.testing.assert_array_equal(physics._qpos[row], one.data.qpos)
-            np.testing.assert_array_equal(physics._qvel[row], one.data.qvel)
-        assert not result.diverged.any()
+        result, expected = (
+            one.step(DEFAULT + 0.6 * noise, torch.ones(8, 2, dtype=torch.bool))
+            for one in (physics, simple)
+        )
+        for field in fields(result):
+            got, value = (getattr(x, field.name) for x in (result, expected))
+            assert torch.equal(got, value), field.name
+            seen[field.name] = seen.get(field.name, False) | bool(value.any())
+        assert torch.equal(physics.state(), simple.state())
+    assert not seen.pop("diverged")
     assert all(seen.values()), seen
 
 
@@ -197,9 +146,9 @@ def test_a_standing_robot_touches_the_floor_with_its_feet_alone():
     physics = make(1)
     for _ in range(5):
         result = step(physics)
-    assert names(result.floor_contact[0]) == FEET
-    assert not result.object_contact.any()
+    assert names(result.link_contact[0]) == FEET
     assert not result.object_hit.any()
+    assert not result.fallen.any()
     assert not result.self_contact.any()
 
 
@@ -207,7 +156,7 @@ def test_a_robot_in_the_air_touches_nothing():
     physics = make(1)
     put(physics, height=1.0)
     result = step(physics)
-    assert not result.floor_contact.any()
+    assert not result.link_contact.any()
     assert not result.self_contact.any()
 
 
@@ -215,7 +164,7 @@ def test_a_ball_on_the_head_touches_the_head_alone(crown):
     physics = make(1, hold=True)
     throw(physics, 1, np.add(crown, [0, 0, 0.14]))
     result = step(physics)
-    assert names(result.object_contact[0]) == {"torso_link"}
+    assert names(result.link_contact[0]) == {"torso_link"} | FEET
     assert result.object_hit.tolist() == [[False, True]]
     throw(physics, 1, np.add(crown, [0, 0, 0.2]))
     assert not step(physics).object_hit.any()
@@ -253,20 +202,18 @@ def arms_in_trunk() -> torch.Tensor:
     raise AssertionError("no such pose")
 
 
-def test_self_collision_can_be_turned_off_without_losing_floor_and_balls(
+def test_a_robot_that_touches_itself_is_told_from_one_hit_or_standing(
     crown, arms_in_trunk
 ):
-    contacts = {}
-    for on in (True, False):
-        physics = make(1, PhysicsConfig(self_collision=on), hold=True)
-        put(physics, height=-0.005, joint_pos=arms_in_trunk)
-        throw(physics, 0, np.add(crown, [0, 0, 0.14]))
-        contacts[on] = step(physics)
-    assert contacts[True].self_contact.all()
-    assert not contacts[False].self_contact.any()
-    for result in contacts.values():
-        assert result.object_hit[0, 0]
-        assert names(result.floor_contact[0]) == FEET
+    physics = make(1, hold=True)
+    put(physics, height=-0.005, joint_pos=arms_in_trunk)
+    result = step(physics)
+    assert result.self_contact.all()
+    assert names(result.link_contact[0]) == FEET
+    throw(physics, 0, np.add(crown, [0, 0, 0.14]))
+    assert step(physics).object_hit[0, 0]
+    put(physics, height=-0.005)
+    assert not step(physics).self_contact.any()
 
 
 def test_an_inactive_object_is_parked_and_touches_nothing(crown):
@@ -278,15 +225,23 @@ def test_an_inactive_object_is_parked_and_touches_nothing(crown):
     assert physics.read().object_pose[0, 0, 2] > 900
 
 
-def test_objects_bounce_only_if_asked():
-    for bounce in (False, True):
-        physics = make(1, bounce=bounce, hold=True)
-        throw(physics, 0, (3.0, 3, 0.3))
-        for _ in range(60):
-            step(physics, active=(True, False))
-        # One second: on the floor, or g/2 below it.
-        height = physics.read().object_pose[0, 0, 2].item()
-        assert height == pytest.approx(0.15 if bounce else 0.3 - 4.9, abs=0.1)
+def test_an_object_falls_through_the_floor():
+    physics = make(1, hold=True)
+    throw(physics, 0, (3.0, 3, 0.3))
+    for _ in range(60):
+        assert not step(physics, active=(True, False)).fallen.any()
+    # One second: g/2 below.
+    height = physics.read().object_pose[0, 0, 2].item()
+    assert height == pytest.approx(0.3 - 4.9, abs=0.1)
+
+
+def test_contacts_by_link_are_told_only_if_asked():
+    scene = make(1).scene
+    bare = MujocoPhysics(replace(scene, link_contacts=False), 1)
+    # Hit by each ball, self, floor, floor by each foot.
+    assert bare.model.nsensor == 2 + 1 + 1 + len(H1_2.feet)
+    put(bare)
+    assert step(bare).link_contact is None
 
 
 def test_weightless_objects_fly_straight():
@@ -399,7 +354,7 @@ def test_read_gives_the_state_of_mujoco():
     np.testing.assert_allclose(state.joint_vel, qvel[:, 6:27], rtol=1e-6)
     balls = qvel[:, 27:].reshape(3, 2, 3)
     np.testing.assert_allclose(state.object_lin_vel_w, balls, rtol=1e-6)
-    some = physics.read(np.array([2, 0]))
+    some = physics.read(torch.tensor([2, 0]))
     assert torch.equal(some.joint_pos, state.joint_pos[[2, 0]])
 
 
@@ -448,7 +403,7 @@ def test_a_reset_row_remembers_nothing():
         used.step(target, torch.ones(4, 2, dtype=torch.bool))
     others = used.state()[[0, 1, 3]]
     pose = fresh.read().base_pose[:1]
-    used.reset(np.array([2]), pose, DEFAULT[None])
+    used.reset(torch.tensor([2]), pose, DEFAULT[None])
     assert torch.equal(used.state()[[0, 1, 3]], others)
     # Of the integration state all is as new: warm start and time included.
     assert torch.equal(used.state()[2], fresh.state()[2])
@@ -480,7 +435,7 @@ def test_a_diverged_row_is_told_and_finite_and_harms_no_other(
     # Once reset, the row goes on as any other.
     pose = torch.tensor([[0, 0, H1_2.default_base_height, 1, 0, 0, 0]])
     for one in (reference, physics):
-        one.reset(np.array([1]), pose, DEFAULT[None])
+        one.reset(torch.tensor([1]), pose, DEFAULT[None])
     for _ in range(10):
         assert not step(physics).diverged.any()
         step(reference)
@@ -490,7 +445,7 @@ def test_a_diverged_row_is_told_and_finite_and_harms_no_other(
 # --- errors ---------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["control_hz", "substeps", "solver_iterations"])
+@pytest.mark.parametrize("name", ["control_hz", "substeps"])
 @pytest.mark.parametrize("value", [0, -1])
 def test_rates_that_are_not_positive_are_refused(name, value):
     with pytest.raises(ValueError, match=f"{name} must be positive, got {value}"):

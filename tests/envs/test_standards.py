@@ -9,7 +9,7 @@ from typing import get_args
 import pytest
 
 from egoskin.envs.dodgeball import DodgeballConfig
-from egoskin.envs.physics.mujoco import PhysicsConfig
+from egoskin.envs.physics import PhysicsConfig
 from egoskin.envs.rewards import RewardConfig
 from egoskin.envs.standards import (
     CUSTOM,

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
-from egoskin.envs.physics.mujoco import Physics, PhysicsConfig, build_scene
+from egoskin.envs.physics import DEFAULT_ENGINE, PhysicsConfig, Scene
 from egoskin.envs.throws import Release, ThrowConfig, Thrower
 from egoskin.rng import Stream, uniform
 from egoskin.robots.config import H1_2
@@ -59,20 +59,19 @@ def aim_points(thrower: Thrower, drawn, base_pose, joint_pos) -> torch.Tensor:
 
 def fly(release: Release, config: ThrowConfig, steps: int = 240) -> torch.Tensor:
     """Positions of balls in MuJoCo, the robot out of the way, ``[steps + 1, n, 3]``."""
-    model = build_scene(
-        H1_2,
-        config.balls[:1],
-        PHYSICS,
+    scene = Scene(
+        robot=H1_2,
+        objects=config.balls[:1],
+        config=PHYSICS,
         weightless_objects=config.flight == "straight",
-        objects_bounce=False,
-        object_mass=config.mass,
+        hold=True,
     )
     n = len(release.position)
-    physics = Physics(model, H1_2, n, PHYSICS, hold=True)
+    physics, rows = DEFAULT_ENGINE(scene, n), torch.arange(n)
     away = torch.tensor([100.0, 0, 3, 1, 0, 0, 0])
     joint_pos = DEFAULT.expand(n, -1)
-    physics.reset(np.arange(n), away.expand(n, 7), joint_pos)
-    physics.throw(np.arange(n), np.zeros(n, int), release.position, release.velocity)
+    physics.reset(rows, away.expand(n, 7), joint_pos)
+    physics.throw(rows, 0 * rows, release.position, release.velocity)
     path = [physics.read().object_pose[:, 0, :3]]
     for _ in range(steps):
         result = physics.step(joint_pos, torch.ones(n, 1, dtype=torch.bool))
@@ -350,80 +349,6 @@ def test_a_vertical_fall_of_the_height_by_hand():
     torch.testing.assert_close(speed, torch.tensor([6.297600]))
 
 
-# --- total speed ----------------------------------------------------------------
-
-
-def at_standing(thrower: Thrower, drawn) -> tuple[torch.Tensor, Release]:
-    """Points aimed at and throws at robots in the default pose, all at one place."""
-    n = len(drawn.speed)
-    base_pose = torch.tensor([0, 0, H1_2.default_base_height, 1, 0, 0, 0]).expand(n, 7)
-    joint_pos = DEFAULT.expand(n, -1)
-    release = thrower.release(drawn, base_pose, torch.zeros(n, 3), joint_pos)
-    return aim_points(thrower, drawn, base_pose, joint_pos), release
-
-
-@pytest.mark.parametrize("aim", ["skin", "body", "box"])
-def test_a_total_speed_is_that_of_the_lower_arc_to_a_standing_robot(aim):
-    config = ThrowConfig(flight="ballistic", aim=aim, speed_is="total")
-    thrower = make(config)
-    drawn = draw(thrower)
-    target, release = at_standing(thrower, drawn)
-    assert closest(fly(release, config), target, torch.zeros(N, 3)).max() < 0.01
-    # Each is one of its 32 draws: eight random numbers each, the fourth the speed.
-    zeros = torch.zeros(N, dtype=torch.int64)
-    u = uniform(0, Stream.THROW, torch.arange(N), zeros, zeros, 8 * 32)
-    tries = 4 + 4 * u.unflatten(-1, (32, 8))[..., 3]
-    # Of the parabola, which the integrator's speed is half a step of gravity above.
-    velocity = release.velocity.clone()
-    velocity[:, 2] -= 9.81 * PHYSICS.timestep / 2
-    speed = velocity.norm(dim=-1)
-    assert ((tries - speed[:, None]).abs().amin(-1) < 1e-4).all()
-    assert len(set(speed.tolist())) == N
-    # The lower arc: its time is below that of the slowest throw, sqrt(2 way / g).
-    gap = target - release.position
-    time = gap[:, :2].norm(dim=-1) / velocity[:, :2].norm(dim=-1)
-    assert (time.square() < 2 * gap.norm(dim=-1) / 9.81).all()
-
-
-@pytest.mark.parametrize(
-    ("aim", "least", "most"), [("body", 0.45, 0.52), ("skin", 0.42, 0.49)]
-)
-def test_draws_of_a_total_speed_that_cannot_arrive_are_drawn_again(aim, least, most):
-    n = 4096
-    plain = make(ThrowConfig(flight="ballistic", aim=aim))
-    total = make(ThrowConfig(flight="ballistic", aim=aim, speed_is="total"))
-    once, again = draw(plain, n), draw(total, n)
-    target, release = at_standing(plain, once)
-    gap = target - release.position
-    across, rise = gap[:, :2].norm(dim=-1), gap[:, 2]
-    # The highest point that a ball of speed s reaches at a distance r:
-    # s^2 / 2 g - g r^2 / 2 s^2 (the parabola that envelops all throws).
-    s2 = once.speed.square()
-    arrives = rise < s2 / 19.62 - 9.81 * across.square() / (2 * s2)
-    # A higher target is reached by fewer.
-    assert least < arrives.float().mean() < most
-    for name in ("azimuth", "distance", "height", "interval"):
-        kept = getattr(once, name) == getattr(again, name)
-        assert torch.equal(kept, arrives), name
-    assert torch.equal((once.target == again.target).all(-1), arrives)
-
-
-@pytest.mark.parametrize(
-    ("drawn", "horizontal"),
-    [
-        # 4 m away at the same height: sin 2a = g r / s^2 = 39.24 / 64, a = 18.90790
-        # deg, and 8 cos a; for 4 m/s there is none, the slowest is at 45 deg:
-        # s^2 = g r, sqrt(39.24 / 2).
-        (8.0, 7.568325),
-        (4.0, 4.429447),
-    ],
-)
-def test_a_total_speed_by_hand(drawn, horizontal):
-    config = replace(LEVEL, speed=(drawn, drawn), speed_is="total")
-    speed = draw(make(config), 1).speed
-    torch.testing.assert_close(speed, torch.tensor([horizontal]))
-
-
 # --- invariances ----------------------------------------------------------------
 
 
@@ -449,12 +374,9 @@ def test_turning_the_robot_turns_the_throw(flight):
     torch.testing.assert_close(again.velocity, expected, atol=1e-4, rtol=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("flight", "speed_is"),
-    [("straight", "horizontal"), ("ballistic", "horizontal"), ("ballistic", "total")],
-)
-def test_a_padded_subset_is_thrown_to_the_same_bits(flight, speed_is):
-    thrower = make(ThrowConfig(flight=flight, speed_is=speed_is))
+@pytest.mark.parametrize("flight", FLIGHTS)
+def test_a_padded_subset_is_thrown_to_the_same_bits(flight):
+    thrower = make(ThrowConfig(flight=flight))
     drawn, (base_pose, joint_pos) = draw(thrower), poses()
     velocity = torch.ones(N, 3)
     whole = thrower.release(drawn, base_pose, velocity, joint_pos)
@@ -477,17 +399,9 @@ def test_a_padded_subset_is_thrown_to_the_same_bits(flight, speed_is):
 
 
 @pytest.mark.parametrize("aim", ["skin", "body"])
-@pytest.mark.parametrize(
-    "throws",
-    [
-        {"flight": "ballistic"},
-        {"flight": "ballistic", "speed_is": "total"},
-        {"flight": "straight"},
-    ],
-    ids=["ballistic", "ballistic, total speed", "straight"],
-)
-def test_every_throw_hits_a_rigid_robot(throws, aim, request, capsys):
-    throws = ThrowConfig(**throws, aim=aim, first_delay=(0.0, 0.0))
+@pytest.mark.parametrize("flight", FLIGHTS)
+def test_every_throw_hits_a_rigid_robot(flight, aim, request, capsys):
+    throws = ThrowConfig(flight=flight, aim=aim, first_delay=(0.0, 0.0))
     config = DodgeballConfig(throws=throws)
     env = DodgeballEnv(H1_2, config, num_envs=256, seed=0, hold=True)
     td = env.reset()
@@ -530,11 +444,9 @@ def test_every_throw_hits_a_rigid_robot(throws, aim, request, capsys):
         ({"speed": (0.0, 0.0)}, "speed must be positive"),
         ({"box_height": (math.nan, 1.0)}, "box_height must be"),
         ({"num_balls": 0}, "num_balls must be at least 1, got 0"),
-        ({"mass": 0.0}, "mass must be positive, got 0.0"),
         ({"lead": -0.1}, "lead must not be negative, got -0.1"),
         ({"box_half_width": 0.0}, "box_half_width has no effect without aim=box"),
         ({"box_height": (1.0, 1.0)}, "box_height has no effect without aim=box"),
-        ({"speed_is": "total"}, "speed_is has no effect without flight=ballistic"),
     ],
 )
 def test_throws_that_cannot_be_thrown_are_refused(changes, message):

@@ -14,7 +14,8 @@ import torch
 from tensordict import TensorDict
 
 from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
-from egoskin.envs.physics.mujoco import PhysicsConfig, build_scene
+from egoskin.envs.physics import PhysicsConfig, Scene
+from egoskin.envs.physics.mujoco import build_scene
 from egoskin.robots.config import H1_2, RobotConfig, read_robot
 from egoskin.robots.kinematics import LinkKinematics
 from egoskin.robots.surface import default_frames, distance_to
@@ -304,12 +305,7 @@ def refused(robot: RobotConfig, text: str) -> None:
         DodgeballEnv(robot, DodgeballConfig(), num_envs=1)
     with pytest.raises(ValueError, match=text):
         build_scene(
-            robot,
-            [Sphere(radius=0.1)],
-            PhysicsConfig(),
-            weightless_objects=False,
-            objects_bounce=False,
-            object_mass=1.0,
+            Scene(robot=robot, objects=(Sphere(radius=0.1),), config=PhysicsConfig())
         )
 
 

@@ -268,6 +268,32 @@ def test_a_migration_leaves_alone_what_is_there_and_makes_no_parts():
     assert migrate(now, FORMAT) == (now, {})
 
 
+@pytest.mark.parametrize(
+    ("name", "gone", "effect"),
+    [
+        ("task.one_action_scale", None, 0.2),
+        ("task.clip_targets", False, True),
+        ("task.physics.self_collision", True, False),
+        ("task.physics.solver_iterations", 10, 100),
+        ("task.throws.mass", 0.4, 1.0),
+        ("task.throws.speed_is", "horizontal", "total"),
+        ("task.throws.on_ground", "inactive", "bounce"),
+    ],
+)
+def test_an_option_of_format_2_goes_and_is_told_where_it_had_an_effect(
+    name, gone, effect
+):
+    for value, retired in ((gone, {}), (effect, {f"env.{name}": effect})):
+        config = {"env": to_plain(EnvConfig())}
+        *path, key = name.split(".")
+        inner = config["env"]
+        for part in path:
+            inner = inner[part]
+        assert key not in inner
+        inner[key] = value
+        assert migrate(config, 2) == ({"env": to_plain(EnvConfig())}, retired)
+
+
 def test_stored_policies_without_a_seal_load_and_say_so(capsys):
     path = (
         ROOT / "studies/version-1/results/blind-seed0/policies/000065536000.safetensors"

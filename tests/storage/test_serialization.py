@@ -64,7 +64,7 @@ def test_what_a_configuration_refuses_is_told_with_the_file():
         ("env.task.reward.survival", math.nan),
         ("ppo.entropy_coeff", math.nan),
         ("env.sensor.range", math.nan),
-        ("env.task.throws.mass", math.inf),
+        ("env.task.throws.lead", math.inf),
         ("env.task.throws.speed", [4.0, math.inf]),
         ("env.task.throws.height", [2.0, math.inf]),
         ("env.task.throws.azimuth_deg", [-math.inf, 180.0]),

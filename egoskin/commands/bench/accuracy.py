@@ -11,7 +11,8 @@ import numpy as np
 import torch
 
 from egoskin.commands.bench.report import Row, show
-from egoskin.envs.physics.mujoco import PhysicsConfig, build_scene
+from egoskin.envs.physics import OBJECT_MASS, PhysicsConfig, Scene
+from egoskin.envs.physics.mujoco import build_scene
 from egoskin.envs.throws import Release, ThrowConfig, Thrower
 from egoskin.make import EnvConfig
 from egoskin.robots.config import RobotConfig
@@ -73,15 +74,14 @@ class _Simulation:
 
     def __init__(self, robot: RobotConfig, config: PhysicsConfig) -> None:
         self._robot, throws = robot, ThrowConfig(num_balls=1)
-        self._mass, self._gravity = throws.mass, throws.gravity
-        self.model = build_scene(
-            robot,
-            throws.balls,
-            config,
+        self._gravity = throws.gravity
+        scene = Scene(
+            robot=robot,
+            objects=throws.balls,
+            config=config,
             weightless_objects=not self._gravity,
-            objects_bounce=False,
-            object_mass=self._mass,
         )
+        self.model = build_scene(scene)
         self.data = mujoco.MjData(self.model)
         self._ball = self.model.body("object_0").id
         self._weight = np.zeros(6)
@@ -121,7 +121,7 @@ class _Simulation:
         momentum, speed = np.zeros(3), np.zeros(3)
         while self.data.time < min(met + _AFTER, _LONGEST_FLIGHT) - 1e-9:
             if link < 0:
-                momentum = self._mass * self.data.qvel[-3:].copy()
+                momentum = OBJECT_MASS * self.data.qvel[-3:].copy()
                 speed = self.data.qvel[:3].copy()
             now = self.data.time
             mujoco.mj_step(self.model, self.data)
@@ -132,9 +132,9 @@ class _Simulation:
         if link < 0:
             nothing = np.full(3, np.nan)
             return _Impact(time=np.nan, link=-1, impulse=np.nan, base=nothing)
-        change = self._mass * self.data.qvel[-3:] - momentum
+        change = OBJECT_MASS * self.data.qvel[-3:] - momentum
         # Gravity's share of the time since.
-        change[2] += self._mass * self._gravity * _AFTER
+        change[2] += OBJECT_MASS * self._gravity * _AFTER
         return _Impact(
             time=met,
             link=link,

@@ -11,7 +11,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
-import numpy as np
 import psutil
 import torch
 from tensordict import TensorDictBase
@@ -23,7 +22,7 @@ from egoskin.agents.ppo import PPO, PPOConfig
 from egoskin.agents.rollout import collect
 from egoskin.commands.bench.report import Row, show
 from egoskin.envs.dodgeball import DodgeballEnv
-from egoskin.envs.physics.mujoco import Physics
+from egoskin.envs.physics.mujoco import MujocoPhysics
 from egoskin.make import (
     EnvConfig,
     check_num_workers,
@@ -70,7 +69,7 @@ class LoopConfig:
         check_num_workers(self.num_envs, self.num_workers)
 
 
-class Recording(Physics):
+class Recording(MujocoPhysics):
     """Physics that writes down what is asked of it, to do it again bare."""
 
     written: list[tuple[str, tuple]]
@@ -88,13 +87,13 @@ class Recording(Physics):
             self.written.append(("park", (fresh,)))
         super().park(objects)
 
-    def reset(self, rows: np.ndarray, base_pose: Tensor, joint_pos: Tensor) -> None:
+    def reset(self, rows: Tensor, base_pose: Tensor, joint_pos: Tensor) -> None:
         """Reset rows, and write it down."""
         self.written.append(("reset", (rows, base_pose, joint_pos)))
         super().reset(rows, base_pose, joint_pos)
 
     def throw(
-        self, rows: np.ndarray, objects: np.ndarray, position: Tensor, velocity: Tensor
+        self, rows: Tensor, objects: Tensor, position: Tensor, velocity: Tensor
     ) -> None:
         """Throw, and write it down."""
         self.written.append(("throw", (rows, objects, position, velocity)))
@@ -106,20 +105,14 @@ class Recording(Physics):
         self._parked = torch.zeros(self.num_envs, self.num_objects, dtype=torch.bool)
 
 
-class RecordingEnv(DodgeballEnv):
-    """The task on physics that write down what is asked of them."""
-
-    physics_class = Recording
-
-
 Layer = tuple[Callable[[], Any], Callable[[Any], object]]
 """What makes a layer ready, and what is timed."""
 
 
-def replay_raw(physics: Physics, written: list[tuple[str, tuple]]) -> None:
+def replay_raw(physics: MujocoPhysics, written: list[tuple[str, tuple]]) -> None:
     """Do again what was written down, with nothing but MuJoCo's steps."""
     for method, args in written:
-        getattr(Physics, method)(physics, *args)
+        getattr(MujocoPhysics, method)(physics, *args)
         if method == "set_target":
             physics.step_raw()
 
@@ -255,13 +248,15 @@ class _Loop:
             norm.update(self._rollout[key])
         norms.load_state_dict(before)
 
-    def _recorder(self) -> RecordingEnv:
-        env = RecordingEnv(
+    def _recorder(self) -> DodgeballEnv:
+        env = DodgeballEnv(
             self.config.env.robot_config,
             self.config.env.task,
             num_envs=self.config.num_envs,
             seed=self.config.seed,
             num_threads=self._workers,
+            tactile=False,
+            engine=Recording,
         )
         assert isinstance(env.physics, Recording)
         env.physics.forget()

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import mujoco
-import numpy as np
 import torch
 
 from egoskin.commands.bench.report import Row, show
-from egoskin.envs.physics.mujoco import Physics, PhysicsConfig, build_scene
+from egoskin.envs.physics import PhysicsConfig, Scene
+from egoskin.envs.physics.mujoco import MujocoPhysics, build_scene
 from egoskin.envs.throws import ThrowConfig
 from egoskin.make import EnvConfig
 from egoskin.storage.serialization import check_counts
@@ -45,29 +45,29 @@ def physics_rows(config: PhysicsBench) -> list[Row]:
     robot = EnvConfig().robot_config
     joints = slice(6, 6 + len(robot.joints))
 
-    def build(name: str) -> Physics:
-        physics_config = PhysicsConfig(
-            self_collision=name != "no_self_collision",
-            substeps=4 if name == "240_hz" else 2,
-        )
-        model = build_scene(
-            robot,
-            ThrowConfig().balls,
-            physics_config,
+    def build(name: str) -> MujocoPhysics:
+        scene = Scene(
+            robot=robot,
+            objects=ThrowConfig().balls,
+            config=PhysicsConfig(substeps=4 if name == "240_hz" else 2),
             weightless_objects=not ThrowConfig().gravity,
-            objects_bounce=False,
-            object_mass=ThrowConfig().mass,
+            link_contacts=name == "link_contacts",
         )
+        model = build_scene(scene)
+        if name == "no_self_collision":
+            # All bits but those of balls and floor.
+            model.geom_contype[:] &= 3
+            model.geom_conaffinity[:] &= 3
         if name == "frictionloss":
             model.dof_frictionloss[joints] = 0.2
         if name == "damping":
             model.dof_damping[joints] = 1.0
         if name == "no_contact_sensors":
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR
-        return Physics(model, robot, config.num_envs, physics_config)
+        return MujocoPhysics(scene, config.num_envs, model=model)
 
     names = ("shipped", "no_self_collision", "frictionloss", "damping")
-    names += ("240_hz", "no_contact_sensors")
+    names += ("240_hz", "link_contacts", "no_contact_sensors")
     variants = {name: build(name) for name in names}
     default = torch.from_numpy(robot.default_joint_pos).float()
     default = default.expand(config.num_envs, -1)
@@ -79,7 +79,7 @@ def physics_rows(config: PhysicsBench) -> list[Row]:
             for name, physics in variants.items():
                 show(f"round {i + 1}/{config.rounds}: {motion} {name}")
                 generator = torch.Generator().manual_seed(i)
-                physics.reset(np.arange(config.num_envs), pose, default)
+                physics.reset(torch.arange(config.num_envs), pose, default)
                 begin = time.process_time()
                 for _ in range(config.steps):
                     shift = torch.randn(default.shape, generator=generator)

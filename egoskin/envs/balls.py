@@ -1,0 +1,139 @@
+"""Objects thrown at robots: which is thrown next and when, and what became of it.
+
+Contract: what is thrown is a function of the draws of `Thrower` and of the robot at
+release; who hit whom is told by the physics. The rest is counted here, row by row.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from egoskin.envs.physics.contract import Physics, PhysicsState
+from egoskin.envs.throws import Thrower
+from egoskin.robots.kinematics import pad_rows
+from egoskin.shapes import Shape
+
+PASSED_DISTANCE = 1.0
+"""A ball has passed once it flies away from the base and is farther than this [m]."""
+
+
+class Balls:
+    """The objects of every row: thrown in turn, in play until they land.
+
+    Args:
+        thrower: Draws the throws and aims them.
+        objects: Shape of each of the ``O`` objects.
+        num_envs: Number of rows ``B``.
+        control_hz: Rate of the control steps [Hz].
+    """
+
+    def __init__(
+        self,
+        thrower: Thrower,
+        objects: Sequence[Shape],
+        num_envs: int,
+        control_hz: float,
+    ) -> None:
+        self.thrower = thrower
+        self._hz, self._num_objects = control_hz, len(objects)
+        self._half_height = torch.tensor([shape.half_height for shape in objects])
+        zeros = torch.zeros(num_envs, dtype=torch.int64)
+        flags = torch.zeros(num_envs, len(objects), dtype=torch.bool)
+        self.state = {
+            # Throws so far; age at which the next one is due, and the first.
+            "throw": zeros,
+            "next_throw_step": zeros.clone(),
+            "first_throw_step": zeros.clone(),
+            # Of each object: whether it is in play, was thrown first, has arrived.
+            "active": flags,
+            "is_first": flags.clone(),
+            "passed": flags.clone(),
+            # First ball, later balls: arrived so far, of which without touching.
+            "arrived": torch.zeros(num_envs, 2),
+            "avoided": torch.zeros(num_envs, 2),
+        }
+        """Everything that is counted, ``[B, ...]`` each, to be saved and put back."""
+
+    def start(self, rows: Tensor, seed: int, ids: Tensor, episode: Tensor) -> None:
+        """Begin episodes: nothing is in play, and the first throw is due later.
+
+        Args:
+            rows: Rows whose episodes begin, ``[n]``.
+            seed: Seed of the draws.
+            ids: Global indices of these rows, padded (`pad_rows`).
+            episode: Their episodes, padded.
+        """
+        for value in self.state.values():
+            value[rows] = 0
+        delay = self.thrower.first_delay(seed, ids, episode)[: len(rows)]
+        steps = (delay * self._hz).round().long()
+        for key in ("first_throw_step", "next_throw_step"):
+            self.state[key][rows] = steps
+
+    def due(self, step: Tensor) -> Tensor:
+        """Return whether the next throw is due at an age, ``[B]`` bool."""
+        return step >= self.state["next_throw_step"]
+
+    def throw(
+        self,
+        physics: Physics,
+        rows: Tensor,
+        step: Tensor,
+        seed: int,
+        ids: Tensor,
+        episode: Tensor,
+    ) -> None:
+        """Throw the next object of some rows at the robot as it is now.
+
+        Args:
+            physics: Where they fly.
+            rows: Rows to throw in, ``[n]``, at least one.
+            step: Their age, ``[n]``.
+            seed: Seed of the draws.
+            ids: Global indices of these rows, padded (`pad_rows`).
+            episode: Their episodes, padded.
+        """
+        state, n, padded = self.state, len(rows), pad_rows(rows)
+        throw, robot = state["throw"], physics.read(padded)
+        draw = self.thrower.draw(seed, ids, episode, throw[padded])
+        release = self.thrower.release(
+            draw, robot.base_pose, robot.base_lin_vel_w, robot.joint_pos
+        )
+        ball = throw[rows] % self._num_objects
+        physics.throw(rows, ball, release.position[:n], release.velocity[:n])
+        state["active"][rows, ball] = True
+        state["passed"][rows, ball] = False
+        state["is_first"][rows, ball] = throw[rows] == 0
+        wait = (draw.interval[:n] * self._hz).round().long()
+        state["next_throw_step"][rows] = step + wait.clamp(min=1)
+        throw[rows] += 1
+
+    def count(self, now: PhysicsState, hit_by: Tensor, sound: Tensor) -> None:
+        """Count the balls that came and those avoided; retire those that landed.
+
+        A ball has arrived when it touches the robot or when it has passed: it lands,
+        or flies away from the base and is farther than a metre.
+
+        Args:
+            now: State reached.
+            hit_by: Which objects touched the robot, ``[B, O]`` bool.
+            sound: Which rows have a simulation to be believed, ``[B, 1]`` bool.
+        """
+        state = self.state
+        gap = now.object_pose[..., :2] - now.base_pose[:, None, :2]
+        closing = now.object_lin_vel_w[..., :2] - now.base_lin_vel_w[:, None, :2]
+        far = gap.square().sum(-1) > PASSED_DISTANCE**2
+        landed = now.object_pose[..., 2] <= self._half_height
+        leaving = ((gap * closing).sum(-1) > 0) & far
+        fresh = state["active"] & ~state["passed"] & sound
+        avoided = fresh & (landed | leaving) & ~hit_by
+        arrived = avoided | (fresh & hit_by)
+        first = state["is_first"]
+        for name, which in (("arrived", arrived), ("avoided", avoided)):
+            state[name][:, 0] += (which & first).sum(-1)
+            state[name][:, 1] += (which & ~first).sum(-1)
+        state["passed"] |= arrived
+        state["active"] &= ~landed

@@ -1,0 +1,93 @@
+"""What is thrown may have any shape: it hits, misses and lands by that shape."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
+from egoskin.envs.throws import ThrowConfig
+from egoskin.robots.config import H1_2
+from egoskin.robots.kinematics import LinkKinematics, rotate
+from egoskin.robots.surface import sample_surface
+from egoskin.shapes import Box, Capsule, Ellipsoid, Shape, Sphere
+
+ROWS = 24
+# Half of them pass beside the robot, above it or between its legs.
+WIDE = ThrowConfig(
+    first_delay=(0.0, 0.0),
+    aim="box",
+    box_half_width=0.8,
+    box_height=(0.4, 2.0),
+    distance=(1.5, 2.0),
+)
+# Long across the flight of some throws and along that of others.
+SHAPES = (
+    Sphere(radius=0.15),
+    Box(half_extents=(0.05, 0.3, 0.1)),
+    Capsule(radius=0.06, half_length=0.25),
+    Ellipsoid(semi_axes=(0.05, 0.3, 0.12)),
+)
+
+
+def body_points(base_pose: torch.Tensor, joint_pos: torch.Tensor) -> torch.Tensor:
+    """Points of the surface of robots in the world, ``[B, n, 3]``."""
+    points = sample_surface(H1_2, H1_2.links, 1500, seed=0)
+    position, rotation = LinkKinematics(H1_2.chain, H1_2.links).poses_b(joint_pos)
+    local = torch.from_numpy(points.position).float()
+    link = torch.from_numpy(points.link)
+    in_base = (rotation[:, link] @ local[..., None])[..., 0] + position[:, link]
+    quat = base_pose[:, None, 3:].expand(-1, len(link), 4)
+    return rotate(quat, in_base) + base_pose[:, None, :3]
+
+
+@pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: type(shape).__name__)
+def test_a_thrown_shape_hits_or_misses_as_its_own_signed_distance_says(shape: Shape):
+    config = DodgeballConfig(throws=WIDE)
+    env = DodgeballEnv(H1_2, config, num_envs=ROWS, hold=True, objects=(shape,))
+    root = env.reset()
+    start, velocity = root["object_pose"][:, 0, :3], root["object_lin_vel_w"][:, 0]
+    points = body_points(root["base_pose"], root["joint_pos"])
+
+    flying = torch.ones(ROWS, dtype=torch.bool)
+    hit = ~flying
+    counts = torch.zeros(2, ROWS)
+    for _ in range(50):
+        root["action"] = torch.zeros(ROWS, len(H1_2.joints))
+        step, root = env.step_and_maybe_reset(root)
+        after = step["next"]
+        for own, key in zip(counts, ("balls_arrived", "balls_avoided"), strict=True):
+            own[flying] = after[key][flying, 0]
+        hit |= flying & after["hit"][:, 0]
+        flying &= ~after["done"][:, 0]
+
+    gap = torch.full((ROWS,), torch.inf)
+    # At 120 Hz, as physics looks at it.
+    for number in range(80):
+        centre = start + velocity * number / 120
+        near = (centre - points.mean(1)).norm(dim=-1) < 1.2
+        x, y, z = (points[near] - centre[near, None]).unbind(-1)
+        least = shape.signed_distance(x, y, z).amin(-1)
+        gap[near] = torch.minimum(gap[near], least)
+    # A point of the body in the solid is a touch; points are some 3 cm apart.
+    assert hit[gap < 0].all()
+    assert not hit[gap > 0.04].any()
+    assert (gap < 0).sum() > ROWS / 6
+    assert (gap > 0.04).sum() > ROWS / 6
+    # What missed has passed: counted as avoided.
+    assert counts[0].all()
+    assert torch.equal(counts[1].bool(), ~hit)
+
+
+@pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: type(shape).__name__)
+def test_a_shape_is_out_of_play_when_its_lowest_point_is_on_the_ground(shape: Shape):
+    config = DodgeballConfig(throws=WIDE)
+    env = DodgeballEnv(H1_2, config, num_envs=2, hold=True, objects=(shape,))
+    root = env.reset()
+    # Weightless, at rest, a centimetre above the ground and a centimetre in it.
+    lowest = shape.half_height + torch.tensor([0.01, -0.01])
+    place = torch.stack((3 + 0 * lowest, 0 * lowest, lowest), -1)
+    rows = torch.arange(2)
+    env.physics.throw(rows, 0 * rows, place, 0 * place)
+    step = env.step(root.set("action", torch.zeros(2, len(H1_2.joints))))["next"]
+    assert step["object_active"].tolist() == [[True], [False]]
