@@ -123,8 +123,10 @@ def record(run: Run, frames: int) -> Record:
         f"torch {start['packages']['torch']}, mujoco {start['packages']['mujoco']}"
         for start in starts
     ]
+    # A script's path, or "egoskin train".
+    called = f"python scripts/{Path(script).name}" if script.endswith(".py") else script
     return Record(
-        command=" ".join(["python", f"scripts/{Path(script).name}", *args]),
+        command=" ".join([called, *args]),
         commit=", ".join(dict.fromkeys(commits)),
         seed=run.config.seed,
         frames=frames,
