@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -18,6 +18,7 @@ from torchrl.envs import (
     TransformedEnv,
 )
 
+from egoskin.bounds import Interval, check_bounds
 from egoskin.checkpoint import part, prefixed
 from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
 from egoskin.envs.standards import standard_of
@@ -69,13 +70,12 @@ class EnvConfig:
     """What the critic alone sees: also the balls, or (the paper's) the velocity."""
     previous_action: bool = False
     """Whether the actor, too, observes its action of the step before."""
-    history: int = 1
+    history: Annotated[int, Interval(ge=1, le=256)] = 1
     """Observations of this many steps, the present one included."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for no history, or gains that the robot does not have."""
-        if self.history < 1:
-            raise ValueError(f"history must be at least 1, got {self.history}")
+        """Raise ValueError for a history out of bounds, or gains of another robot."""
+        check_bounds(self)
         self.robot_config.joint_gains(self.task.physics.gains)
 
     @property

@@ -5,12 +5,12 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Collection
 from pathlib import Path
 from typing import Any, TypeVar
 
 import dacite
 
+from egoskin.bounds import BoundsError, path_to
 from egoskin.files import read_regular
 
 T = TypeVar("T")
@@ -47,29 +47,6 @@ def to_plain(value: Any) -> Any:
     return value
 
 
-def check_numbers(
-    content: Any, may_be_infinite: Collection[str] = (), name: str = ""
-) -> None:
-    """Raise ValueError if a configuration holds a number that is not finite.
-
-    Args:
-        content: A dataclass, or what is in one.
-        may_be_infinite: Dotted names of fields that may be infinite, but not NaN.
-        name: Dotted name of the content, for the error text.
-    """
-    if dataclasses.is_dataclass(content):
-        for field in dataclasses.fields(content):
-            inner = f"{name}.{field.name}".lstrip(".")
-            check_numbers(getattr(content, field.name), may_be_infinite, inner)
-    elif isinstance(content, (tuple, list)):
-        for value in content:
-            check_numbers(value, may_be_infinite, name)
-    elif isinstance(content, float) and not math.isfinite(content):
-        if name in may_be_infinite and not math.isnan(content):
-            return
-        raise ValueError(f"{name} must be a finite number, got {content}")
-
-
 def from_plain(kind: type[T], content: Any, what: str) -> T:
     """Return a configuration from the values that `to_plain` gave.
 
@@ -79,7 +56,8 @@ def from_plain(kind: type[T], content: Any, what: str) -> T:
         what: Where they came from, for the error text.
 
     Raises:
-        ValueError: If a field is unknown or of the wrong type; the text names it.
+        ValueError: If a field is unknown, of the wrong type or out of bounds; the text
+            names it.
     """
     if not isinstance(content, dict):
         raise ValueError(f"{what}: expected an object, got {type(content).__name__}")
@@ -87,6 +65,8 @@ def from_plain(kind: type[T], content: Any, what: str) -> T:
     config = dacite.Config(type_hooks=hooks, strict=True)
     try:
         return dacite.from_dict(kind, _with_tuples(content), config)
+    except BoundsError as error:
+        raise ValueError(f"{what}: {path_to(error.owner, kind)}{error}") from error
     # The last is what a configuration itself refuses.
     except (dacite.DaciteError, ValueError) as error:
         raise ValueError(f"{what}: {error}") from error
@@ -104,7 +84,10 @@ def _with_tuples(content: Any) -> Any:
 def _float(value: Any) -> Any:
     """Return a number as float, "inf" too; anything else is left to be refused."""
     whole = isinstance(value, int) and not isinstance(value, bool)
-    return float(value) if whole or value in ("inf", "-inf") else value
+    try:
+        return float(value) if whole or value in ("inf", "-inf") else value
+    except OverflowError as error:
+        raise ValueError("a number of hundreds of digits is none that fits") from error
 
 
 def _path(value: Any) -> Any:

@@ -41,6 +41,7 @@ import tyro
 from torch import Tensor
 
 from egoskin.agents.ppo import PPOConfig
+from egoskin.bounds import COUNT, POSITIVE, check_bounds
 from egoskin.checkpoint import (
     PARTIAL,
     append,
@@ -49,7 +50,6 @@ from egoskin.checkpoint import (
     save_tensors,
     write_file,
 )
-from egoskin.cli import check_counts
 from egoskin.draws import check_seed
 from egoskin.envs.dodgeball import DodgeballConfig
 from egoskin.envs.standards import Standard, training_task
@@ -64,7 +64,7 @@ from egoskin.formats import (
     unseal,
 )
 from egoskin.make import EnvConfig, check_num_workers
-from egoskin.plain import changed_fields, check_numbers, from_plain, read_json, to_plain
+from egoskin.plain import changed_fields, from_plain, read_json, to_plain
 from egoskin.policies import CHECKPOINT_NAME
 from egoskin.sensors import Skin
 from egoskin.workers import available_cores
@@ -86,7 +86,7 @@ class TrainConfig:
     throw or end given beside it makes the task custom."""
     seed: int = 0
     """Seed of everything random: throws, starts, networks, actions."""
-    total_frames: int = 65_536_000
+    total_frames: Annotated[int, COUNT] = 65_536_000
     """Environment steps of the whole run (the paper's 1000 epochs)."""
     num_envs: int = 4096
     """Agents simulated in parallel."""
@@ -94,13 +94,13 @@ class TrainConfig:
     """Processes that simulate; None: the largest divisor of num_envs <= cores."""
     device: str = "cpu"
     """Device of the learner ("cpu", "cuda", "cuda:1")."""
-    learner_threads: int | None = None
+    learner_threads: Annotated[int | None, COUNT] = None
     """Threads of the learner; None: one for each core."""
     run_dir: Path | None = None
     """Folder of the run; None: a new one under runs/, named after time and sensor."""
-    snapshot_frames: int = 5_000_000
+    snapshot_frames: Annotated[int, COUNT] = 5_000_000
     """Environment steps between the policies kept for learning curves."""
-    checkpoint_interval: float = 60.0
+    checkpoint_interval: Annotated[float, POSITIVE] = 60.0
     """A checkpoint is at most this old [s]."""
     resume: Path | None = None
     """Run folder to go on with; changed may be --total-frames, to a later end, and what
@@ -108,13 +108,8 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         """Raise ValueError for values with which no run can start."""
-        check_numbers(self, may_be_infinite=("env.sensor.range",))
-        check_counts(self, "total_frames", "snapshot_frames", "learner_threads")
+        check_bounds(self)
         check_seed(self.seed)
-        if not self.checkpoint_interval > 0:
-            raise ValueError(
-                f"checkpoint_interval must be positive, got {self.checkpoint_interval}"
-            )
         check_num_workers(self.num_envs, self.num_workers)
         frames = self.num_envs * self.ppo.rollout_steps
         if frames < self.ppo.num_mini_batches:

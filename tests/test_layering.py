@@ -16,6 +16,7 @@ MODULES = sorted(
 # What each part may import of the package; a folder's name covers all it holds.
 ALLOWED = {
     "files": set(),
+    "bounds": set(),
     "chains": set(),
     "robots": {"files", "chains"},
     "compilation": set(),
@@ -28,8 +29,9 @@ ALLOWED = {
     "surface": {"robots", "shapes", "kinematics"},
     "transform": {"kinematics"},
     "observations": {"kinematics", "transform"},
-    "envs": {"robots", "shapes", "draws", "kinematics", "surface", "envs"},
+    "envs": {"bounds", "robots", "shapes", "draws", "kinematics", "surface", "envs"},
     "sensors": {
+        "bounds",
         "files",
         "compilation",
         "rounding",
@@ -43,7 +45,7 @@ ALLOWED = {
         "sparse",
         "sensors",
     },
-    "agents": {"sparse", "agents"},
+    "agents": {"bounds", "sparse", "agents"},
 }
 # The simulator, and what draws pictures of it.
 MUJOCO = {

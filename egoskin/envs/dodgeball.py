@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -11,6 +12,7 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from egoskin.bounds import Interval, check_bounds
 from egoskin.draws import Stream, uniform
 from egoskin.envs.physics import Physics, PhysicsConfig, PhysicsState, build_scene
 from egoskin.envs.rewards import TERMS, RewardConfig, reward_terms
@@ -32,41 +34,33 @@ class DodgeballConfig:
     """The balls and how they are thrown."""
     reward: RewardConfig = field(default_factory=RewardConfig)
     """Weights of the reward terms."""
-    action_scale: float = 0.3
+    action_scale: Annotated[float, Interval(gt=0, le=100)] = 0.3
     """q* = q_default + action_scale x torque limit / kp x action, per joint."""
-    one_action_scale: float | None = None
+    one_action_scale: Annotated[float | None, Interval(gt=0, le=100)] = None
     """The same scale for all joints instead [rad]."""
     clip_targets: bool = False
     """Clip q* to the joint ranges (an ankle could then ask for little torque)."""
-    episode_length_s: float = 10.0
+    episode_length_s: Annotated[float, Interval(gt=0, le=3600)] = 10.0
     """Episodes are truncated this long after the first throw [s]."""
-    success_s: float = 3.0
+    success_s: Annotated[float, Interval(gt=0, le=3600)] = 3.0
     """An episode not terminated until this long after the first throw succeeds [s]."""
     self_contact_ends: bool = False
     """Whether a robot that touches itself terminates the episode, as a fall does."""
-    start_joint_noise: float = 0.05
+    start_joint_noise: Annotated[float, Interval(ge=0, le=10)] = 0.05
     """Joints start uniformly within this of the default pose [rad]."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for values that make no episode."""
-        for name in ("action_scale", "one_action_scale", "success_s"):
-            value = getattr(self, name)
-            if value is not None and not value > 0:
-                raise ValueError(f"{name} must be positive, got {value}")
-        steps = self.episode_length_s * self.physics.control_hz
-        if not 1 <= steps < math.inf:
+        check_bounds(self)
+        if self.episode_length_s * self.physics.control_hz < 1:
             raise ValueError(
-                f"episode_length_s must be finite and at least one control step, got "
+                "episode_length_s must be at least one control step, got "
                 f"{self.episode_length_s}"
             )
         if self.self_contact_ends and not self.physics.self_collision:
             raise ValueError(
                 "self_contact_ends needs physics.self_collision: without it the robot "
                 "never touches itself"
-            )
-        if self.start_joint_noise < 0:
-            raise ValueError(
-                f"start_joint_noise must not be negative, got {self.start_joint_noise}"
             )
 
     @property

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import mujoco
 import mujoco.batch
@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from egoskin.bounds import Interval, check_bounds
 from egoskin.robots import RobotConfig
 from egoskin.shapes import Sphere
 
@@ -38,22 +39,20 @@ class PhysicsConfig:
 
     gains: str = "rotor_inertia"
     """Named PD gain set of the robot ("real", "rotor_inertia")."""
-    control_hz: float = 60.0
+    control_hz: Annotated[float, Interval(ge=1, le=1000)] = 60.0
     """Rate at which the policy acts [Hz]."""
-    substeps: int = 2
+    substeps: Annotated[int, Interval(ge=1, le=1000)] = 2
     """Physics steps in each control step."""
     self_collision: bool = True
     """Whether arms, torso and legs collide with each other."""
-    solver_iterations: int = 10
+    solver_iterations: Annotated[int, Interval(ge=1, le=1000)] = 10
     """Most Newton iterations in each physics step."""
     target_velocity: Literal["zero", "finite_difference"] = "zero"
     """Velocity target of the PD law: 0, or the change of the position target."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for rates and counts that are not positive."""
-        for name in ("control_hz", "substeps", "solver_iterations"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        """Raise ValueError for numbers out of bounds."""
+        check_bounds(self)
 
     @property
     def timestep(self) -> float:
