@@ -13,6 +13,7 @@ from types import FrameType
 from typing import Any
 
 from egoskin.interrupts import ENDING, end_next_time, end_now, say, take
+from egoskin.memory import is_out_of_memory
 from egoskin.workers import WorkerError
 
 
@@ -24,10 +25,10 @@ class _Ended(KeyboardInterrupt):
 def clear_errors() -> Iterator[None]:
     """Turn what ends a script into one line on stderr and an exit status.
 
-    An error that the user can mend is ValueError (bad input) or OSError (files): status
-    2. A worker's end is status 1, and a signal 128 with its number added. If nobody
-    reads the output any more, that is no error. Anything else is a fault of ours and
-    keeps its traceback.
+    An error that the user can mend is status 2: ValueError (bad input), OSError (files),
+    too little memory, what is too large to count or too deep. A worker's end is status
+    1, and a signal 128 with its number added. If nobody reads the output any more, that
+    is no error. Anything else is a fault of ours and keeps its traceback.
     """
     before = {number: signal.getsignal(number) for number in ENDING}
     hook, sys.unraisablehook = sys.unraisablehook, _end_if_lost
@@ -39,7 +40,13 @@ def clear_errors() -> Iterator[None]:
             sys.stdout.flush()
     except WorkerError as error:
         raise SystemExit(f"error: {error}") from None
-    except (ValueError, OSError) as error:
+    except Exception as error:
+        if is_out_of_memory(error):
+            first, *_ = str(error).splitlines() or ["out of memory"]
+            print(f"error: too little memory: {first}", file=sys.stderr)
+            raise SystemExit(2) from None
+        if not isinstance(error, (ValueError, OSError, OverflowError, RecursionError)):
+            raise
         if isinstance(error, BrokenPipeError) and _nobody_reads():
             # What is left to be written is not tried again.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -13,6 +13,7 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.envs import (
     Compose,
+    EnvBase,
     ExcludeTransform,
     Transform,
     TransformedEnv,
@@ -22,6 +23,7 @@ from egoskin.bounds import Interval, check_bounds
 from egoskin.checkpoint import part, prefixed
 from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
 from egoskin.envs.standards import standard_of
+from egoskin.memory import check_memory, check_shared_memory
 from egoskin.observations import HideObjects, Oracle, Privileged, Proprioception
 from egoskin.robots import ROBOTS, RobotConfig, RobotName
 from egoskin.sensors import History, Skin
@@ -48,6 +50,11 @@ _RAW_KEYS = (
     "object_hit",
     "object_arrived",
 )
+# More agents than this are a slip of the keyboard.
+_MOST_AGENTS, _MOST_WORKERS = 2**20, 1024
+# Memory of the simulation of one agent, and what workers share beside the tensors: it
+# is a page for each tensor at least [bytes].
+_SIMULATION, _SHARED_EXTRA = 12_000, 2**20
 MASK_ALL = ("all",)
 """Mask of all sensors, and of what an oracle is told."""
 # What the networks read of the transforms' results; the others stay as well.
@@ -263,12 +270,22 @@ def make_env(
         mask: Links whose sensors detect nothing, or `MASK_ALL`.
 
     Raises:
-        ValueError: If the workers do not divide the agents, or as `make_worker_env`.
+        ValueError: If the workers do not divide the agents, they do not fit this
+            machine, MuJoCo cannot make the scene, or as `make_worker_env`.
     """
     workers = check_num_workers(num_envs, num_workers)
     if skin is None:
         # Once, not in each worker.
         skin = config.skin.build(config.robot_config)
+    # What cannot be made, or does not fit, is told of before the workers start.
+    one = make_worker_env(
+        config, skin, num_envs=1, seed=seed, bare=bare, sparse=sparse, mask=mask
+    )
+    assert isinstance(one.base_env, DodgeballEnv)
+    one.base_env.check_scene()
+    check_memory(env_memory(one, num_envs))
+    shared = "what workers and trainer exchange (num_envs, history, sensors)"
+    check_shared_memory(2 * num_envs * _row_bytes(one) + _SHARED_EXTRA, shared)
     rows = num_envs // workers
     return WorkerPool(
         [
@@ -290,6 +307,29 @@ def make_env(
     )
 
 
+def env_memory(one: EnvBase, num_envs: int) -> dict[str, int]:
+    """Return what memory the agents of an environment take at least.
+
+    Args:
+        one: The environment of a single row.
+        num_envs: Number of agents.
+
+    Returns:
+        Bytes, as `egoskin.memory.check_memory` takes them.
+    """
+    # The state before and after a step, in the workers and in what they share.
+    row = _SIMULATION + 4 * _row_bytes(one)
+    return {"the agents (num_envs or episodes, history, sensors)": num_envs * row}
+
+
+def _row_bytes(one: EnvBase) -> int:
+    """Return the size of what an environment of a single row gives in a step."""
+    return sum(
+        spec.shape.numel() * spec.dtype.itemsize
+        for spec in one.observation_spec.values(True, True)
+    )
+
+
 def check_num_workers(
     num_envs: int, num_workers: int | None, name: str = "num_envs"
 ) -> int:
@@ -301,14 +341,20 @@ def check_num_workers(
         name: How the number of agents was called, for the error text.
 
     Raises:
-        ValueError: If it does not divide the number of agents; the text lists what
-            does.
+        ValueError: If it does not divide the number of agents, then the text lists
+            what does; or if either is out of bounds.
     """
-    if num_envs < 1:
-        raise ValueError(f"{name} must be at least 1, got {num_envs}")
+    bounds = {
+        name: (num_envs, _MOST_AGENTS),
+        "num_workers": (num_workers, _MOST_WORKERS),
+    }
+    for what, (number, most) in bounds.items():
+        wrong = number is not None and Interval(ge=1, le=most).violation(number)
+        if wrong:
+            raise ValueError(f"{what} must {wrong}, got {number}")
     if num_workers is None:
         return default_num_workers(num_envs)
-    if num_workers < 1 or num_envs % num_workers:
+    if num_envs % num_workers:
         limit = max(64, num_workers)
         fit = [n for n in range(1, min(num_envs, limit) + 1) if num_envs % n == 0]
         raise ValueError(

@@ -63,9 +63,15 @@ from egoskin.formats import (
     sealed_json,
     unseal,
 )
-from egoskin.make import EnvConfig, check_num_workers
+from egoskin.make import EnvConfig, check_num_workers, env_memory, make_worker_env
+from egoskin.memory import check_memory
 from egoskin.plain import changed_fields, from_plain, read_json, to_plain
-from egoskin.policies import CHECKPOINT_NAME
+from egoskin.policies import (
+    CHECKPOINT_NAME,
+    PolicySpec,
+    agent_tensors,
+    sparse_sources,
+)
 from egoskin.sensors import Skin
 from egoskin.workers import available_cores
 
@@ -262,11 +268,13 @@ class Run:
         """Return a new run folder that holds the configuration and the skin.
 
         Raises:
-            ValueError: If the folder holds anything already, or the skin is none.
+            ValueError: If the folder holds anything already, the skin is none, or there is
+                too little memory.
         """
         skin = config.env.skin.build(config.env.robot_config)
         # Sensors that do not fit each other are found now, not in a worker.
         config.env.sensor.filled(skin)
+        _check_memory(config, skin)
         path = config.run_dir
         if path is None:
             kind = config.env.sensor.label()
@@ -553,6 +561,29 @@ class Run:
         """Close the logs."""
         if self._events is not None:
             self._events.close()
+
+
+def _check_memory(config: TrainConfig, skin: Skin) -> None:
+    """Raise ValueError if a training cannot fit into the memory of this machine."""
+    sources = sparse_sources(config.env, skin)
+    one = make_worker_env(
+        config.env, skin, num_envs=1, seed=config.seed, sparse=bool(sources)
+    )
+    spec = PolicySpec.of(config.env, skin, config.ppo.network, one, sources)
+    with torch.device("meta"):
+        agent = spec.build_agent()
+    weights = sum(value.numel() for value in agent_tensors(agent).values())
+    read = sum(size for key, size in spec.sizes.items() if key not in sources)
+    check_memory(
+        {
+            **env_memory(one, config.num_envs),
+            # The weights, their gradient and two moments, in float32.
+            "the networks (ppo.network.hidden)": 16 * weights,
+            "a rollout (num_envs, ppo.rollout_steps, history)": 4
+            * read
+            * config.frames_per_batch,
+        }
+    )
 
 
 def _text(characters: Tensor) -> str:

@@ -254,6 +254,10 @@ class DodgeballEnv(EnvBase):
             )
         return self._physics
 
+    def check_scene(self) -> None:
+        """Raise ValueError if MuJoCo cannot make the robot and the balls."""
+        _ = self.physics
+
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
             self._seed = seed

@@ -128,7 +128,8 @@ def build_scene(
         torque = clip(kp (q* - q) - kd qdot, +-limit), evaluated in every substep.
 
     Raises:
-        ValueError: If the robot's base does not float, or a joint is no hinge.
+        ValueError: If the robot's base does not float, a joint is no hinge, or MuJoCo
+            cannot make the model.
     """
     robot.check_floating_base()
     spec = robot.spec()
@@ -186,7 +187,11 @@ def build_scene(
         actuator.gainprm[0] = p
         actuator.biasprm[1:3] = -p, -d
     _add_contact_sensors(spec, robot, len(objects))
-    return spec.compile()
+    try:
+        return spec.compile()
+    except (ValueError, mujoco.FatalError) as error:
+        text = " ".join(str(error).split())
+        raise ValueError(f"MuJoCo cannot make the scene: {text}") from error
 
 
 def _add_contact_sensors(
