@@ -7,14 +7,48 @@ import select
 import signal
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from tyro.constructors import (
+    ConstructorRegistry,
+    PrimitiveConstructorSpec,
+    PrimitiveTypeInfo,
+)
+
 from egoskin.interrupts import ENDING, end_next_time, end_now, say, take
 from egoskin.memory import is_out_of_memory
 from egoskin.workers import WorkerError
+
+NUMBERS = ConstructorRegistry()
+"""How options are read, while it is entered: a whole number also as 1e6."""
+
+
+@NUMBERS.primitive_rule
+def _whole_number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[int] | None:
+    if info.type is not int:
+        return None
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="INT",
+        instance_from_str=lambda texts: _read_whole(texts[0]),
+        is_instance=lambda value: isinstance(value, int),
+        str_from_instance=lambda value: [str(value)],
+    )
+
+
+def _read_whole(text: str) -> int:
+    """Return a whole number from "1000000", "1_000_000" or "1e6"."""
+    with suppress(ValueError):
+        return int(text)
+    with suppress(ValueError):
+        number = float(text)
+        # Beyond, not every whole number is a float.
+        if number.is_integer() and abs(number) < 2**53:
+            return int(number)
+    raise ValueError(f"expected a whole number, got {text}")
 
 
 class _Ended(KeyboardInterrupt):
@@ -25,8 +59,10 @@ class _Ended(KeyboardInterrupt):
 def clear_errors() -> Iterator[None]:
     """Turn what ends a script into one line on stderr and an exit status.
 
-    An error that the user can mend is status 2: ValueError (bad input), OSError (files),
-    too little memory, what is too large to count or too deep. A worker's end is status
+    Within, `NUMBERS` says how options are read.
+
+    An error that the user can mend is status 2: ValueError (bad input), OSError
+    (files), too little memory, what is too large or too deep. A worker's end is status
     1, and a signal 128 with its number added. If nobody reads the output any more, that
     is no error. Anything else is a fault of ours and keeps its traceback.
     """
@@ -35,7 +71,8 @@ def clear_errors() -> Iterator[None]:
     take(_raise, *ENDING)
     try:
         try:
-            yield
+            with NUMBERS:
+                yield
         finally:
             sys.stdout.flush()
     except WorkerError as error:
@@ -115,6 +152,8 @@ def check_output(path: Path | None, option: str) -> None:
     if os.path.isdir(path):
         raise ValueError(f"{option}: {path} is a folder")
     try:
+        # To open one waits for a reader; that of a shell or /dev/stdout has no path.
+        pipe = path.is_fifo() and os.path.lexists(os.path.realpath(path))
         new = not os.path.lexists(path)
         if new or path.is_file():
             # Appending nothing changes nothing.
@@ -124,3 +163,5 @@ def check_output(path: Path | None, option: str) -> None:
     except OSError as error:
         text = f"{option}: {path} cannot be written ({error.strerror})"
         raise ValueError(text) from None
+    if pipe:
+        raise ValueError(f"{option}: {path} is a named pipe, not a file")

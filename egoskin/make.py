@@ -344,11 +344,8 @@ def check_num_workers(
         ValueError: If it does not divide the number of agents, then the text lists
             what does; or if either is out of bounds.
     """
-    bounds = {
-        name: (num_envs, _MOST_AGENTS),
-        "num_workers": (num_workers, _MOST_WORKERS),
-    }
-    for what, (number, most) in bounds.items():
+    agents, processes = (num_envs, _MOST_AGENTS), (num_workers, _MOST_WORKERS)
+    for what, (number, most) in {name: agents, "num_workers": processes}.items():
         wrong = number is not None and Interval(ge=1, le=most).violation(number)
         if wrong:
             raise ValueError(f"{what} must {wrong}, got {number}")

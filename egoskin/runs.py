@@ -52,7 +52,7 @@ from egoskin.checkpoint import (
 )
 from egoskin.draws import check_seed
 from egoskin.envs.dodgeball import DodgeballConfig
-from egoskin.envs.standards import Standard, training_task
+from egoskin.envs.standards import CUSTOM, Standard, training_task
 from egoskin.events import EventFile
 from egoskin.files import read_regular
 from egoskin.formats import (
@@ -117,6 +117,15 @@ class TrainConfig:
         check_bounds(self)
         check_seed(self.seed)
         check_num_workers(self.num_envs, self.num_workers)
+        if self.standard is not None and self.env.standard not in (
+            self.standard,
+            CUSTOM,
+        ):
+            raise ValueError(
+                f"standard={self.standard} is for the command line, and the task is of "
+                f"standard {self.env.standard}: build one with egoskin.envs.standards."
+                f"training_task({self.standard!r}, DodgeballConfig())"
+            )
         frames = self.num_envs * self.ppo.rollout_steps
         if frames < self.ppo.num_mini_batches:
             raise ValueError(
@@ -268,8 +277,8 @@ class Run:
         """Return a new run folder that holds the configuration and the skin.
 
         Raises:
-            ValueError: If the folder holds anything already, the skin is none, or there is
-                too little memory.
+            ValueError: If the folder holds anything already, the skin is none, or there
+                is too little memory.
         """
         skin = config.env.skin.build(config.env.robot_config)
         # Sensors that do not fit each other are found now, not in a worker.
@@ -577,8 +586,8 @@ def _check_memory(config: TrainConfig, skin: Skin) -> None:
     check_memory(
         {
             **env_memory(one, config.num_envs),
-            # The weights, their gradient and two moments, in float32.
-            "the networks (ppo.network.hidden)": 16 * weights,
+            # Weights, two moments and gradients, of four shares and all, in float32.
+            "the networks (ppo.network.hidden)": 32 * weights,
             "a rollout (num_envs, ppo.rollout_steps, history)": 4
             * read
             * config.frames_per_batch,

@@ -29,7 +29,7 @@ _SIGNAL_KEYS = ("signal",)
 class NetworkConfig:
     """Size and initialisation of actor and critic."""
 
-    hidden: Annotated[tuple[int, ...], Interval(ge=1, le=8192)] = (32, 32)
+    hidden: Annotated[tuple[int, ...], Interval(ge=1, le=4096)] = (32, 32)
     """Units of the hidden layers, the same for actor and critic."""
     init_std: Annotated[float, POSITIVE] = 0.8
     """Standard deviation of the action at the start."""
