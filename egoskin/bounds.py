@@ -14,7 +14,6 @@ import math
 import typing
 from collections.abc import Mapping
 from dataclasses import dataclass
-from numbers import Integral, Real
 from typing import Any
 
 
@@ -31,9 +30,9 @@ class Interval:
     le: float | None = None
     """Numbers are at most this."""
 
-    def violation(self, value: Real) -> str | None:
+    def violation(self, value: float) -> str | None:
         """Return what a number outside must be or not be; None for one inside."""
-        if isinstance(value, Integral):
+        if isinstance(value, int):
             # Compared as it is: one of 400 digits is no float.
             if not -(2**63) <= value < 2**63:
                 return "be a number of 64 bits"
@@ -78,7 +77,7 @@ def check_bounds(config: Any) -> None:
     for name, interval in _intervals(type(config)).items():
         value = getattr(config, name)
         for number in value if isinstance(value, tuple) else (value,):
-            if not isinstance(number, Real) or isinstance(number, bool):
+            if not isinstance(number, (int, float)) or isinstance(number, bool):
                 continue
             if wrong := interval.violation(number):
                 raise BoundsError(type(config), f"{name} must {wrong}, got {value}")
@@ -106,6 +105,8 @@ def path_to(owner: type, kind: type) -> str:
     for name, hint in typing.get_type_hints(kind).items():
         if hint is owner:
             return f"{name}."
-        if dataclasses.is_dataclass(hint) and (inner := path_to(owner, hint)):
-            return f"{name}.{inner}"
+        if isinstance(hint, type) and dataclasses.is_dataclass(hint):
+            inner = path_to(owner, hint)
+            if inner:
+                return f"{name}.{inner}"
     return ""

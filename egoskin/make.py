@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Literal
@@ -283,9 +283,7 @@ def make_env(
     )
     assert isinstance(one.base_env, DodgeballEnv)
     one.base_env.check_scene()
-    check_memory(env_memory(one, num_envs))
-    shared = "what workers and trainer exchange (num_envs, history, sensors)"
-    check_shared_memory(2 * num_envs * _row_bytes(one) + _SHARED_EXTRA, shared)
+    check_fits(one, num_envs)
     rows = num_envs // workers
     return WorkerPool(
         [
@@ -307,27 +305,26 @@ def make_env(
     )
 
 
-def env_memory(one: EnvBase, num_envs: int) -> dict[str, int]:
-    """Return what memory the agents of an environment take at least.
+def check_fits(
+    one: EnvBase, num_envs: int, others: Mapping[str, int] | None = None
+) -> None:
+    """Raise ValueError if an environment does not fit into the machine's memory.
 
     Args:
-        one: The environment of a single row.
+        one: The same of a single row.
         num_envs: Number of agents.
-
-    Returns:
-        Bytes, as `egoskin.memory.check_memory` takes them.
+        others: What else needs memory, as `egoskin.memory.check_memory` takes it.
     """
-    # The state before and after a step, in the workers and in what they share.
-    row = _SIMULATION + 4 * _row_bytes(one)
-    return {"the agents (num_envs or episodes, history, sensors)": num_envs * row}
-
-
-def _row_bytes(one: EnvBase) -> int:
-    """Return the size of what an environment of a single row gives in a step."""
-    return sum(
+    row = sum(
         spec.shape.numel() * spec.dtype.itemsize
         for spec in one.observation_spec.values(True, True)
     )
+    options = "(num_envs or episodes, history, sensors)"
+    # The state before and after a step, in the workers and in what they share.
+    agents = num_envs * (_SIMULATION + 4 * row)
+    check_memory({f"the agents {options}": agents, **(others or {})})
+    exchanged = f"what passes between the processes {options}"
+    check_shared_memory(2 * num_envs * row + _SHARED_EXTRA, exchanged)
 
 
 def check_num_workers(

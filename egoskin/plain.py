@@ -14,6 +14,8 @@ from egoskin.bounds import BoundsError, path_to
 from egoskin.files import read_regular
 
 T = TypeVar("T")
+# Deeper than anything that is written, and no trouble for what walks through it.
+_DEEPEST = 100
 
 
 def read_json(path: Path) -> Any:
@@ -25,9 +27,21 @@ def read_json(path: Path) -> Any:
     """
     content = read_regular(path)
     try:
-        return json.loads(content)
+        value = json.loads(content)
+        if _depth(value) > _DEEPEST:
+            raise ValueError(f"it is nested more than {_DEEPEST} deep")
+        return value
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not JSON: {error}") from error
+
+
+def _depth(value: Any) -> int:
+    """Return how deep lists and objects are nested."""
+    depth, level = 0, [value]
+    while level := [x for x in level if isinstance(x, (dict, list))]:
+        depth += 1
+        level = [y for x in level for y in (x.values() if isinstance(x, dict) else x)]
+    return depth
 
 
 def to_plain(value: Any) -> Any:

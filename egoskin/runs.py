@@ -33,7 +33,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any, TypeVar, get_args
 
 import numpy as np
 import torch
@@ -63,8 +63,7 @@ from egoskin.formats import (
     sealed_json,
     unseal,
 )
-from egoskin.make import EnvConfig, check_num_workers, env_memory, make_worker_env
-from egoskin.memory import check_memory
+from egoskin.make import EnvConfig, check_fits, check_num_workers, make_worker_env
 from egoskin.plain import changed_fields, from_plain, read_json, to_plain
 from egoskin.policies import (
     CHECKPOINT_NAME,
@@ -74,6 +73,8 @@ from egoskin.policies import (
 )
 from egoskin.sensors import Skin
 from egoskin.workers import available_cores
+
+T = TypeVar("T")
 
 _PACKAGES = ("egoskin", "torch", "torchrl", "tensordict", "mujoco", "numpy")
 _PACKAGES += ("pytorch-kinematics", "gymnasium")
@@ -377,7 +378,7 @@ class Run:
             return unseal({"starts": content}, what)[0]["starts"]
         if not isinstance(content, dict) or "sha256" not in content:
             raise ValueError(f"{what} is damaged or was edited")
-        return unseal(content, what)[0]["starts"]
+        return _a(list, unseal(content, what)[0].get("starts"), "starts", what)
 
     def record_start(self) -> None:
         """Add versions, machine, git state and command of this start to the log."""
@@ -494,12 +495,14 @@ class Run:
         """
         self.load_skin()
         tensors, header = load_tensors(self.checkpoint_path)
+        what = str(self.checkpoint_path)
         # Checkpoints of format 1 hold none of these.
         if "config" in header:
-            self._check_trained_with(header.pop("config"))
-        self._starts = header.pop("starts", [])
+            config = _a(dict, header.pop("config"), "config", what)
+            self._check_trained_with(config)
+        self._starts = _a(list, header.pop("starts", []), "starts", what)
         if _METRICS in tensors:
-            self._metrics = _text(tensors.pop(_METRICS))
+            self._metrics = _text(tensors.pop(_METRICS), what)
         else:
             self._metrics = _whole_rows(self._metrics_path, header.get("frames", 0))
         return tensors, header
@@ -513,7 +516,7 @@ class Run:
         if self.checkpoint_path.exists():
             tensors, _ = load_tensors(self.checkpoint_path)
             if _METRICS in tensors:
-                return _text(tensors[_METRICS])
+                return _text(tensors[_METRICS], str(self.checkpoint_path))
         if not self._metrics_path.is_file():
             raise ValueError(f"{self.path} has not been trained: it has no metrics.csv")
         return self._metrics_path.read_text()
@@ -583,21 +586,36 @@ def _check_memory(config: TrainConfig, skin: Skin) -> None:
         agent = spec.build_agent()
     weights = sum(value.numel() for value in agent_tensors(agent).values())
     read = sum(size for key, size in spec.sizes.items() if key not in sources)
-    check_memory(
-        {
-            **env_memory(one, config.num_envs),
-            # Weights, two moments and gradients, of four shares and all, in float32.
-            "the networks (ppo.network.hidden)": 32 * weights,
-            "a rollout (num_envs, ppo.rollout_steps, history)": 4
-            * read
-            * config.frames_per_batch,
-        }
-    )
+    others = {
+        # Weights, two moments and gradients, of four shares and all, in float32.
+        "the networks (ppo.network.hidden)": 32 * weights,
+        "a rollout (num_envs, ppo.rollout_steps, history)": 4
+        * read
+        * config.frames_per_batch,
+    }
+    check_fits(one, config.num_envs, others)
 
 
-def _text(characters: Tensor) -> str:
-    """Return the text that a checkpoint keeps as a tensor of bytes."""
-    return characters.numpy().tobytes().decode()
+def _a(kind: type[T], value: Any, name: str, what: str) -> T:
+    """Return what a file holds by a name; raise ValueError if it is of another kind."""
+    if not isinstance(value, kind):
+        raise ValueError(
+            f"{what} is damaged or was edited: its {name} must be a {kind.__name__}, "
+            f"not {type(value).__name__}"
+        )
+    return value
+
+
+def _text(characters: Tensor, what: str) -> str:
+    """Return the text that a checkpoint keeps as a tensor of bytes.
+
+    Raises:
+        ValueError: If it is none.
+    """
+    try:
+        return characters.numpy().tobytes().decode()
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{what} is damaged: its metrics are no text") from error
 
 
 def _whole_rows(path: Path, frames: int) -> str:

@@ -34,7 +34,6 @@ _MAX_LEAD_RATIO = 0.9
 _MAX_TRIES = 32
 # Bounds that leave every throw finite in float32 and MuJoCo a model that it can make.
 _Delay = Annotated[tuple[float, float], Interval(ge=0, le=1000)]
-_Delay = Annotated[tuple[float, float], Interval(ge=0, le=1000)]
 _Seconds = Annotated[tuple[float, float], Interval(gt=0, le=1000)]
 _MetresPerSecond = Annotated[tuple[float, float], Interval(ge=0.01, le=1000)]
 _Degrees = Annotated[tuple[float, float], Interval(ge=-360, le=360)]
