@@ -3,24 +3,27 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.envs import (
     Compose,
+    EnvBase,
     ExcludeTransform,
     Transform,
     TransformedEnv,
 )
 
+from egoskin.bounds import Interval, check_bounds
 from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
 from egoskin.envs.observations import HideObjects, Oracle, Privileged, Proprioception
 from egoskin.envs.standards import standard_of
+from egoskin.memory import check_memory, check_shared_memory
 from egoskin.parallel import WorkerPool, default_num_workers
 from egoskin.robots.config import ROBOTS, RobotConfig, RobotName
 from egoskin.sensors import History, Skin
@@ -29,6 +32,11 @@ from egoskin.sensors.geometry import STATE_KEYS
 from egoskin.storage.tensor_file import part, prefixed
 from egoskin.transform import StatefulTransform
 
+# More agents than this are a slip of the keyboard.
+_MOST_AGENTS, _MOST_WORKERS = 2**20, 1024
+# Memory of the simulation of one agent, and what workers share beside the tensors: it
+# is a page for each tensor at least [bytes].
+_SIMULATION, _SHARED_EXTRA = 12_000, 2**20
 MASK_ALL = ("all",)
 """Mask of all sensors, and of what an oracle is told."""
 # What the networks read of the transforms' results; the others stay as well.
@@ -51,13 +59,12 @@ class EnvConfig:
     """What the critic alone sees: also the balls, or (the paper's) the velocity."""
     previous_action: bool = False
     """Whether the actor, too, observes its action of the step before."""
-    history: int = 1
+    history: Annotated[int, Interval(ge=1, le=256)] = 1
     """Observations of this many steps, the present one included."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for no history, or gains that the robot does not have."""
-        if self.history < 1:
-            raise ValueError(f"history must be at least 1, got {self.history}")
+        """Raise ValueError for a history out of bounds, or gains of another robot."""
+        check_bounds(self)
         self.robot_config.joint_gains(self.task.physics.gains)
 
     @property
@@ -248,12 +255,20 @@ def make_env(
         mask: Links whose sensors detect nothing, or `MASK_ALL`.
 
     Raises:
-        ValueError: If the workers do not divide the agents, or as `make_worker_env`.
+        ValueError: If the workers do not divide the agents, they do not fit this
+            machine, MuJoCo cannot make the scene, or as `make_worker_env`.
     """
     workers = check_num_workers(num_envs, num_workers)
     if skin is None:
         # Once, not in each worker.
         skin = config.skin.build(config.robot_config)
+    # What cannot be made, or does not fit, is told of before the workers start.
+    one = make_worker_env(
+        config, skin, num_envs=1, seed=seed, bare=bare, sparse=sparse, mask=mask
+    )
+    assert isinstance(one.base_env, DodgeballEnv)
+    one.base_env.check_scene()
+    check_fits(one, num_envs)
     rows = num_envs // workers
     return WorkerPool(
         [
@@ -275,6 +290,28 @@ def make_env(
     )
 
 
+def check_fits(
+    one: EnvBase, num_envs: int, others: Mapping[str, int] | None = None
+) -> None:
+    """Raise ValueError if an environment does not fit into the machine's memory.
+
+    Args:
+        one: The same of a single row.
+        num_envs: Number of agents.
+        others: What else needs memory, as `egoskin.memory.check_memory` takes it.
+    """
+    row = sum(
+        spec.shape.numel() * spec.dtype.itemsize
+        for spec in one.observation_spec.values(True, True)
+    )
+    options = "(num_envs or episodes, history, sensors)"
+    # The state before and after a step, in the workers and in what they share.
+    agents = num_envs * (_SIMULATION + 4 * row)
+    check_memory({f"the agents {options}": agents, **(others or {})})
+    exchanged = f"what passes between the processes {options}"
+    check_shared_memory(2 * num_envs * row + _SHARED_EXTRA, exchanged)
+
+
 def check_num_workers(
     num_envs: int, num_workers: int | None, name: str = "num_envs"
 ) -> int:
@@ -286,14 +323,17 @@ def check_num_workers(
         name: How the number of agents was called, for the error text.
 
     Raises:
-        ValueError: If it does not divide the number of agents; the text lists what
-            does.
+        ValueError: If it does not divide the number of agents, then the text lists
+            what does; or if either is out of bounds.
     """
-    if num_envs < 1:
-        raise ValueError(f"{name} must be at least 1, got {num_envs}")
+    agents, processes = (num_envs, _MOST_AGENTS), (num_workers, _MOST_WORKERS)
+    for what, (number, most) in {name: agents, "num_workers": processes}.items():
+        wrong = number is not None and Interval(ge=1, le=most).violation(number)
+        if wrong:
+            raise ValueError(f"{what} must {wrong}, got {number}")
     if num_workers is None:
         return default_num_workers(num_envs)
-    if num_workers < 1 or num_envs % num_workers:
+    if num_envs % num_workers:
         limit = max(64, num_workers)
         fit = [n for n in range(1, min(num_envs, limit) + 1) if num_envs % n == 0]
         raise ValueError(

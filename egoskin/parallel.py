@@ -43,6 +43,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase, ParallelEnv, Transform, TransformedEnv
 
 from egoskin.interrupts import ENDING
+from egoskin.memory import is_out_of_memory
 
 # How long the parent sleeps between looks at its workers: first this share of the time
 # that the last step took, then at least this [s], and this share of the time it has
@@ -148,8 +149,9 @@ class WorkerEnv(TransformedEnv):
 def _reported(report: Path) -> Iterator[None]:
     try:
         yield
-    except Exception:
-        report.write_text(traceback.format_exc())
+    except Exception as error:
+        plain = is_out_of_memory(error)
+        report.write_text(f"{error}" if plain else traceback.format_exc())
         raise
 
 

@@ -15,6 +15,8 @@ MODULES = {
 
 # Small tools that many rooms share; the last ones import those before them.
 TOOLS = [
+    "bounds",
+    "memory",
     "rounding",
     "rng",
     "sparse",

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -18,6 +18,7 @@ from tensordict.nn import InteractionType, TensorDictModule
 from torch import Tensor, nn
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 
+from egoskin.bounds import POSITIVE, Interval, check_bounds
 from egoskin.sparse import SparseRows, SparseSource
 
 # Keys whose values are a skin's signals.
@@ -28,11 +29,11 @@ _SIGNAL_KEYS = ("signal",)
 class NetworkConfig:
     """Size and initialisation of actor and critic."""
 
-    hidden: tuple[int, ...] = (32, 32)
+    hidden: Annotated[tuple[int, ...], Interval(ge=1, le=4096)] = (32, 32)
     """Units of the hidden layers, the same for actor and critic."""
-    init_std: float = 0.8
+    init_std: Annotated[float, POSITIVE] = 0.8
     """Standard deviation of the action at the start."""
-    std_bounds: tuple[float, float] = (0.1, 1.0)
+    std_bounds: Annotated[tuple[float, float], POSITIVE] = (0.1, 1.0)
     """The standard deviation never leaves these bounds."""
     normalize: Literal["body", "all"] = "all"
     """Running normalisation of all but the skin's signals, or of everything. Signals
@@ -41,14 +42,15 @@ class NetworkConfig:
 
     def __post_init__(self) -> None:
         """Raise ValueError for sizes and bounds that make no network."""
+        check_bounds(self)
         low, high = self.std_bounds
         if not 0 < low <= self.init_std <= high:
             raise ValueError(
                 f"need 0 < std_bounds[0] <= init_std <= std_bounds[1], got init_std "
                 f"{self.init_std} and std_bounds ({low}, {high})"
             )
-        if not self.hidden or min(self.hidden) < 1:
-            raise ValueError(f"hidden must be positive sizes, got {self.hidden}")
+        if not self.hidden:
+            raise ValueError("hidden must be one size at least, got none")
 
 
 class RunningNorm(nn.Module):

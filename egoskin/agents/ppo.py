@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Annotated
 
 import torch
 from tensordict import NonTensorData, TensorDict, TensorDictBase
@@ -18,6 +18,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from egoskin.agents.networks import Agent, NetworkConfig, RunningNorm, input_keys
+from egoskin.bounds import COUNT, NOT_NEGATIVE, POSITIVE, SHARE, Interval, check_bounds
 from egoskin.sparse import SparseRows
 
 # Adaptive learning rate: bounds, and the largest factor of one update.
@@ -52,77 +53,47 @@ class PPOConfig:
 
     network: NetworkConfig = field(default_factory=NetworkConfig)
     """Size and initialisation of actor and critic."""
-    rollout_steps: int = 16
+    rollout_steps: Annotated[int, Interval(ge=1, le=100_000)] = 16
     """Control steps each agent collects for one update."""
-    ppo_epochs: int = 5
+    ppo_epochs: Annotated[int, Interval(ge=1, le=1000)] = 5
     """Passes over a rollout."""
-    num_mini_batches: int = 4
+    num_mini_batches: Annotated[int, COUNT] = 4
     """Minibatches in each pass."""
-    gamma: float = 0.995
+    gamma: Annotated[float, SHARE] = 0.995
     """Discount for each control step."""
-    gae_lambda: float = 0.8
+    gae_lambda: Annotated[float, SHARE] = 0.8
     """Decay of the generalised advantage estimate that the actor learns from."""
-    value_lambda: float | None = 0.95
+    value_lambda: Annotated[float | None, SHARE] = 0.95
     """Decay of the estimate that the critic learns from; None is gae_lambda."""
-    noise_correlation: float = 0.5
+    noise_correlation: Annotated[float, Interval(ge=0, lt=1)] = 0.5
     """Correlation of the exploration noise with that of the step before, within a
     rollout (white noise at 60 Hz hardly moves a body)."""
-    noise_correlation_start: int = 16_000_000
+    noise_correlation_start: Annotated[int, NOT_NEGATIVE] = 16_000_000
     """Frames before which the noise is white all the same."""
-    clip_epsilon: float = 0.2
-    """Clip range of the probability ratio."""
-    entropy_coeff: float = 0.003
+    clip_epsilon: Annotated[float, Interval(gt=0, le=1)] = 0.2
+    """Clip range of the probability ratio (its lower bound must have a logarithm)."""
+    entropy_coeff: Annotated[float, NOT_NEGATIVE] = 0.003
     """Weight of the entropy bonus at the start."""
-    entropy_frames: int | None = 65_536_000
+    entropy_frames: Annotated[int | None, COUNT] = 65_536_000
     """It falls linearly to zero over this many frames; None keeps it."""
-    critic_coeff: float = 1.0
+    critic_coeff: Annotated[float, POSITIVE] = 1.0
     """Weight of the value loss."""
-    learning_rate: float = 1e-3
+    learning_rate: Annotated[float, POSITIVE] = 1e-3
     """Adam's learning rate at the start."""
-    desired_kl: float | None = 0.02
+    desired_kl: Annotated[float | None, POSITIVE] = 0.02
     """Adapt it from update to update until one moves the policy by this divergence;
     None keeps it."""
-    max_grad_norm: float = 1.0
+    max_grad_norm: Annotated[float, POSITIVE] = 1.0
     """Gradient norm to clip at, for actor and critic separately."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for values outside their ranges."""
-        positive = (
-            "rollout_steps",
-            "ppo_epochs",
-            "num_mini_batches",
-            "clip_epsilon",
-            "learning_rate",
-            "max_grad_norm",
-            "desired_kl",
-            "entropy_frames",
-        )
-        for name in positive:
-            value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:
-                raise ValueError(f"{name} must be positive and finite, got {value}")
-        if self.clip_epsilon > 1:
-            # The bound 1 - clip_epsilon of the ratio would have no logarithm.
-            raise ValueError(f"clip_epsilon must be at most 1, got {self.clip_epsilon}")
+        check_bounds(self)
         low, high = _LR_BOUNDS
         if self.desired_kl is not None and not low <= self.learning_rate <= high:
             raise ValueError(
                 f"a learning_rate that is adapted (desired_kl) must be between {low:g} "
                 f"and {high:g}, got {self.learning_rate}"
-            )
-        for name in ("gamma", "gae_lambda", "value_lambda"):
-            value = getattr(self, name)
-            if value is not None and not 0 <= value <= 1:
-                raise ValueError(f"{name} must be between 0 and 1, got {value}")
-        if self.noise_correlation_start < 0:
-            raise ValueError(
-                f"noise_correlation_start must not be negative, got "
-                f"{self.noise_correlation_start}"
-            )
-        if not 0 <= self.noise_correlation < 1:
-            raise ValueError(
-                f"noise_correlation must be at least 0 and below 1, got "
-                f"{self.noise_correlation}"
             )
 
     def noise_correlation_at(self, frames: int) -> float:

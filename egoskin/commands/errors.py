@@ -7,15 +7,49 @@ import select
 import signal
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import Any
 
 import tyro
+from tyro.constructors import (
+    ConstructorRegistry,
+    PrimitiveConstructorSpec,
+    PrimitiveTypeInfo,
+)
 
 from egoskin.commands import unknown
 from egoskin.interrupts import ENDING, end_next_time, end_now, say, take
+from egoskin.memory import is_out_of_memory
 from egoskin.parallel import WorkerError
+
+NUMBERS = ConstructorRegistry()
+"""How options are read, while it is entered: a whole number also as 1e6."""
+
+
+@NUMBERS.primitive_rule
+def _whole_number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[int] | None:
+    if info.type is not int:
+        return None
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="INT",
+        instance_from_str=lambda texts: _read_whole(texts[0]),
+        is_instance=lambda value: isinstance(value, int),
+        str_from_instance=lambda value: [str(value)],
+    )
+
+
+def _read_whole(text: str) -> int:
+    """Return a whole number from "1000000", "1_000_000" or "1e6"."""
+    with suppress(ValueError):
+        return int(text)
+    with suppress(ValueError):
+        number = float(text)
+        # Beyond, not every whole number is a float.
+        if number.is_integer() and abs(number) < 2**53:
+            return int(number)
+    raise ValueError(f"expected a whole number, got {text}")
 
 
 class _Ended(KeyboardInterrupt):
@@ -26,22 +60,31 @@ class _Ended(KeyboardInterrupt):
 def clear_errors() -> Iterator[None]:
     """Turn what ends a command into one line on stderr and an exit status.
 
-    An error that the user can mend is ValueError (bad input) or OSError (files): status
-    2. A worker's end is status 1, and a signal 128 with its number added. If nobody
-    reads the output any more, that is no error. Anything else is a fault of ours and
-    keeps its traceback.
+    Within, `NUMBERS` says how options are read.
+
+    An error that the user can mend is status 2: ValueError (bad input), OSError
+    (files), too little memory, what is too large or too deep. A worker's end is status
+    1, and a signal 128 with its number added. If nobody reads the output any more, that
+    is no error. Anything else is a fault of ours and keeps its traceback.
     """
     before = {number: signal.getsignal(number) for number in ENDING}
     hook, sys.unraisablehook = sys.unraisablehook, _end_if_lost
     take(_raise, *ENDING)
     try:
         try:
-            yield
+            with NUMBERS:
+                yield
         finally:
             sys.stdout.flush()
     except WorkerError as error:
         raise SystemExit(f"error: {error}") from None
-    except (ValueError, OSError) as error:
+    except Exception as error:
+        if is_out_of_memory(error):
+            first, *_ = str(error).splitlines() or ["out of memory"]
+            print(f"error: too little memory: {first}", file=sys.stderr)
+            raise SystemExit(2) from None
+        if not isinstance(error, (ValueError, OSError, OverflowError, RecursionError)):
+            raise
         if isinstance(error, BrokenPipeError) and _nobody_reads():
             # What is left to be written is not tried again.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

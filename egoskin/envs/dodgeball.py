@@ -6,6 +6,7 @@ import math
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -13,6 +14,7 @@ from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from egoskin.bounds import Interval, check_bounds
 from egoskin.envs.balls import Balls
 from egoskin.envs.physics import (
     DEFAULT_ENGINE,
@@ -40,32 +42,25 @@ class DodgeballConfig:
     """The balls and how they are thrown."""
     reward: RewardConfig = field(default_factory=RewardConfig)
     """Weights of the reward terms."""
-    action_scale: float = 0.3
+    action_scale: Annotated[float, Interval(gt=0, le=100)] = 0.3
     """q* = q_default + action_scale x torque limit / kp x action, per joint. (It is not
     clipped to the joint's range: an ankle could then ask for little torque.)"""
-    episode_length_s: float = 10.0
+    episode_length_s: Annotated[float, Interval(gt=0, le=3600)] = 10.0
     """Episodes are truncated this long after the first throw [s]."""
-    success_s: float = 3.0
+    success_s: Annotated[float, Interval(gt=0, le=3600)] = 3.0
     """An episode not terminated until this long after the first throw succeeds [s]."""
     self_contact_ends: bool = False
     """Whether a robot that touches itself terminates the episode, as a fall does."""
-    start_joint_noise: float = 0.05
+    start_joint_noise: Annotated[float, Interval(ge=0, le=10)] = 0.05
     """Joints start uniformly within this of the default pose [rad]."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for values that make no episode."""
-        for name in ("action_scale", "success_s"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        steps = self.episode_length_s * self.physics.control_hz
-        if not 1 <= steps < math.inf:
+        check_bounds(self)
+        if self.episode_length_s * self.physics.control_hz < 1:
             raise ValueError(
-                f"episode_length_s must be finite and at least one control step, got "
+                "episode_length_s must be at least one control step, got "
                 f"{self.episode_length_s}"
-            )
-        if self.start_joint_noise < 0:
-            raise ValueError(
-                f"start_joint_noise must not be negative, got {self.start_joint_noise}"
             )
 
     @property
@@ -192,6 +187,10 @@ class DodgeballEnv(EnvBase):
                 self.scene, self.batch_size[0], num_threads=self._num_threads
             )
         return self._physics
+
+    def check_scene(self) -> None:
+        """Raise ValueError if MuJoCo cannot make the robot and the balls."""
+        _ = self.physics
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:

@@ -6,32 +6,41 @@ Adding a term is adding a weight to `RewardConfig` and a line to `reward_terms`.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Annotated
 
 import torch
 from torch import Tensor
 
+from egoskin.bounds import Interval, check_bounds
+
 # Width of the upright bonus: exp(-|g_xy|^2 / 0.2), as in common humanoid tasks.
 _UPRIGHT_WIDTH = 0.2
+# Beyond, the squares of returns are too large for float32 soon.
+_Weight = Annotated[float, Interval(ge=-1e6, le=1e6)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class RewardConfig:
     """Weights of the reward terms; a cost is negative. Units of reward per step."""
 
-    survival: float = 0.1
+    survival: _Weight = 0.1
     """For every control step without contact or fall."""
-    upright: float = 0.01
+    upright: _Weight = 0.01
     """Posture: times exp(-|gravity_xy|^2 / 0.2), the horizontal part in the base."""
-    posture: float = -0.05
+    posture: _Weight = -0.05
     """Posture: times the mean squared deviation from the default pose [rad^2]."""
-    energy: float = -5e-7
+    energy: _Weight = -5e-7
     """Times the mechanical power, sum |torque x velocity| [W]."""
-    drift_speed: float = -0.01
+    drift_speed: _Weight = -0.01
     """Drift: times the squared planar speed of the base [m^2/s^2]."""
-    drift_distance: float = -0.1
+    drift_distance: _Weight = -0.1
     """Drift: times the squared planar distance from the start [m^2], at most 4."""
-    action_rate: float = -5e-4
+    action_rate: _Weight = -5e-4
     """Times the mean squared change of the action since the last step."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for numbers out of bounds."""
+        check_bounds(self)
 
 
 TERMS = tuple(field.name for field in fields(RewardConfig))

@@ -8,13 +8,14 @@ pose the robot has at release. One bank of draws therefore serves every policy.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from torch import Tensor
 
+from egoskin.bounds import Interval, check_bounds
 from egoskin.rng import Stream, uniform
 from egoskin.robots.config import RobotConfig
 from egoskin.robots.kinematics import LinkKinematics, rotate
@@ -28,6 +29,12 @@ _NUM_AIM_POINTS, _AIM_SEED = 4096, 0
 # A robot that runs away faster than this share of the ball's speed is led as if it
 # ran at it; otherwise no throw could reach it.
 _MAX_LEAD_RATIO = 0.9
+# Bounds that leave every throw finite in float32 and MuJoCo a model that it can make.
+_Delay = Annotated[tuple[float, float], Interval(ge=0, le=1000)]
+_Seconds = Annotated[tuple[float, float], Interval(gt=0, le=1000)]
+_MetresPerSecond = Annotated[tuple[float, float], Interval(ge=0.01, le=1000)]
+_Degrees = Annotated[tuple[float, float], Interval(ge=-360, le=360)]
+_Metres = Annotated[tuple[float, float], Interval(gt=0, le=1000)]
 # Options that have an effect with one value of another alone.
 _ONLY_WITH = {
     "box_half_width": ("aim", "box"),
@@ -39,55 +46,42 @@ _ONLY_WITH = {
 class ThrowConfig:
     """The balls and how they are thrown; every range is drawn from uniformly."""
 
-    radius: float = 0.15
+    radius: Annotated[float, Interval(ge=1e-3, le=10)] = 0.15
     """Radius of the balls [m]."""
-    num_balls: int = 2
+    num_balls: Annotated[int, Interval(ge=1, le=100)] = 2
     """Balls thrown in turn, so that a slow one is not snatched away in flight."""
-    first_delay: tuple[float, float] = (0.0, 2.0)
+    first_delay: _Delay = (0.0, 2.0)
     """Time from the start of an episode to the first throw [s]: at a random moment no
     fixed programme pays, with (0, 0) a blind robot learns to duck at once."""
-    interval: tuple[float, float] = (1.0, 2.0)
+    interval: _Seconds = (1.0, 2.0)
     """Time from one throw to the next [s]."""
-    height: tuple[float, float] = (2.0, 3.0)
+    height: _Metres = (2.0, 3.0)
     """Height of release above ground [m]."""
-    distance: tuple[float, float] = (4.0, 6.0)
+    distance: _Metres = (4.0, 6.0)
     """Horizontal distance of release from the base [m]."""
-    speed: tuple[float, float] = (4.0, 8.0)
+    speed: _MetresPerSecond = (4.0, 8.0)
     """Initial speed [m/s]: its horizontal part if ballistic, else the whole."""
-    azimuth_deg: tuple[float, float] = (-180.0, 180.0)
+    azimuth_deg: _Degrees = (-180.0, 180.0)
     """Direction the ball comes from, relative to the robot's heading [deg]."""
     aim: Literal["skin", "body", "box"] = "skin"
     """A random point of the outer surface of the links that carry skin (the robot's
     ``skin_links``, whatever the skin), of the body (no shins, no feet), or of a box."""
-    box_half_width: float = 0.45
+    box_half_width: Annotated[float, Interval(ge=0, le=1000)] = 0.45
     """For aim=box: largest sideways offset from the base [m]."""
-    box_height: tuple[float, float] = (0.3, 1.8)
+    box_height: _Metres = (0.3, 1.8)
     """For aim=box: height above ground [m]."""
-    lead: float = 1.0
+    lead: Annotated[float, Interval(ge=0, le=10)] = 1.0
     """Share of the base's planar velocity by which the aim is led."""
     flight: Literal["ballistic", "straight"] = "straight"
     """With gravity, or without weight at constant speed (the last 2 m take longer)."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for what cannot be thrown, or has no effect."""
-        positive = ("interval", "height", "distance", "speed", "box_height")
-        for name in (*positive, "first_delay", "azimuth_deg"):
-            low, high = getattr(self, name)
-            if not low <= high:
-                raise ValueError(f"{name} must be (low, high), got ({low}, {high})")
-            if name in positive and low <= 0:
-                raise ValueError(f"{name} must be positive, got ({low}, {high})")
-        if not 0 <= self.first_delay[0] <= self.first_delay[1] < math.inf:
-            raise ValueError(
-                f"first_delay must be finite and not negative, got {self.first_delay}"
-            )
-        if self.num_balls < 1:
-            raise ValueError(f"num_balls must be at least 1, got {self.num_balls}")
-        for name in ("lead", "box_half_width"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(
-                    f"{name} must not be negative, got {getattr(self, name)}"
-                )
+        check_bounds(self)
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, tuple) and not value[0] <= value[1]:
+                raise ValueError(f"{field.name} must be (low, high), got {value}")
         for name, (option, value) in _ONLY_WITH.items():
             changed = getattr(self, name) != getattr(ThrowConfig, name)
             if changed and getattr(self, option) != value:

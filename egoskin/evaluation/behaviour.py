@@ -68,7 +68,7 @@ class Displacement:
     """Where the base is in the episodes that last to an age."""
 
     age: float
-    """Age [s]."""
+    """Age, from the first throw on [s]."""
     episodes: int
     """Number of these episodes."""
     mean: float | None
@@ -199,7 +199,7 @@ class Watcher:
         self._hit = self._arrived.clone()
         self._failed = torch.zeros(episodes, dtype=torch.bool)
         # Way and height at each age, of the episodes that last, [2, n].
-        self._base: dict[float, Tensor] = {}
+        self._base: dict[float, list[Tensor]] = {moment: [] for moment in _AGES}
         self._waited = self._fallen_waiting = 0
         self._waiting_speed = self._waiting_power = 0.0
         self._feet = _Feet(robot)
@@ -220,9 +220,9 @@ class Watcher:
         if self._step >= round(_SETTLED * self._hz):
             self._see_waiting(after[going & (age <= 0)])
         for moment in _AGES:
-            if self._step == round(moment * self._hz):
-                way = after["displacement_w"][going].square().sum(-1).sqrt()
-                self._base[moment] = torch.stack((way, after["base_pose"][going, 2]))
+            now = going & (age == round(moment * self._hz))
+            way = after["displacement_w"][now].square().sum(-1).sqrt()
+            self._base[moment].append(torch.stack((way, after["base_pose"][now, 2])))
         self._see_balls(after, running)
         # A blow, a fall or a failed simulation is not how the policy moves.
         self._see_motion(before[going], after[going])
@@ -282,7 +282,7 @@ class Watcher:
         """Return where the base was at each age."""
         result = []
         for age in _AGES:
-            way, height = self._base.get(age, torch.zeros(2, 0))
+            way, height = torch.cat([torch.zeros(2, 0), *self._base[age]], 1)
             some = len(way) > 0
             result.append(
                 Displacement(

@@ -11,16 +11,15 @@ import torch
 import tyro
 
 from egoskin.agents.ppo import PPOConfig
+from egoskin.bounds import COUNT, POSITIVE, check_bounds
 from egoskin.envs.dodgeball import DodgeballConfig
-from egoskin.envs.standards import Standard, training_task
+from egoskin.envs.standards import CUSTOM, Standard, training_task
 from egoskin.make import EnvConfig, check_num_workers
 from egoskin.parallel import available_cores
 from egoskin.rng import check_seed
 from egoskin.storage.formats import present_config, read_sealed
 from egoskin.storage.serialization import (
     changed_fields,
-    check_counts,
-    check_numbers,
     from_plain,
     to_plain,
 )
@@ -39,7 +38,7 @@ class TrainConfig:
     throw or end given beside it makes the task custom."""
     seed: int = 0
     """Seed of everything random: throws, starts, networks, actions."""
-    total_frames: int = 65_536_000
+    total_frames: Annotated[int, COUNT] = 65_536_000
     """Environment steps of the whole run (the paper's 1000 epochs)."""
     num_envs: int = 4096
     """Agents simulated in parallel."""
@@ -47,13 +46,13 @@ class TrainConfig:
     """Processes that simulate; None: the largest divisor of num_envs <= cores."""
     device: str = "cpu"
     """Device of the learner ("cpu", "cuda", "cuda:1")."""
-    learner_threads: int | None = None
+    learner_threads: Annotated[int | None, COUNT] = None
     """Threads of the learner; None: one for each core."""
     run_dir: Path | None = None
     """Folder of the run; None: a new one under runs/, named after time and sensor."""
-    snapshot_frames: int = 5_000_000
+    snapshot_frames: Annotated[int, COUNT] = 5_000_000
     """Environment steps between the policies kept for learning curves."""
-    checkpoint_interval: float = 60.0
+    checkpoint_interval: Annotated[float, POSITIVE] = 60.0
     """A checkpoint is at most this old [s]."""
     resume: Path | None = None
     """Run folder to go on with; changed may be --total-frames, to a later end, and what
@@ -61,14 +60,18 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         """Raise ValueError for values with which no run can start."""
-        check_numbers(self, may_be_infinite=("env.sensor.range",))
-        check_counts(self, "total_frames", "snapshot_frames", "learner_threads")
+        check_bounds(self)
         check_seed(self.seed)
-        if not self.checkpoint_interval > 0:
-            raise ValueError(
-                f"checkpoint_interval must be positive, got {self.checkpoint_interval}"
-            )
         check_num_workers(self.num_envs, self.num_workers)
+        if self.standard is not None and self.env.standard not in (
+            self.standard,
+            CUSTOM,
+        ):
+            raise ValueError(
+                f"standard={self.standard} is for the command line, and the task is of "
+                f"standard {self.env.standard}: build one with egoskin.envs.standards."
+                f"training_task({self.standard!r}, DodgeballConfig())"
+            )
         frames = self.num_envs * self.ppo.rollout_steps
         if frames < self.ppo.num_mini_batches:
             raise ValueError(

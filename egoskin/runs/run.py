@@ -31,13 +31,19 @@ import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from egoskin.policies.policy import CHECKPOINT_NAME
+from egoskin.make import check_fits, make_worker_env
+from egoskin.policies.policy import (
+    CHECKPOINT_NAME,
+    PolicySpec,
+    agent_tensors,
+    sparse_sources,
+)
 from egoskin.runs.config import (
     CALL_FIELDS,
     MACHINE_FIELDS,
@@ -69,6 +75,8 @@ from egoskin.storage.tensor_file import (
     write_file,
 )
 
+T = TypeVar("T")
+
 _PACKAGES = ("egoskin", "torch", "torchrl", "tensordict", "mujoco", "numpy")
 _PACKAGES += ("pytorch-kinematics", "gymnasium")
 
@@ -98,11 +106,13 @@ class Run:
         """Return a new run folder that holds the configuration and the skin.
 
         Raises:
-            ValueError: If the folder holds anything already, or the skin is none.
+            ValueError: If the folder holds anything already, the skin is none, or there
+                is too little memory.
         """
         skin = config.env.skin.build(config.env.robot_config)
         # Sensors that do not fit each other are found now, not in a worker.
         config.env.sensor.filled(skin)
+        _check_memory(config, skin)
         path = config.run_dir
         if path is None:
             kind = config.env.sensor.label()
@@ -193,7 +203,7 @@ class Run:
             return unseal({"starts": content}, what)[0]["starts"]
         if not isinstance(content, dict) or "sha256" not in content:
             raise ValueError(f"{what} is damaged or was edited")
-        return unseal(content, what)[0]["starts"]
+        return _a(list, unseal(content, what)[0].get("starts"), "starts", what)
 
     def record_start(self) -> None:
         """Add versions, machine, git state and command of this start to the log."""
@@ -310,12 +320,14 @@ class Run:
         """
         self.load_skin()
         tensors, header = load_tensors(self.checkpoint_path)
+        what = str(self.checkpoint_path)
         # Checkpoints of format 1 hold none of these.
         if "config" in header:
-            self._check_trained_with(header.pop("config"))
-        self._starts = header.pop("starts", [])
+            config = _a(dict, header.pop("config"), "config", what)
+            self._check_trained_with(config)
+        self._starts = _a(list, header.pop("starts", []), "starts", what)
         if _METRICS in tensors:
-            self._metrics = _text(tensors.pop(_METRICS))
+            self._metrics = _text(tensors.pop(_METRICS), what)
         else:
             self._metrics = _whole_rows(self._metrics_path, header.get("frames", 0))
         return tensors, header
@@ -329,7 +341,7 @@ class Run:
         if self.checkpoint_path.exists():
             tensors, _ = load_tensors(self.checkpoint_path)
             if _METRICS in tensors:
-                return _text(tensors[_METRICS])
+                return _text(tensors[_METRICS], str(self.checkpoint_path))
         if not self._metrics_path.is_file():
             raise ValueError(f"{self.path} has not been trained: it has no metrics.csv")
         return self._metrics_path.read_text()
@@ -388,9 +400,47 @@ class Run:
             self._events.close()
 
 
-def _text(characters: Tensor) -> str:
-    """Return the text that a checkpoint keeps as a tensor of bytes."""
-    return characters.numpy().tobytes().decode()
+def _check_memory(config: TrainConfig, skin: Skin) -> None:
+    """Raise ValueError if a training cannot fit into the memory of this machine."""
+    sources = sparse_sources(config.env, skin)
+    one = make_worker_env(
+        config.env, skin, num_envs=1, seed=config.seed, sparse=bool(sources)
+    )
+    spec = PolicySpec.of(config.env, skin, config.ppo.network, one, sources)
+    with torch.device("meta"):
+        agent = spec.build_agent()
+    weights = sum(value.numel() for value in agent_tensors(agent).values())
+    read = sum(size for key, size in spec.sizes.items() if key not in sources)
+    others = {
+        # Weights, two moments and gradients, of four shares and all, in float32.
+        "the networks (ppo.network.hidden)": 32 * weights,
+        "a rollout (num_envs, ppo.rollout_steps, history)": 4
+        * read
+        * config.frames_per_batch,
+    }
+    check_fits(one, config.num_envs, others)
+
+
+def _a(kind: type[T], value: Any, name: str, what: str) -> T:
+    """Return what a file holds by a name; raise ValueError if it is of another kind."""
+    if not isinstance(value, kind):
+        raise ValueError(
+            f"{what} is damaged or was edited: its {name} must be a {kind.__name__}, "
+            f"not {type(value).__name__}"
+        )
+    return value
+
+
+def _text(characters: Tensor, what: str) -> str:
+    """Return the text that a checkpoint keeps as a tensor of bytes.
+
+    Raises:
+        ValueError: If it is none.
+    """
+    try:
+        return characters.numpy().tobytes().decode()
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{what} is damaged: its metrics are no text") from error
 
 
 def _whole_rows(path: Path, frames: int) -> str:

@@ -8,13 +8,12 @@ replaces a checkpoint.
 from __future__ import annotations
 
 import dataclasses
-import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -23,6 +22,7 @@ from torch import Tensor
 from egoskin.agents.networks import Agent
 from egoskin.agents.ppo import PPO, NonFiniteError
 from egoskin.agents.rollout import collect
+from egoskin.bounds import NOT_NEGATIVE, POSITIVE, check_bounds
 from egoskin.envs.rewards import TERMS
 from egoskin.envs.state import keys_read_by
 from egoskin.make import load_env_state, make_env, save_env_state
@@ -52,19 +52,16 @@ METRIC_KEYS = (*keys_read_by("trainer"), "reward", "terminated")
 class Progress:
     """How far a training has come: what a checkpoint holds beside tensors."""
 
-    frames: int
+    frames: Annotated[int, NOT_NEGATIVE]
     """Environment steps learnt from."""
-    wall_s: float
+    wall_s: Annotated[float, NOT_NEGATIVE]
     """Time that took [s]."""
-    learning_rate: float
+    learning_rate: Annotated[float, POSITIVE]
     """Present learning rate."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for numbers that no training comes to."""
-        if self.frames < 0 or not 0 <= self.wall_s < math.inf:
-            raise ValueError(f"frames or wall_s cannot be, in {self}")
-        if not 0 < self.learning_rate < math.inf:
-            raise ValueError(f"learning_rate cannot be, in {self}")
+        check_bounds(self)
 
 
 class Trainer:

@@ -7,12 +7,13 @@ import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from tensordict import TensorDictBase
 from torchrl.envs import Transform
 
+from egoskin.bounds import NOT_NEGATIVE, Interval, check_bounds
 from egoskin.rng import offset_seed
 from egoskin.robots.config import RobotConfig
 from egoskin.sensors.field import FieldSensor
@@ -22,7 +23,7 @@ from egoskin.sensors.imperfections.presets import PRESETS
 from egoskin.sensors.ray import RaySensor, SparseRays
 from egoskin.sensors.signals import Binary, Localization, Proximity, SkinOrder
 from egoskin.sensors.skin.coverage import Field, Ray
-from egoskin.sensors.skin.placement import place_sensors
+from egoskin.sensors.skin.placement import MAX_SENSORS, place_sensors
 from egoskin.sensors.skin.skin import Skin
 from egoskin.shapes import Shape
 
@@ -36,23 +37,35 @@ class SkinConfig:
 
     path: Path | None = None
     """Skin file; None places sensors at random on the upper body."""
-    num_sensors: int = 64
-    """Number of sensors to place (ignored with a file)."""
-    seed: int = 0
-    """Seed of the placement (ignored with a file)."""
+    num_sensors: Annotated[int, Interval(ge=1, le=MAX_SENSORS)] = 64
+    """Number of sensors to place (none with a file)."""
+    seed: Annotated[int, NOT_NEGATIVE] = 0
+    """Seed of the placement (none with a file)."""
     placement: Literal["area_uniform", "poisson_disk"] = "area_uniform"
     """Independent points or well-spread ones; `egoskin skin` has more to choose."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for numbers out of bounds."""
+        check_bounds(self)
 
     def build(self, robot: RobotConfig) -> Skin:
         """Return the skin, checked against the robot.
 
         Raises:
-            ValueError: If the file is no skin of this robot.
+            ValueError: If the file is no skin of this robot, or there is one and an
+                option of placing sensors, too.
         """
         if self.path is None:
             return place_sensors(
                 robot, self.num_sensors, self.seed, method=self.placement
             )
+        # Here, not at construction: runs and policies of before are still read.
+        for name in ("num_sensors", "seed", "placement"):
+            if getattr(self, name) != getattr(SkinConfig, name):
+                raise ValueError(
+                    f"skin.{name} has no effect beside skin.path: the sensors are "
+                    f"those of the file {self.path}"
+                )
         skin = Skin.load(self.path)
         # Robots of one maker name their links alike.
         if skin.robot != robot.name:
@@ -91,7 +104,7 @@ class SensorConfig:
     but the truth: position and velocity of every ball, to find the task's ceiling."""
     signal: Literal["localization", "proximity", "closeness", "binary"] = "proximity"
     """Ball position if any sensor detects it; distance / range; 1 - that; in range?"""
-    range: float = 2.0
+    range: Annotated[float, Interval(ge=1e-3, le=math.inf)] = 2.0
     """Detection range [m], to the ball's surface; "inf" is allowed."""
     field: Field = dataclasses.field(default_factory=Field)
     """Field sensors."""
@@ -114,9 +127,8 @@ class SensorConfig:
     """The position of the ball (signal=localization)."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for a range that is not positive, or what has no effect."""
-        if not self.range > 0:
-            raise ValueError(f"the sensor range must be positive, got {self.range}")
+        """Raise ValueError for a range out of bounds, or what has no effect."""
+        check_bounds(self)
         if not self.uses_skin:
             ignored = {
                 "reduce": self.reduce != "none",

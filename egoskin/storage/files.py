@@ -71,6 +71,8 @@ def check_output(path: Path | None, option: str) -> None:
     if os.path.isdir(path):
         raise ValueError(f"{option}: {path} is a folder")
     try:
+        # To open one waits for a reader; that of a shell or /dev/stdout has no path.
+        pipe = path.is_fifo() and os.path.lexists(os.path.realpath(path))
         new = not os.path.lexists(path)
         if new or path.is_file():
             # Appending nothing changes nothing.
@@ -80,6 +82,8 @@ def check_output(path: Path | None, option: str) -> None:
     except OSError as error:
         text = f"{option}: {path} cannot be written ({error.strerror})"
         raise ValueError(text) from None
+    if pipe:
+        raise ValueError(f"{option}: {path} is a named pipe, not a file")
 
 
 def _open_without_waiting(path: str, flags: int) -> int:

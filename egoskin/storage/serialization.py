@@ -5,15 +5,17 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Collection
 from pathlib import Path
 from typing import Any, TypeVar
 
 import dacite
 
+from egoskin.bounds import BoundsError, path_to
 from egoskin.storage.files import read_regular
 
 T = TypeVar("T")
+# Deeper than anything that is written, and no trouble for what walks through it.
+_DEEPEST = 100
 
 
 def read_json(path: Path) -> Any:
@@ -25,9 +27,21 @@ def read_json(path: Path) -> Any:
     """
     content = read_regular(path)
     try:
-        return json.loads(content)
+        value = json.loads(content)
+        if _depth(value) > _DEEPEST:
+            raise ValueError(f"it is nested more than {_DEEPEST} deep")
+        return value
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not JSON: {error}") from error
+
+
+def _depth(value: Any) -> int:
+    """Return how deep lists and objects are nested."""
+    depth, level = 0, [value]
+    while level := [x for x in level if isinstance(x, (dict, list))]:
+        depth += 1
+        level = [y for x in level for y in (x.values() if isinstance(x, dict) else x)]
+    return depth
 
 
 def to_plain(value: Any) -> Any:
@@ -47,29 +61,6 @@ def to_plain(value: Any) -> Any:
     return value
 
 
-def check_numbers(
-    content: Any, may_be_infinite: Collection[str] = (), name: str = ""
-) -> None:
-    """Raise ValueError if a configuration holds a number that is not finite.
-
-    Args:
-        content: A dataclass, or what is in one.
-        may_be_infinite: Dotted names of fields that may be infinite, but not NaN.
-        name: Dotted name of the content, for the error text.
-    """
-    if dataclasses.is_dataclass(content):
-        for field in dataclasses.fields(content):
-            inner = f"{name}.{field.name}".lstrip(".")
-            check_numbers(getattr(content, field.name), may_be_infinite, inner)
-    elif isinstance(content, (tuple, list)):
-        for value in content:
-            check_numbers(value, may_be_infinite, name)
-    elif isinstance(content, float) and not math.isfinite(content):
-        if name in may_be_infinite and not math.isnan(content):
-            return
-        raise ValueError(f"{name} must be a finite number, got {content}")
-
-
 def check_counts(config: Any, *names: str) -> None:
     """Raise ValueError if a field that counts something is below 1; None is left."""
     for name in names:
@@ -87,7 +78,8 @@ def from_plain(kind: type[T], content: Any, what: str) -> T:
         what: Where they came from, for the error text.
 
     Raises:
-        ValueError: If a field is unknown or of the wrong type; the text names it.
+        ValueError: If a field is unknown, of the wrong type or out of bounds; the text
+            names it.
     """
     if not isinstance(content, dict):
         raise ValueError(f"{what}: expected an object, got {type(content).__name__}")
@@ -95,6 +87,8 @@ def from_plain(kind: type[T], content: Any, what: str) -> T:
     config = dacite.Config(type_hooks=hooks, strict=True)
     try:
         return dacite.from_dict(kind, _with_tuples(content), config)
+    except BoundsError as error:
+        raise ValueError(f"{what}: {path_to(error.owner, kind)}{error}") from error
     # The last is what a configuration itself refuses.
     except (dacite.DaciteError, ValueError) as error:
         raise ValueError(f"{what}: {error}") from error
@@ -112,7 +106,10 @@ def _with_tuples(content: Any) -> Any:
 def _float(value: Any) -> Any:
     """Return a number as float, "inf" too; anything else is left to be refused."""
     whole = isinstance(value, int) and not isinstance(value, bool)
-    return float(value) if whole or value in ("inf", "-inf") else value
+    try:
+        return float(value) if whole or value in ("inf", "-inf") else value
+    except OverflowError as error:
+        raise ValueError("a number of hundreds of digits is none that fits") from error
 
 
 def _path(value: Any) -> Any:

@@ -8,9 +8,11 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 from egoskin.commands.errors import clear_errors
 from egoskin.parallel import WorkerError
+from egoskin.runs.config import parse_config
 from egoskin.storage.files import check_output
 
 
@@ -31,6 +33,74 @@ def test_a_file_that_cannot_be_written_is_told_of_before_the_work(tmp_path):
     for path in (tmp_path / ("x" * 300), Path("/proc/new.json")):
         with pytest.raises(ValueError, match=rf"--json: {path} cannot be written \("):
             check_output(path, "--json")
+
+
+def test_a_named_pipe_is_no_file_to_write(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(ValueError, match=r"--json: .*pipe is a named pipe"):
+        check_output(tmp_path / "pipe", "--json")
+    # As a shell passes `>(gzip > out.gz)`.
+    read, write = os.pipe()
+    check_output(Path(f"/dev/fd/{write}"), "--json")
+    os.close(read)
+    os.close(write)
+
+
+@pytest.mark.parametrize("text", ["1e6", "1_000_000", "1000000", "1.0e6"])
+def test_a_whole_number_may_have_an_exponent(text):
+    with clear_errors():
+        assert parse_config(["--total-frames", text]).total_frames == 10**6
+
+
+@pytest.mark.parametrize("text", ["1.5", "inf", "nan", "1e400", "1e30", "x"])
+def test_what_is_no_whole_number_is_refused(text, capsys):
+    with pytest.raises(SystemExit) as ended, clear_errors():
+        parse_config(["--total-frames", text])
+    assert ended.value.code == 2
+    assert f"expected a whole number, got {text}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (["--ppo.network.hidden", "0"], "ppo.network: hidden must be at least 1"),
+        (["--ppo.critic-coeff", "-1"], "ppo: critic_coeff must be positive"),
+        (["--num-workers", "1e9"], "num_workers must be at most 1,024"),
+    ],
+)
+def test_a_number_out_of_bounds_is_named_with_its_option(args, message, capsys):
+    with pytest.raises(SystemExit) as ended, clear_errors():
+        parse_config(args)
+    assert ended.value.code == 2
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("error", "text"),
+    [
+        (MemoryError(), "too little memory: out of memory"),
+        (RuntimeError("can't start new thread"), "too little memory: can't start new"),
+        (OverflowError("int too large to convert"), "int too large to convert"),
+        (RecursionError("maximum recursion depth"), "maximum recursion depth"),
+    ],
+)
+def test_what_is_too_much_for_the_machine_is_one_line(error, text, capsys):
+    with pytest.raises(SystemExit) as ended, clear_errors():
+        raise error
+    assert ended.value.code == 2
+    assert capsys.readouterr().err.startswith(f"error: {text}")
+
+
+def test_more_than_torch_can_allocate_is_one_line(capsys):
+    with pytest.raises(SystemExit), clear_errors():
+        torch.empty(2**50)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: too little memory")
+
+
+def test_a_fault_of_ours_keeps_its_traceback():
+    with pytest.raises(RuntimeError, match="ours"), clear_errors():
+        raise RuntimeError("ours")
 
 
 def test_a_pipe_that_nobody_reads_is_no_error(monkeypatch, capfd):

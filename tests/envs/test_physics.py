@@ -448,7 +448,14 @@ def test_a_diverged_row_is_told_and_finite_and_harms_no_other(
 @pytest.mark.parametrize("name", ["control_hz", "substeps"])
 @pytest.mark.parametrize("value", [0, -1])
 def test_rates_that_are_not_positive_are_refused(name, value):
-    with pytest.raises(ValueError, match=f"{name} must be positive, got {value}"):
+    with pytest.raises(ValueError, match=f"{name} must be at least 1, got {value}"):
+        PhysicsConfig(**{name: value})
+
+
+@pytest.mark.parametrize("name", ["control_hz", "substeps", "solver_iterations"])
+@pytest.mark.parametrize("value", [2**31, 10**400])
+def test_rates_and_counts_that_mujoco_cannot_hold_are_refused(name, value):
+    with pytest.raises(ValueError, match=f"{name} must be .*, got {value}"):
         PhysicsConfig(**{name: value})
 
 

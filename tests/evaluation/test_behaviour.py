@@ -308,6 +308,19 @@ def test_displacement_is_that_of_the_episodes_that_last():
     assert (five.age, five.episodes, five.height) == (5.0, 0, None)
 
 
+def test_displacement_is_of_an_age_from_the_first_throw_on():
+    watcher = Watcher(make(), 0, 2)
+    first = torch.tensor([[0], [30]])
+    for step in range(1, 121):
+        way = torch.tensor([[float(step), 0.0]]).expand(2, 2)
+        after = state(2, displacement_w=way, first_throw_step=first)
+        watcher(state(2), after, torch.ones(2, dtype=torch.bool))
+    one, two, *_ = watcher.displacement()
+    # Steps 60 and 90; 120 and, not reached, 150.
+    assert (one.episodes, one.mean) == (2, 75.0)
+    assert (two.episodes, two.mean) == (1, 120.0)
+
+
 def test_watching_changes_no_figure():
     config = EnvConfig()
     skin = config.skin.build(H1_2)

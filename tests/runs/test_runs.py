@@ -127,6 +127,14 @@ def test_a_standard_sets_throws_and_ends(args, version):
     assert config.seed == 3
 
 
+def test_a_standard_that_sets_nothing_is_refused():
+    # Only the command line can tell what is a default and what was given.
+    with pytest.raises(ValueError, match=r"is of standard 2: .*training_task\('1'"):
+        TrainConfig(standard="1")
+    task = training_task("1", DodgeballConfig())
+    assert TrainConfig(standard="1", env=EnvConfig(task=task)).env.standard == "1"
+
+
 def test_a_throw_or_an_end_beside_a_standard_makes_it_custom():
     lead = parse_config(["--standard", "1", "--task.throws.lead", "0.5"]).env
     assert lead.standard == "custom"

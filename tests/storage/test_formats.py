@@ -148,6 +148,56 @@ def test_a_damaged_file_of_a_run_never_loads_changed(name: str, run: Path):
     assert name == "metrics.csv" or refused > 150
 
 
+def rewrite_header(run: Path, **changes: Any) -> None:
+    tensors, header = load_tensors(run / "checkpoint.safetensors")
+    save_tensors(run / "checkpoint.safetensors", tensors, {**header, **changes})
+
+
+@pytest.mark.parametrize("name", ["config", "starts", "policy"])
+@pytest.mark.parametrize("value", [5, "x", None])
+def test_what_a_checkpoint_holds_must_be_of_its_kind(name, value, run: Path):
+    rewrite_header(run, **{name: value})
+    with pytest.raises(
+        ValueError, match=r"checkpoint\.safetensors (is damaged|holds no)"
+    ):
+        egoskin.load_policy(run) if name == "policy" else Run.open(
+            run
+        ).load_checkpoint()
+
+
+@pytest.mark.parametrize("content", [{}, {"starts": 5}, {"starts": None}])
+def test_a_log_of_starts_that_holds_none_is_named(content, run: Path):
+    (run / "versions.json").write_bytes(sealed_json(content))
+    with pytest.raises(
+        ValueError, match=r"versions\.json is damaged .* starts must be"
+    ):
+        Run.open(run).starts()
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("num_envs", 10**9, "num_envs must be at most"),
+        ("seed", 10**400, "seed must be a number of 64 bits"),
+        ("checkpoint_interval", 10**400, "a number of hundreds of digits"),
+    ],
+    ids=["agents", "whole", "float"],
+)
+def test_a_number_too_large_in_a_stored_configuration_is_named(
+    field, value, message, run: Path
+):
+    rewrite(run / "config.json", lambda content: content.update({field: value}))
+    with pytest.raises(ValueError, match=rf"config\.json: {message}"):
+        Run.open(run)
+
+
+def test_json_nested_too_deep_is_named(run: Path):
+    for content in ("[" * 100_000 + "]" * 100_000, '{"a":' * 900 + "1" + "}" * 900):
+        (run / "config.json").write_text(content)
+        with pytest.raises(ValueError, match=r"config\.json"):
+            Run.open(run)
+
+
 def test_no_order_of_keys_matters():
     content = {"b": [1, 2.5, "x"], "a": {"d": None, "c": True}}
     tensors = {"y": torch.ones(2), "x": torch.zeros(3, dtype=torch.int64)}

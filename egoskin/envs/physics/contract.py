@@ -24,10 +24,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 from torch import Tensor
 
+from egoskin.bounds import Interval, check_bounds
 from egoskin.robots.config import RobotConfig
 from egoskin.shapes import Shape
 
@@ -41,18 +42,16 @@ class PhysicsConfig:
 
     gains: str = "rotor_inertia"
     """Named PD gain set of the robot ("real", "rotor_inertia")."""
-    control_hz: float = 60.0
+    control_hz: Annotated[float, Interval(ge=1, le=1000)] = 60.0
     """Rate at which the policy acts [Hz]."""
-    substeps: int = 2
+    substeps: Annotated[int, Interval(ge=1, le=1000)] = 2
     """Physics steps in each control step."""
     target_velocity: Literal["zero", "finite_difference"] = "zero"
     """Velocity target of the PD law: 0, or the change of the position target."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for rates and counts that are not positive."""
-        for name in ("control_hz", "substeps"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        """Raise ValueError for numbers out of bounds."""
+        check_bounds(self)
 
     @property
     def timestep(self) -> float:

@@ -98,7 +98,11 @@ def build_scene(scene: Scene) -> mujoco.MjModel:
         actuator.gainprm[0] = p
         actuator.biasprm[1:3] = -p, -d
     _add_contact_sensors(spec, scene)
-    return spec.compile()
+    try:
+        return spec.compile()
+    except (ValueError, mujoco.FatalError) as error:
+        text = " ".join(str(error).split())
+        raise ValueError(f"MuJoCo cannot make the scene: {text}") from error
 
 
 def _add_contact_sensors(spec: mujoco.MjSpec, scene: Scene) -> None:

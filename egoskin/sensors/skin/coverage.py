@@ -9,16 +9,18 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from numbers import Integral
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
+
+from egoskin.bounds import Interval, check_bounds
 
 
 @dataclass(frozen=True, kw_only=True)
 class Field:
     """The closest point of an object around the sensor, whatever its direction."""
 
-    half_angle_deg: float = 180.0
+    half_angle_deg: Annotated[float, Interval(gt=0, le=180)] = 180.0
     """Angle from the normal within which the closest point must lie [deg]: 180 all
     around, 90 the outer hemisphere, less a cone."""
     measure: Literal["surface", "centre"] = "surface"
@@ -29,11 +31,8 @@ class Field:
 
     def __post_init__(self) -> None:
         """Raise ValueError for an angle that is no cone, or an unknown measure."""
+        check_bounds(self)
         _check_choice("measure", self.measure, ("surface", "centre"))
-        if not 0 < self.half_angle_deg <= 180:
-            raise ValueError(
-                f"half_angle_deg must be in (0, 180], got {self.half_angle_deg}"
-            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,28 +43,27 @@ class Ray:
     corner.
     """
 
-    grid: tuple[int, int] = (8, 8)
+    grid: Annotated[tuple[int, int], Interval(le=1024)] = (8, 8)
     """Zones along the sensor's y and x: (rows, columns)."""
-    fov_deg: float = 63.0
+    fov_deg: Annotated[float, Interval(gt=0, lt=180)] = 63.0
     """Full angle of the field of view [deg]."""
     fov: Literal["diagonal", "axis"] = "diagonal"
     """Whether the angle is measured corner to corner or along each axis."""
     beams: Literal["centres", "edges"] = "centres"
     """Beams through the zones' centres, or spread from edge to edge of the view."""
-    sub_beams: int = 1
+    sub_beams: Annotated[int, Interval(le=64)] = 1
     """A zone reads the closest of this many squared beams, spread over it evenly."""
     measure: Literal["beam", "depth"] = "beam"
     """Distance along the beam, or its component along the normal."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for no zones, a view that is no pyramid, unknown words."""
+        check_bounds(self)
         _check_choice("fov", self.fov, ("diagonal", "axis"))
         _check_choice("beams", self.beams, ("centres", "edges"))
         _check_choice("measure", self.measure, ("beam", "depth"))
         if len(self.grid) != 2 or not all(map(_is_positive, self.grid)):
             raise ValueError(f"grid must be two positive integers, got {self.grid}")
-        if not 0 < self.fov_deg < 180:
-            raise ValueError(f"fov_deg must be in (0, 180), got {self.fov_deg}")
         if not _is_positive(self.sub_beams):
             raise ValueError(
                 f"sub_beams must be a positive integer, got {self.sub_beams}"

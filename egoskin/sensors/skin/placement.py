@@ -29,7 +29,7 @@ _DARTS_PER_SQUARE = 40
 # are thrown only for a number of sensors, so many at once.
 _MAX_DARTS = 2_000_000
 # Of more the candidates alone would fill the memory.
-_MAX_SENSORS = _MAX_DARTS // _CANDIDATES
+MAX_SENSORS = _MAX_DARTS // _CANDIDATES
 # Points that measure the outer area and the rejected shares.
 _AREA_POINTS = 4000
 
@@ -225,9 +225,9 @@ def _check(
         raise ValueError("num_sensors=None needs a spacing to decide the number")
     if num_sensors is not None and num_sensors < 1:
         raise ValueError(f"the number of sensors must be positive, got {num_sensors}")
-    if num_sensors is not None and num_sensors > _MAX_SENSORS:
+    if num_sensors is not None and num_sensors > MAX_SENSORS:
         raise ValueError(
-            f"the number of sensors must be at most {_MAX_SENSORS:,}, got {num_sensors}"
+            f"the number of sensors must be at most {MAX_SENSORS:,}, got {num_sensors}"
         )
     if seed < 0:
         raise ValueError(f"the seed of a placement must not be negative, got {seed}")

@@ -1,0 +1,112 @@
+"""Bounds of numbers, declared with the field of a configuration.
+
+    mass: Annotated[float, Interval(gt=0, le=1e6)] = 0.4
+
+Contract: every number of a checked configuration lies in the interval of its field,
+each of a tuple, too; one without an interval is finite, and if whole fits 64 bits.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+import typing
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True, kw_only=True)
+class Interval:
+    """An interval of numbers; infinity is in it only if it is named: ``le=inf``."""
+
+    gt: float | None = None
+    """Numbers are above this."""
+    ge: float | None = None
+    """Numbers are at least this."""
+    lt: float | None = None
+    """Numbers are below this."""
+    le: float | None = None
+    """Numbers are at most this."""
+
+    def violation(self, value: float) -> str | None:
+        """Return what a number outside must be or not be; None for one inside."""
+        if isinstance(value, int):
+            # Compared as it is: one of 400 digits is no float.
+            if not -(2**63) <= value < 2**63:
+                return "be a number of 64 bits"
+        elif math.isnan(value) or (math.isinf(value) and self.le != value):
+            return "be a finite number"
+        if self.gt is not None and not value > self.gt:
+            return f"be above {self.gt:,}" if self.gt else "be positive"
+        if self.ge is not None and not value >= self.ge:
+            return f"be at least {self.ge:,}" if self.ge else "not be negative"
+        if self.lt is not None and not value < self.lt:
+            return f"be below {self.lt:,}"
+        if self.le is not None and not value <= self.le:
+            return f"be at most {self.le:,}"
+        return None
+
+
+POSITIVE, NOT_NEGATIVE = Interval(gt=0), Interval(ge=0)
+COUNT, SHARE = Interval(ge=1), Interval(ge=0, le=1)
+
+
+class BoundsError(ValueError):
+    """A number of a configuration is out of bounds.
+
+    Args:
+        owner: Class of the configuration.
+        text: Name of its field, what it must be and what it is.
+    """
+
+    def __init__(self, owner: type, text: str) -> None:
+        super().__init__(text)
+        self.owner = owner
+
+
+def check_bounds(config: Any) -> None:
+    """Raise BoundsError if a number of a dataclass is out of bounds.
+
+    Those of inner dataclasses are their own to check.
+
+    Args:
+        config: The dataclass; it calls this first in its ``__post_init__``.
+    """
+    for name, interval in _intervals(type(config)).items():
+        value = getattr(config, name)
+        for number in value if isinstance(value, tuple) else (value,):
+            if not isinstance(number, (int, float)) or isinstance(number, bool):
+                continue
+            if wrong := interval.violation(number):
+                raise BoundsError(type(config), f"{name} must {wrong}, got {value}")
+
+
+@functools.cache
+def _intervals(kind: type) -> Mapping[str, Interval]:
+    """Return the interval of each field of a dataclass."""
+    hints = typing.get_type_hints(kind, include_extras=True)
+    found = {}
+    for field in dataclasses.fields(kind):
+        declared = getattr(hints[field.name], "__metadata__", ())
+        own = [what for what in declared if isinstance(what, Interval)]
+        found[field.name] = own[0] if own else Interval()
+    return found
+
+
+def path_to(owner: type, kind: type) -> str:
+    """Return where a configuration stands in another: "env.task.", or "" if nowhere.
+
+    Args:
+        owner: Class of the inner one, of which there is one.
+        kind: Class of the outer one.
+    """
+    for name, hint in typing.get_type_hints(kind).items():
+        if hint is owner:
+            return f"{name}."
+        if isinstance(hint, type) and dataclasses.is_dataclass(hint):
+            inner = path_to(owner, hint)
+            if inner:
+                return f"{name}.{inner}"
+    return ""

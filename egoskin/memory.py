@@ -1,0 +1,90 @@
+"""How much memory there is, whether what is planned fits it, and errors that say no."""
+
+from __future__ import annotations
+
+import os
+import resource
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+
+import torch
+
+_CGROUP_LIMITS = (
+    "/sys/fs/cgroup/memory.max",
+    "/sys/fs/cgroup/memory/memory.limit_in_bytes",
+)
+_SHARED = "/dev/shm"
+# What errors of Python and PyTorch say that are of no class of their own.
+_OUT_OF_MEMORY = (
+    "can't allocate memory",
+    "Cannot allocate memory",
+    "not enough memory",
+    "unable to allocate shared memory",
+    "can't start new thread",
+)
+
+
+def machine_memory() -> int:
+    """Return the memory that this process may ever have [bytes]."""
+    limits = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]
+    for path in _CGROUP_LIMITS:
+        # Absent on other systems; "max" where there is none.
+        with suppress(OSError, ValueError):
+            limits.append(int(Path(path).read_text()))
+    address_space, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if address_space != resource.RLIM_INFINITY:
+        limits.append(address_space)
+    return min(limits)
+
+
+def check_memory(needs: Mapping[str, int]) -> None:
+    """Raise ValueError if the machine cannot hold what is needed.
+
+    Args:
+        needs: Bytes that are needed for certain, by what needs them and the options
+            that decide how much.
+    """
+    needed, there = sum(needs.values()), machine_memory()
+    if needed > there:
+        largest = max(needs, key=lambda name: needs[name])
+        raise ValueError(
+            f"this needs at least {_size(needed)} of memory, and there are "
+            f"{_size(there)}; most of it is for {largest}"
+        )
+
+
+def check_shared_memory(needed: int, what: str) -> None:
+    """Raise ValueError if shared memory has too little room left.
+
+    Writing there then ends a process without a word (SIGBUS).
+
+    Args:
+        needed: Bytes that are needed.
+        what: What for, and the options that decide how much.
+    """
+    # Other systems have no such folder.
+    if not os.path.isdir(_SHARED):
+        return
+    status = os.statvfs(_SHARED)
+    free = status.f_bavail * status.f_frsize
+    if needed > free:
+        raise ValueError(
+            f"{_SHARED} has {_size(free)} of shared memory left, and {_size(needed)} "
+            f"are needed for {what}; in a container, give it more (docker: --shm-size)"
+        )
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether an error says that there is too little memory, shared or not."""
+    if isinstance(error, (MemoryError, torch.OutOfMemoryError)):
+        return True
+    known = isinstance(error, (RuntimeError, OSError))
+    return known and any(text in str(error) for text in _OUT_OF_MEMORY)
+
+
+def _size(number: int) -> str:
+    for unit, size in (("GB", 1e9), ("MB", 1e6)):
+        if number >= size:
+            return f"{number / size:,.1f} {unit}"
+    return f"{number:,} bytes"
