@@ -13,8 +13,8 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
-import ray
-from ray.exceptions import RayError
+import ray  # pyright: ignore[reportMissingImports]
+from ray.exceptions import RayError  # pyright: ignore[reportMissingImports]
 
 from egoskin.study.job import FAILED
 from egoskin.study.manifest import PlannedRun
@@ -70,7 +70,8 @@ class RayRunner(Runner):
 
     def _begin(self, run: PlannedRun) -> None:
         # Of a task whose node is lost Ray keeps the count.
-        task = _work.options(max_retries=self._tries, num_cpus=self._cores)
+        work: Any = _work
+        task = work.options(max_retries=self._tries, num_cpus=self._cores)
         path = str(self._folder.path)
         self._tasks[run.name] = task.remote(path, run.name, self._nice, self._cores)
 
