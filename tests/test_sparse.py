@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
-from egoskin.agents.networks import Agent, NetworkConfig, SignalNorm
+from egoskin.agents.networks import Agent, NetworkConfig
+from egoskin.agents.normalizers import SignalNorm
 from egoskin.agents.ppo import PPO, PPOConfig
 from egoskin.agents.rollout import collect
 from egoskin.make import EnvConfig, make_env

@@ -19,7 +19,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from benchmarks.report import Row, show
-from egoskin.agents.networks import RunningNorm
+from egoskin.agents.normalizers import RunningNorm
 from egoskin.agents.ppo import PPO, PPOConfig
 from egoskin.agents.rollout import collect
 from egoskin.envs.dodgeball import DodgeballEnv
