@@ -429,8 +429,8 @@ CELLS = [
         )
     ),
     ["--sensor.corruption", "time_of_flight", "--history", "3"],
-    ["--sensor.occlusion", "--sensor.per-object", "--sensor.validity"],
-    ["--sensor.signal", "localization", "--sensor.localization.hold"],
+    ["--sensor.occlusion"],
+    ["--sensor.signal", "localization", "--sensor.keep-last"],
     ["--sensor.range", "inf", "--sensor.field.half-angle-deg", "90"],
 ]
 
@@ -455,6 +455,7 @@ BAD_SKIN = """{"format": "egoskin-skin-1", "robot": "h1_2", "sensors": [
         (["--sensor.rnge", "1"], "--sensor.range"),
         (["--sensor.range", "-1"], "must be positive"),
         (["--sensor.signal", "smell"], "proximity"),
+        (["--sensor.localization.hold"], "is now --sensor.keep-last"),
         (["--num-envs", "32", "--num-workers", "3"], "valid: 1, 2, 4, 8, 16, 32"),
         (["--task.physics.gains", "strong"], "real, rotor_inertia"),
         (["--sensor.reduce", "min"], "reduce=min is for ray sensors"),

@@ -1,8 +1,8 @@
 """Show what a skin sees, before any training: a picture, a table and JSON.
 
-python scripts/coverage.py --out coverage.png --json coverage.json
-python scripts/coverage.py --skin.path skin.json --coverages field ray --ranges 0.5 1
-python scripts/coverage.py --occlusion
+python scripts/visibility.py --out visibility.png --json visibility.json
+python scripts/visibility.py --skin.path skin.json --coverages field ray --ranges 0.5 1
+python scripts/visibility.py --occlusion
 
 A robot stands still in its default pose. Balls come straight at its base from all
 directions, straight at every part of its surface, and as the task throws them. A ball
@@ -50,7 +50,7 @@ from egoskin.envs.throws import ThrowConfig
 from egoskin.evaluation.visibility import Analysis, analyse
 from egoskin.robots.config import ROBOTS, RobotName
 from egoskin.sensors import Field, Ray
-from egoskin.sensors.config import SkinConfig
+from egoskin.sensors.config import SensorConfig, SkinConfig
 from egoskin.storage.serialization import to_plain
 from egoskin.viewer.film import check_path
 
@@ -61,7 +61,7 @@ BLIND, NOWHERE = "#c1272d", "#e6e6e6"
 
 
 @dataclass(frozen=True, kw_only=True)
-class CoverageConfig:
+class VisibilityConfig:
     """Show what a skin sees, before any training: a picture, a table and JSON."""
 
     robot: RobotName = "h1_2"
@@ -86,9 +86,9 @@ class CoverageConfig:
     """Throws followed."""
     seed: int = 0
     """Seed of the throws and of the points on the surface."""
-    out: Path = Path("coverage.png")
+    out: Path = Path("visibility.png")
     """Picture to write, .png, .jpg, .svg or .pdf."""
-    json: Path = Path("coverage.json")
+    json: Path = Path("visibility.json")
     """All figures, to write."""
 
 
@@ -233,21 +233,23 @@ def draw(analysis: Analysis, report: dict[str, Any], title: str) -> Figure:
 
 def main(args: list[str]) -> None:
     """Run the command."""
-    config = tyro.cli(CoverageConfig, args=args, description=__doc__)
+    config = tyro.cli(VisibilityConfig, args=args, description=__doc__)
     # Before the minutes that the analysis takes.
     check_path(config.out, PICTURE_SUFFIXES)
     check_path(config.json, (".json",))
     robot = ROBOTS[config.robot]
     skin = config.skin.build(robot)
     physics = PhysicsConfig()
-    coverages = {"field": config.field, "ray": config.ray}
+    own = {"field": {"field": config.field}, "ray": {"ray": config.ray}}
     analysis = analyse(
         robot,
         skin,
-        {name: coverages[name] for name in config.coverages},
+        {
+            name: SensorConfig(coverage=name, occlusion=config.occlusion, **own[name])
+            for name in config.coverages
+        },
         sorted(config.ranges),
         config.throws,
-        occlusion=config.occlusion,
         num_throws=config.num_throws,
         seed=config.seed,
         timestep=physics.timestep,
