@@ -182,7 +182,7 @@ def _measure(
         object_active=torch.ones(m, 1, dtype=torch.bool),
         batch_size=[m],
     )
-    return torch.cat([sensor(state)["distance"] for sensor in sensors], -1)
+    return torch.cat([sensor(state)[sensor.out_keys[0]] for sensor in sensors], -1)
 
 
 def trace(

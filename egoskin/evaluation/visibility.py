@@ -41,7 +41,7 @@ from egoskin.shapes import Sphere
 CLEARANCES = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
 """Clearances at which the share of directions seen by then is reported [m]."""
 BANDS = (0.0, 0.8, 1.2, 1.6, math.inf)
-"""Heights of contact above ground that are told apart [m]: legs to head."""
+"""Heights of contact above ground that are distinguished [m]: legs to head."""
 
 
 @dataclass(frozen=True, kw_only=True)
