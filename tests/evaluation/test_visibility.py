@@ -45,8 +45,8 @@ RHO = 0.2
 
 @pytest.fixture
 def ball_robot(small_robot):
-    """A ball 1 m above ground, with a foot too small to matter."""
-    return small_robot(f"<geom size='{RHO}'/><geom size='0.01' pos='0.7 -0.7 -1'/>")
+    """A ball 3 m above ground, with a foot too small to matter."""
+    return small_robot(f"<geom size='{RHO}'/><geom size='0.01' pos='2 -2 -3'/>")
 
 
 def sensors(*poses, **options) -> Skin:
@@ -200,8 +200,7 @@ def test_share_of_directions_and_of_surface_is_that_of_the_cap(ball_robot, max_r
         ball_robot, skin, FIELD, [max_range], ThrowConfig(), num_throws=1
     )
     gap = analysis.directions.gap
-    # The same on every path but the few that lead to the foot.
-    last = gap.gather(1, analysis.directions.contact[:, None] - 1).median().item()
+    last = gap.gather(1, analysis.directions.contact[:, None] - 1).max().item()
     assert 0.001 < last < 0.01
 
     def share(gap: float) -> float:
@@ -453,11 +452,11 @@ def test_the_command_writes_a_picture_and_figures(tmp_path, monkeypatch, capsys)
 def test_the_command_has_the_body_in_the_way_if_asked(tmp_path, monkeypatch):
     pytest.importorskip("matplotlib")
     monkeypatch.chdir(tmp_path)
-    small = ("--skin.num-sensors", "8", "--num-throws", "16", "--coverages", "field")
+    small = ("--skin.num-sensors", "4", "--num-throws", "4", "--coverages", "field")
     for name in ("clear", "solid"):
         out = ("--out", f"{name}.png", "--json", f"{name}.json")
         option = ("--occlusion",) if name == "solid" else ()
-        run_script(monkeypatch, *small, *out, *option, "--ranges", "1")
+        run_script(monkeypatch, *small, *out, *option, "--ranges", "0.3")
     clear, solid = (
         json.loads((tmp_path / f"{name}.json").read_text())
         for name in ("clear", "solid")
