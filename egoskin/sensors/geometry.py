@@ -171,7 +171,8 @@ class ProximitySensor(RowTransform):
         self._kinematics = LinkKinematics(chain, links)
 
         def constant(name: str, value: object, dtype: torch.dtype) -> None:
-            self.register_buffer(name, torch.as_tensor(value, dtype=dtype))
+            # A copy: a mask changes the ranges of this sensor, not of the skin.
+            self.register_buffer(name, torch.as_tensor(value, dtype=dtype).clone())
 
         # Constants are float64; a scene has them in the dtype of its inputs.
         constant("_link", [links.index(name) for name in skin.links], torch.int64)

@@ -92,8 +92,9 @@ class SensorPipeline:
     def num_readings(self, group: SensorGroup) -> int:
         """Return how many readings each sensor of a group signals, ``K`` or 1."""
         coverage = group.skin.coverage[0]
-        grid = isinstance(coverage, Ray) and self.config.reduce == "none"
-        return coverage.num_beams if grid else 1
+        if isinstance(coverage, Ray) and self.config.reduce == "none":
+            return coverage.num_beams
+        return 1
 
     @property
     def signal_size(self) -> int:

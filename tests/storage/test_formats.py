@@ -267,6 +267,16 @@ def test_a_migration_leaves_alone_what_is_there_and_makes_no_parts():
     assert migrate(now, FORMAT) == (now, {})
 
 
+def test_sensor_options_of_format_2_go_or_have_another_name():
+    position = {"hold": True, "frame": "base", "over_range": False}
+    sensor = {"validity": False, "ray": {"sub_beams": 1, "grid": [4, 4]}}
+    old = {"env": {"sensor": {**sensor, "localization": position}}}
+    sensor = {"keep_last": True, "ray": {"grid": [4, 4]}}
+    assert migrate(old, 2) == ({"env": {"sensor": sensor}}, {})
+    position["frame"] = "torso"
+    assert migrate(old, 2)[1] == {"env.sensor.localization.frame": "torso"}
+
+
 def test_stored_policies_without_a_seal_load_and_say_so(capsys):
     path = ROOT / "results/blind_seed0/policies/000065536000.safetensors"
     throws = egoskin.load_policy(path).env_config.task.throws
