@@ -24,14 +24,14 @@ from `egoskin.sensors.imperfections.corruption.Corruption`
 from `egoskin.sensors.Proximity`, ``Binary`` or ``Localization``
 ``signal``                  ``[*B, S]``   or ``[*B, 3]`` (localization) actor, critic
 from `egoskin.sensors.history`
-``last_signal``             as signal     the last one that saw         actor, critic
+``last_signal``             as signal     when last anything was seen   actor, critic
 ``signal_history``          ``[*B, ...]`` the last signals              actor, critic
 from `egoskin.sensors.tactile`, in tasks of your own
 ``contact_force``           ``[*B, L, 3]`` yours [N]                     tactile
 ``contact_free``            ``[*B, 1]``   bool: untouched so far        -
 from `egoskin.envs.observations`
 ``observation``             ``[*B, 6+2J]`` body; 6+3J: and last action  actor, critic
-``privileged_observation``  ``[*B, P]``   told in training only         critic
+``privileged_observation``  ``[*B, P]``   observed in training only     critic
 ``signal``                  ``[*B, 7 O]`` an oracle's: the truth        actor, critic
 from `egoskin.agents.networks.Agent`
 ``action``                  ``[*B, J]``   see DodgeballEnv              env

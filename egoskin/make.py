@@ -29,6 +29,7 @@ from egoskin.robots.config import ROBOTS, RobotConfig, RobotName
 from egoskin.sensors import History, Skin
 from egoskin.sensors.config import SensorConfig, SkinConfig
 from egoskin.sensors.geometry import STATE_KEYS
+from egoskin.sensors.pipeline import SensorPipeline, masks_all
 from egoskin.storage.tensor_file import part, prefixed
 from egoskin.transform import StatefulTransform
 
@@ -37,8 +38,6 @@ _MOST_AGENTS, _MOST_WORKERS = 2**20, 1024
 # Memory of the simulation of one agent, and what workers share beside the tensors: it
 # is a page for each tensor at least [bytes].
 _SIMULATION, _SHARED_EXTRA = 12_000, 2**20
-MASK_ALL = ("all",)
-"""Mask of all sensors, and of what an oracle is told."""
 # What the networks read of the transforms' results; the others stay as well.
 _NETWORK_KEYS = ("observation", "privileged_observation", "signal")
 
@@ -76,6 +75,20 @@ class EnvConfig:
     def standard(self) -> str:
         """Version of the standard throw that it trains on, "custom" if none."""
         return standard_of(self.task)
+
+    def pipeline(self, skin: Skin | None = None) -> SensorPipeline:
+        """Return what the sensors are, measure and signal.
+
+        Args:
+            skin: The sensors; by default those that ``skin`` describes.
+
+        Raises:
+            ValueError: If skin, robot and configuration do not fit each other.
+        """
+        robot = self.robot_config
+        if skin is None:
+            skin = self.skin.build(robot)
+        return SensorPipeline(self.sensor, robot, skin)
 
     @property
     def actor_keys(self) -> list[str]:
@@ -118,7 +131,7 @@ def make_worker_env(
             cost).
         sparse: Whether to give the state that the sensors read, for the agent's own
             sources, instead of the signal.
-        mask: Links whose sensors detect nothing, or `MASK_ALL`.
+        mask: Links whose sensors detect nothing, or `egoskin.sensors.MASK_ALL`.
 
     Raises:
         ValueError: If the skin does not fit the robot, or ``sparse`` is asked for with
@@ -131,9 +144,7 @@ def make_worker_env(
         )
     if sparse and mask and not masks_all(mask):
         raise ValueError("sparse sources know no mask of some links: leave sparse off")
-    robot = config.robot_config
-    if skin is None:
-        skin = config.skin.build(robot)
+    sensors, robot = config.pipeline(skin), config.robot_config
     env = DodgeballEnv(
         robot,
         config.task,
@@ -166,15 +177,13 @@ def make_worker_env(
         if masks_all(mask):
             transforms.append(HideObjects())
         if not sparse:
-            transforms += config.sensor.transforms(
-                robot,
-                skin,
+            transforms += sensors.transforms(
                 throws.balls,
                 dt=1 / config.task.physics.control_hz,
                 seed=seed,
                 row_offset=row_offset,
                 out_key=f"signal{suffix}",
-                masked=masked_sensors(skin, mask),
+                masked=sensors.masked(mask),
             )
         if config.sensor.coverage == "oracle":
             transforms.append(Oracle(out_keys=[f"signal{suffix}"]))
@@ -189,35 +198,6 @@ def make_worker_env(
         unread = [key for key in raw if not (sparse and key in STATE_KEYS)]
         transforms.append(ExcludeTransform(*unread, *between))
     return TransformedEnv(env, Compose(transforms))
-
-
-def masked_sensors(skin: Skin, mask: Sequence[str]) -> list[int]:
-    """Return the indices of the sensors on masked links, all with `MASK_ALL`."""
-    every = masks_all(mask)
-    return [i for i, name in enumerate(skin.links) if every or name in mask]
-
-
-def masks_all(mask: Sequence[str]) -> bool:
-    """Whether a mask is that of all sensors."""
-    return tuple(mask) == MASK_ALL
-
-
-def check_mask(config: EnvConfig, skin: Skin, mask: Sequence[str]) -> None:
-    """Raise ValueError for a mask that masks nothing; the text lists what does."""
-    if not mask:
-        return
-    if config.sensor.coverage == "none":
-        raise ValueError("a blind robot has no sensors to mask")
-    if masks_all(mask):
-        return
-    if not config.sensor.uses_skin:
-        raise ValueError("an oracle has no sensors on links: mask all of it")
-    links = sorted(set(skin.links))
-    for name in mask:
-        if name not in links:
-            raise ValueError(
-                f"mask: no sensor on {name!r}; links with sensors: {', '.join(links)}"
-            )
 
 
 def _state_keys(transform: Transform) -> list[NestedKey]:
@@ -252,7 +232,7 @@ def make_env(
         hold: Whether the robots are held rigid in their default pose.
         bare: Whether to leave out observations and sensors.
         sparse: Whether to give the state instead of the signal, see `make_worker_env`.
-        mask: Links whose sensors detect nothing, or `MASK_ALL`.
+        mask: Links whose sensors detect nothing, or `egoskin.sensors.MASK_ALL`.
 
     Raises:
         ValueError: If the workers do not divide the agents, they do not fit this

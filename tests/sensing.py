@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 from hypothesis import strategies as st
@@ -19,6 +21,12 @@ SHAPES = (
 KEYS = ("base_pose", "joint_pos", "object_pose", "object_active")
 """What a sensor reads, in the order of its `compute`."""
 SEED = st.integers(0, 2**32 - 1)
+
+
+def along_axes(angle: float) -> float:
+    """A square view's angle from corner to corner, from that along an axis [deg]."""
+    tangent = math.tan(math.radians(angle) / 2)
+    return 2 * math.degrees(math.atan(math.sqrt(2) * tangent))
 
 
 def measure(sensor, state):

@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
-from egoskin.agents.networks import Agent, NetworkConfig, SignalNorm
+from egoskin.agents.networks import Agent, NetworkConfig
+from egoskin.agents.normalizers import SignalNorm
 from egoskin.agents.ppo import PPO, PPOConfig
 from egoskin.agents.rollout import collect
 from egoskin.make import EnvConfig, make_env
@@ -23,7 +24,7 @@ from egoskin.policies.policy import (
     sparse_sources,
 )
 from egoskin.robots.config import H1_2
-from egoskin.sensors import Ray, RaySensor, place_sensors
+from egoskin.sensors import Ray, RaySensor, SensorPipeline, place_sensors
 from egoskin.sensors.config import SensorConfig
 from egoskin.shapes import Sphere
 from egoskin.sparse import SparseRows
@@ -92,7 +93,7 @@ def test_rows_are_selected_and_joined_like_those_of_the_matrix(seed, rows, wante
 # --- rays -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("ray", [Ray(), Ray(sub_beams=2), Ray(measure="depth")])
+@pytest.mark.parametrize("ray", [Ray(), Ray(measure="depth")])
 def test_hits_are_the_readings_of_the_grid(random_state, ray):
     state = random_state(300, seed=1, objects=3)
     # Two objects on one another, and a row of NaN.
@@ -111,12 +112,12 @@ def test_hits_are_the_readings_of_the_grid(random_state, ray):
 
 @pytest.mark.parametrize("signal", ["proximity", "closeness", "binary"])
 def test_the_sparse_signal_is_that_of_the_transforms(random_state, signal):
-    config = replace(RAYS, signal=signal)
+    pipeline = SensorPipeline(replace(RAYS, signal=signal), H1_2, SKIN)
     objects = (Sphere(radius=0.25),) * 3
-    rays = config.sparse_rays(H1_2, SKIN, objects)
+    rays = pipeline.sparse_rays(objects)
     state = random_state(200, seed=2, objects=3)
     dense = state.clone()
-    for transform in config.transforms(H1_2, SKIN, objects, dt=1 / 60):
+    for transform in pipeline.transforms(objects, dt=1 / 60):
         transform(dense)
     assert torch.equal(rays(state).dense(), dense["signal"])
     # A batch of another size than the first.
@@ -124,7 +125,8 @@ def test_the_sparse_signal_is_that_of_the_transforms(random_state, signal):
 
 
 def test_nothing_in_reach_is_no_hit(random_state):
-    rays = RAYS.sparse_rays(H1_2, SKIN, (Sphere(radius=0.25),))
+    pipeline = SensorPipeline(RAYS, H1_2, SKIN)
+    rays = pipeline.sparse_rays((Sphere(radius=0.25),))
     state = random_state(20, seed=0, objects=1)
     state["object_active"][:] = False
     assert torch.equal(rays(state).dense(), torch.ones(20, 16 * 64))
@@ -138,8 +140,6 @@ def test_nothing_in_reach_is_no_hit(random_state):
         {"signal": "localization"},
         {"reduce": "min"},
         {"corruption": "time_of_flight"},
-        {"per_object": True},
-        {"validity": True},
     ],
 )
 def test_whatever_is_not_sparse_is_left_to_the_transforms(change):

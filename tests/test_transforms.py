@@ -19,9 +19,10 @@ from torchrl.envs.utils import check_env_specs
 from egoskin.envs.dodgeball import DodgeballEnv
 from egoskin.envs.observations import Oracle, Privileged, Proprioception, approaches_b
 from egoskin.envs.throws import GRAVITY
-from egoskin.make import MASK_ALL, EnvConfig, make_worker_env
+from egoskin.make import EnvConfig, make_worker_env
 from egoskin.robots.config import H1_2
 from egoskin.sensors import (
+    MASK_ALL,
     Binary,
     Field,
     FieldSensor,
@@ -30,7 +31,7 @@ from egoskin.sensors import (
     RaySensor,
     place_sensors,
 )
-from egoskin.sensors.config import LocalizationConfig, SensorConfig
+from egoskin.sensors.config import SensorConfig
 from throwing import TASK
 
 SKIN = place_sensors(H1_2, 12, seed=0)
@@ -55,13 +56,9 @@ BUILDERS = {
         RaySensor, SKIN, H1_2.chain, BALLS, 1.0, per_object=True
     ),
     "proximity": partial(Proximity, 1.0),
-    "closeness": partial(Proximity, 1.0, closeness=True, validity=True),
+    "closeness": partial(Proximity, 1.0, closeness=True),
     "binary": Binary,
     "localization": Localization,
-    "localization, torso": partial(
-        Localization, centre=(H1_2.chain, "torso_link"), slots="all", validity=True
-    ),
-    "localization, yaw": partial(Localization, yaw_only=True, scale=2.0),
     "proprioception": partial(Proprioception, DEFAULT),
     "proprioception, action": partial(
         Proprioception,
@@ -364,12 +361,8 @@ SENSORS = {
     "infinite": SensorConfig(range=float("inf")),
     "blind": SensorConfig(coverage="none"),
     "oracle": SensorConfig(coverage="oracle"),
-    "ray": SensorConfig(coverage="ray", signal="closeness", validity=True),
-    "ray, reduced, held": SensorConfig(
-        coverage="ray",
-        signal="localization",
-        localization=LocalizationConfig(hold=True),
-    ),
+    "ray": SensorConfig(coverage="ray", signal="closeness"),
+    "ray, last": SensorConfig(coverage="ray", signal="localization", keep_last=True),
     "cone, real, hidden": SensorConfig(
         field=Field(half_angle_deg=60), corruption="acoustic", occlusion=True
     ),
@@ -407,10 +400,10 @@ def test_environment_keeps_its_specs(sensor):
 
 @pytest.mark.parametrize("sparse", [False, True])
 @pytest.mark.parametrize("keep_raw", [False, True])
-def test_masked_sensors_feel_no_ball_and_the_critic_is_still_told(sparse, keep_raw):
-    # Within 5 m of the body nearly all balls are felt.
+def test_masked_sensors_detect_nothing_and_the_critic_still_observes(sparse, keep_raw):
+    # Within 5 m of the body nearly all balls are detected.
     sensor = SensorConfig(coverage="ray", range=5.0)
-    feeling, numb = (
+    sensing, masked = (
         make_worker_env(
             EnvConfig(task=TASK, sensor=sensor),
             SKIN,
@@ -422,18 +415,18 @@ def test_masked_sensors_feel_no_ball_and_the_critic_is_still_told(sparse, keep_r
         )
         for mask in ((), MASK_ALL)
     )
-    felt = False
-    for one, other in zip(run(feeling, 40), run(numb, 40), strict=True):
+    sensed = False
+    for one, other in zip(run(sensing, 40), run(masked, 40), strict=True):
         assert torch.equal(one["done"], other["done"])
-        told = "privileged_observation"
-        assert torch.equal(one[told], other[told])
+        key = "privileged_observation"
+        assert torch.equal(one[key], other[key])
         if sparse or keep_raw:
             assert not other["object_active"].any()
         if not sparse:
             assert (other["signal"] == 1).all()
-        felt |= bool((one["object_active"] if sparse else one["signal"] < 1).any())
-    assert felt
-    check_env_specs(numb)
+        sensed |= bool((one["object_active"] if sparse else one["signal"] < 1).any())
+    assert sensed
+    check_env_specs(masked)
 
 
 @pytest.mark.parametrize("content", ["objects", "velocity"])
@@ -482,7 +475,7 @@ def outside(config: EnvConfig, parallel, **kwargs) -> TransformedEnv:
     transforms = [
         Proprioception(DEFAULT),
         Privileged("objects", JOINTS, len(BALLS), gravity),
-        *config.sensor.transforms(H1_2, SKIN, BALLS, dt=1 / 60),
+        *config.pipeline(SKIN).transforms(BALLS, dt=1 / 60),
     ]
     return TransformedEnv(parallel(2, bases, **kwargs), Compose(*transforms))
 

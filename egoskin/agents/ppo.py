@@ -17,7 +17,8 @@ from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
-from egoskin.agents.networks import Agent, NetworkConfig, RunningNorm, input_keys
+from egoskin.agents.networks import Agent, NetworkConfig, input_keys
+from egoskin.agents.normalizers import RunningNorm
 from egoskin.bounds import COUNT, NOT_NEGATIVE, POSITIVE, SHARE, Interval, check_bounds
 from egoskin.sparse import SparseRows
 

@@ -23,6 +23,14 @@ from egoskin.interrupts import ENDING, end_next_time, end_now, say, take
 from egoskin.memory import is_out_of_memory
 from egoskin.parallel import WorkerError
 
+# Options that have another name now, by the old one.
+_RENAMED = {
+    "--sensor.localization.hold": "--sensor.keep-last",
+    "--sensor.ray.fov": "--sensor.ray.fov-deg, from corner to corner",
+    "--coverage": "--visibility",
+    "--numb": "--mask",
+    "--throw": "--standard",
+}
 NUMBERS = ConstructorRegistry()
 """How options are read, while it is entered: a whole number also as 1e6."""
 
@@ -72,6 +80,7 @@ def clear_errors() -> Iterator[None]:
     take(_raise, *ENDING)
     try:
         try:
+            _check_names(sys.argv[1:])
             with NUMBERS:
                 yield
         finally:
@@ -100,6 +109,14 @@ def clear_errors() -> Iterator[None]:
         if signal.getsignal(signal.SIGINT) is not end_now:
             for number, handler in before.items():
                 signal.signal(number, handler)
+
+
+def _check_names(args: list[str]) -> None:
+    """Raise ValueError for an option that has another name now."""
+    for arg in args:
+        name = arg.split("=")[0].replace("_", "-")
+        if name in _RENAMED:
+            raise ValueError(f"{name} is now {_RENAMED[name]}")
 
 
 def _nobody_reads() -> bool:

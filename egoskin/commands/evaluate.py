@@ -22,10 +22,11 @@ import tyro
 from egoskin.evaluation.behaviour import Behaviour, Motion, behave
 from egoskin.evaluation.operating_map import check_map, draw_map, operating_map
 from egoskin.evaluation.throw_set import Estimate, Evaluation, evaluate, standard_task
-from egoskin.make import MASK_ALL, EnvConfig, check_mask, check_num_workers
+from egoskin.make import EnvConfig, check_num_workers
 from egoskin.policies.policy import load_policy
 from egoskin.progress import StatusLine, counted
 from egoskin.rng import check_seed
+from egoskin.sensors import MASK_ALL
 from egoskin.storage.files import check_output
 from egoskin.storage.serialization import check_counts
 from egoskin.viewer.film import check_path
@@ -188,7 +189,7 @@ def main(args: list[str]) -> None:
     env_config = policy.env_config
     if config.standard != "run":
         env_config = standard_task(env_config, config.standard)
-    check_mask(env_config, policy.skin, config.masked)
+    env_config.pipeline(policy.skin).check_mask(config.masked)
     if config.map is not None:
         check_map(env_config)
     line = StatusLine(f"playing {counted(config.episodes, 'episode')}")

@@ -99,7 +99,7 @@ class Plan:
     steps_per_s: float | None = None
     """Environment steps per second and core; None: measured now, in half a minute for
     each way to share the cores among runs."""
-    coverage: bool = False
+    visibility: bool = False
     """Also say what each coverage and range sees before any training (minutes)."""
 
     def __post_init__(self) -> None:
@@ -131,11 +131,11 @@ class Plan:
             f"minutes a run\n"
             f"  {total.disk / 1e9:,.2f} GB of disk"
         )
-        if self.coverage:
+        if self.visibility:
             seen = what_is_seen(manifest)
             if self.dir is not None:
                 text = json.dumps(seen, indent=2, allow_nan=False) + "\n"
-                write_file(self.dir / "coverage.json", text.encode())
+                write_file(self.dir / "visibility.json", text.encode())
         if self.dir is not None:
             print(f"manifest {StudyFolder(self.dir).manifest_path}")
 
@@ -164,12 +164,11 @@ def what_is_seen(manifest: Manifest) -> dict[str, Any]:
     if not sensors:
         print("no cell has a skin: nothing is seen")
         return {}
-    coverages = {s.coverage: s.ray if s.coverage == "ray" else s.field for s in sensors}
     base = manifest.base.env
     analysis = analyse(
         base.robot_config,
         base.skin.build(base.robot_config),
-        coverages,
+        {s.coverage: s for s in sensors},
         sorted({s.range for s in sensors}),
         base.task.throws,
         timestep=base.task.physics.timestep,

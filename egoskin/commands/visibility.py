@@ -43,7 +43,7 @@ from egoskin.evaluation.visibility import Analysis, analyse
 from egoskin.progress import counted
 from egoskin.robots.config import ROBOTS, RobotName
 from egoskin.sensors import Field, Ray
-from egoskin.sensors.config import SkinConfig
+from egoskin.sensors.config import SensorConfig, SkinConfig
 from egoskin.storage.serialization import to_plain
 from egoskin.viewer.film import check_path
 
@@ -233,14 +233,16 @@ def main(args: list[str]) -> None:
     robot = ROBOTS[config.robot]
     skin = config.skin.build(robot)
     physics = PhysicsConfig()
-    coverages = {"field": config.field, "ray": config.ray}
+    own = {"field": {"field": config.field}, "ray": {"ray": config.ray}}
     analysis = analyse(
         robot,
         skin,
-        {name: coverages[name] for name in config.coverages},
+        {
+            name: SensorConfig(coverage=name, occlusion=config.occlusion, **own[name])
+            for name in config.coverages
+        },
         sorted(config.ranges),
         config.throws,
-        occlusion=config.occlusion,
         num_throws=config.num_throws,
         seed=config.seed,
         timestep=physics.timestep,

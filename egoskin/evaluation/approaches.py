@@ -22,8 +22,8 @@ from torch import Tensor
 from egoskin.envs.throws import GRAVITY, ThrowConfig, Thrower
 from egoskin.robots.config import RobotConfig
 from egoskin.robots.surface import default_frames, distance_to, sample_surface
-from egoskin.sensors import FieldSensor, Ray, RaySensor, Skin
-from egoskin.sensors.skin.coverage import Coverage
+from egoskin.sensors import Ray, SensorPipeline, Skin
+from egoskin.sensors.config import SensorConfig
 from egoskin.shapes import Sphere
 from egoskin.transform import RowTransform
 
@@ -38,7 +38,7 @@ _NUM_SURFACE_POINTS = 1000
 _CHUNK, _BODY_CHUNK = 4096, 2**17
 
 Progress = Callable[[str, float], None]
-"""Told what is in work, and the share of it that is done."""
+"""Called with what is in work, and the share of it that is done."""
 
 
 class StandingRobot:
@@ -134,47 +134,39 @@ class Trace:
         return torch.where(self.seen, at_first, 0.0)
 
 
-def farthest(
-    skin: Skin, coverages: Mapping[str, Coverage], ranges: Sequence[float]
-) -> float:
-    """Return how far any sensor sees in any cell [m].
-
-    Args:
-        skin: The sensors.
-        coverages: Coverages by name, for sensors without one of their own.
-        ranges: Ranges, for sensors without one of their own [m].
-    """
-    return max(
-        float(skin.filled(coverage, max(ranges)).reach().max())
-        for coverage in coverages.values()
-    )
-
-
-def _sensors(
+def pipelines(
     robot: RobotConfig,
     skin: Skin,
-    coverage: Coverage,
+    sensors: Mapping[str, SensorConfig],
     max_range: float,
-    ball: Sphere,
-    occlusion: bool,
-) -> tuple[list[RowTransform], Tensor]:
-    """Return transforms that together are the skin, and each sensor's own range.
+) -> dict[str, SensorPipeline]:
+    """Return ideal sensors that give one distance each, by name.
 
-    The range is NaN where the sensor has none.
+    Args:
+        robot: The robot.
+        skin: The sensors.
+        sensors: What they measure, by name: coverage and occlusion count.
+        max_range: For sensors without a range of their own [m].
     """
-    full = skin.filled(coverage, max_range)
-    body = robot.primitives if occlusion else ()
-    parts: list[RowTransform] = []
-    groups = full.groups()
-    for part in map(full.select, groups):
-        args = part, robot.chain, [ball], max_range
-        parts.append(
-            RaySensor(*args, reduce="min", body=body)
-            if isinstance(part.coverage[0], Ray)
-            else FieldSensor(*args, body=body)
+    made = {}
+    for name, config in sensors.items():
+        default = config.default_coverage
+        rays = any(isinstance(own or default, Ray) for own in skin.coverage)
+        ideal = SensorConfig(
+            coverage=config.coverage,
+            field=config.field,
+            ray=config.ray,
+            occlusion=config.occlusion,
+            range=max_range,
+            reduce="min" if rays else "none",
         )
-    order = [index for group in groups for index in group]
-    return parts, torch.from_numpy(skin.range[order]).float()
+        made[name] = SensorPipeline(ideal, robot, skin)
+    return made
+
+
+def farthest(sensors: Mapping[str, SensorPipeline]) -> float:
+    """Return how far any sensor of any of the pipelines sees [m]."""
+    return max(float(each.skin.reach().max()) for each in sensors.values())
 
 
 def _measure(
@@ -190,18 +182,17 @@ def _measure(
         object_active=torch.ones(m, 1, dtype=torch.bool),
         batch_size=[m],
     )
-    return torch.cat([sensor(state)["distance"] for sensor in sensors], -1)
+    return torch.cat([sensor(state)[sensor.out_keys[0]] for sensor in sensors], -1)
 
 
 def trace(
     body: StandingRobot,
     position: Tensor,
     skin: Skin,
-    coverages: Mapping[str, Coverage],
+    sensors: Mapping[str, SensorPipeline],
     ranges: Sequence[float],
     ball: Sphere,
     *,
-    occlusion: bool = False,
     progress: Progress = lambda what, share: None,
 ) -> Trace:
     """Return when balls on given paths touch the body and who detects them before.
@@ -210,19 +201,17 @@ def trace(
         body: The robot.
         position: Centres of the balls along the paths [m], ``[n, T, 3]``.
         skin: The sensors.
-        coverages: Coverages by name, for sensors without one of their own.
+        sensors: What `pipelines` made of them, for the longest of the ranges.
         ranges: Ranges, for sensors without one of their own [m].
         ball: The ball.
-        occlusion: Whether the body hides what lies behind it.
-        progress: Told the coverage in work.
+        progress: Called with the name of the pipeline in work.
 
     Returns:
-        The traces; cells in the order of coverages and, within one, of ranges.
+        The traces; cells in the order of pipelines and, within one, of ranges.
     """
     n, steps, _ = position.shape
-    longest = float(np.nanmax([*ranges, *skin.range]))
     # A sensor that stands off the body sees as much farther than the body is near.
-    near = farthest(skin, coverages, ranges) + body.standoff(skin)
+    near = farthest(sensors) + body.standoff(skin)
     flat = position.reshape(-1, 3)
     distance = [
         body.distance(part.double().numpy(), ball.radius + near)
@@ -239,14 +228,16 @@ def trace(
     visible = before & above & (gap <= near)
 
     rows = visible.reshape(-1).nonzero()[:, 0]
-    num_sensors = torch.zeros(len(coverages), len(ranges), n * steps, dtype=torch.int16)
-    for c, (name, coverage) in enumerate(coverages.items()):
-        sensors, own = _sensors(body.config, skin, coverage, longest, ball, occlusion)
+    num_sensors = torch.zeros(len(sensors), len(ranges), n * steps, dtype=torch.int16)
+    for c, (name, pipeline) in enumerate(sensors.items()):
+        order = [index for group in pipeline.groups for index in group.index]
+        own = torch.from_numpy(skin.range[order]).float()
+        measuring = pipeline.sensors([ball])
         limits = [torch.where(own.isnan(), r, own) for r in ranges]
         # One measurement at the longest range serves all ranges.
         for k, chunk in enumerate(rows.split(_CHUNK)):
             progress(name, k * _CHUNK / max(len(rows), 1))
-            reading = _measure(body, sensors, flat[chunk])
+            reading = _measure(body, measuring, flat[chunk])
             for r, limit in enumerate(limits):
                 num_sensors[c, r, chunk] = (reading <= limit).sum(-1).short()
         progress(name, 1.0)

@@ -146,7 +146,7 @@ def behave(
         bank_seed: Seed of the bank.
         episodes: Size of the bank.
         num_workers: Physics threads; the result does not depend on it.
-        mask: Links whose sensors detect nothing, or `egoskin.make.MASK_ALL`.
+        mask: Links whose sensors detect nothing, or `egoskin.sensors.MASK_ALL`.
         on_step: Called with (steps done, episodes still running).
     """
     bank: dict[str, Any] = {

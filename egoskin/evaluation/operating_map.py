@@ -122,13 +122,11 @@ _MAPS = (
 
 
 def check_map(config: EnvConfig) -> None:
-    """Raise ValueError if the actor tells balls apart: a map takes more of them."""
-    sensor = config.sensor
-    if sensor.coverage == "oracle" or sensor.per_object:
-        what = "an oracle" if sensor.coverage == "oracle" else "per_object"
+    """Raise ValueError if the actor observes each ball: a map takes more of them."""
+    if config.sensor.coverage == "oracle":
         raise ValueError(
-            f"a map takes more balls than the {config.task.throws.num_balls} that the "
-            f"policy's observation tells apart ({what}): no map can be made of it"
+            f"a map takes more balls than the {config.task.throws.num_balls} that an "
+            "oracle observes, each in its place: no map can be made of it"
         )
 
 
@@ -160,7 +158,7 @@ def operating_map(
         bank_seed: Seed of the throws.
         episodes: Episodes of each point.
         num_workers: Processes; the result does not depend on it.
-        mask: Links whose sensors detect nothing, or `egoskin.make.MASK_ALL`.
+        mask: Links whose sensors detect nothing, or `egoskin.sensors.MASK_ALL`.
         on_point: Called with (points done, points in all).
 
     Returns:

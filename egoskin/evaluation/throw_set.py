@@ -23,7 +23,6 @@ from egoskin.envs.dodgeball import DodgeballConfig
 from egoskin.envs.standards import Standard, evaluation_task
 from egoskin.make import (
     EnvConfig,
-    check_mask,
     check_num_workers,
     make_env,
     make_worker_env,
@@ -157,14 +156,14 @@ def play_bank(
         first: Row of the first of them; with ``watch`` alone.
         num_workers: Processes; the result does not depend on it.
         hold: Whether the robot is held rigid in its default pose.
-        mask: Links whose sensors detect nothing, or `egoskin.make.MASK_ALL`.
+        mask: Links whose sensors detect nothing, or `egoskin.sensors.MASK_ALL`.
         on_step: Called with (steps done, episodes still running).
         watch: Sees every step; the bank is then played in this process, with threads
             instead of workers, and comes to the same.
     """
     assert first == 0 or watch is not None
     seed = throw_seed(config, bank_seed)
-    check_mask(config, skin, mask)
+    config.pipeline(skin).check_mask(mask)
     shared: dict[str, Any] = {
         "num_envs": episodes,
         "seed": seed,
@@ -307,7 +306,7 @@ def evaluate(
         bank_seed: Seed of the bank.
         episodes: Size of the bank.
         num_workers: Processes; the result does not depend on it.
-        mask: Links whose sensors detect nothing, or `egoskin.make.MASK_ALL`.
+        mask: Links whose sensors detect nothing, or `egoskin.sensors.MASK_ALL`.
         on_step: Called with (steps done, episodes still running).
         watch: Sees every step of the policy's episodes, see `play_bank`.
     """

@@ -21,6 +21,7 @@ from egoskin.make import EnvConfig, default_num_workers, make_worker_env
 from egoskin.policies.policy import Policy
 from egoskin.sensors import Skin
 from egoskin.sensors.config import SensorConfig
+from egoskin.sensors.pipeline import SensorPipeline
 
 # Share of the plans that the next ones are drawn around, and how much of their mean and
 # deviation stays from one iteration to the next.
@@ -223,14 +224,10 @@ def _until_in_reach(
     bare = Skin(
         robot=skin.robot, links=skin.links, position=skin.position, normal=skin.normal
     )
-    transforms = sensor.transforms(
-        config.robot_config,
-        bare,
-        balls,
-        dt=1 / config.task.physics.control_hz,
-    )
-    feel = Compose(transforms)
-    # Balls are thrown in turn: that of the others is not felt.
+    pipeline = SensorPipeline(sensor, config.robot_config, bare)
+    dt = 1 / config.task.physics.control_hz
+    sense = Compose(pipeline.transforms(balls, dt=dt))
+    # Balls are thrown in turn: that of the others is not sensed.
     mine = torch.arange(len(balls)) == (ball - 1) % len(balls)
     root = env.reset()
     kept = root.clone()
@@ -246,14 +243,14 @@ def _until_in_reach(
             _task(env).load_simulation_state(now)
         seen = root.clone(recurse=False)
         seen["object_active"] = root["object_active"] & mine
-        felt = feel(seen)["signal"].any(-1) & last
-        begin = waiting & felt
+        sensed = sense(seen)["signal"].any(-1) & last
+        begin = waiting & sensed
         if begin.any():
             kept[begin] = root[begin]
             for key, value in now.items():
                 simulation[key][begin] = value[begin]
         started |= begin
-        waiting &= ~felt
+        waiting &= ~sensed
         if not waiting.any():
             break
         step, root = env.step_and_maybe_reset(policy(root))

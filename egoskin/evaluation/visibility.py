@@ -26,6 +26,7 @@ from egoskin.evaluation.approaches import (
     direction_grid,
     direction_paths,
     farthest,
+    pipelines,
     surface_paths,
     throw_paths,
     trace,
@@ -34,13 +35,13 @@ from egoskin.evaluation.approaches import (
 from egoskin.rng import check_seed
 from egoskin.robots.config import RobotConfig
 from egoskin.sensors import Skin
-from egoskin.sensors.skin.coverage import Coverage
+from egoskin.sensors.config import SensorConfig
 from egoskin.shapes import Sphere
 
 CLEARANCES = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
 """Clearances at which the share of directions seen by then is reported [m]."""
 BANDS = (0.0, 0.8, 1.2, 1.6, math.inf)
-"""Heights of contact above ground that are told apart [m]: legs to head."""
+"""Heights of contact above ground that are distinguished [m]: legs to head."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -221,7 +222,7 @@ class Analysis:
     def _sensors_at_once(self, i: int) -> dict[str, float | None]:
         """How many sensors detect a thrown ball at once, while any does.
 
-        One alone tells where the ball is as finely as sensors stand; all at once tell
+        One alone says where the ball is as finely as sensors stand; all at once say
         nothing of it unless they also give the distance.
         """
         count = self.throws.num_sensors[i][self.throws.touches]
@@ -240,11 +241,10 @@ def _share(flags: Tensor, among: Tensor) -> float | None:
 def analyse(
     robot: RobotConfig,
     skin: Skin,
-    coverages: Mapping[str, Coverage],
+    sensors: Mapping[str, SensorConfig],
     ranges: Sequence[float],
     throws: ThrowConfig,
     *,
-    occlusion: bool = False,
     num_throws: int = 2000,
     seed: int = 0,
     timestep: float = 1 / 120,
@@ -256,21 +256,20 @@ def analyse(
     Args:
         robot: The robot.
         skin: The sensors.
-        coverages: Coverages by name, for sensors without one of their own.
+        sensors: What they measure, by name: coverage and occlusion count.
         ranges: Ranges, for sensors without one of their own [m].
         throws: The throws.
-        occlusion: Whether the robot's own body hides what lies behind it.
         num_throws: How many throws are followed.
         seed: Seed of the throws and of the points on the surface.
         timestep: Physics time step of the task [s].
         control_period: Time between two actions of a policy [s].
-        progress: Told what is in work, and how much of it is done.
+        progress: Called with what is in work, and how much of it is done.
 
     Raises:
         ValueError: If there is no coverage, range or throw, a range is not positive
             and finite, or the seed is none.
     """
-    if not coverages or not ranges:
+    if not sensors or not ranges:
         raise ValueError("an analysis needs at least one coverage and one range")
     if len(set(ranges)) < len(ranges):
         raise ValueError(f"a range is given twice: {list(ranges)}")
@@ -287,17 +286,14 @@ def analyse(
         raise ValueError(f"num_throws must be at least 1, got {num_throws}")
     body, ball = StandingRobot(robot), Sphere(radius=throws.radius)
     skin.check_links(robot.links)
-    far = farthest(skin, coverages, ranges)
+    cells = pipelines(robot, skin, sensors, max(ranges))
+    far = farthest(cells)
 
     def follow(what: str, paths: Tensor) -> Trace:
-        def tell(name: str, share: float) -> None:
+        def show(name: str, share: float) -> None:
             progress(f"{what}, {name}", share)
 
-        return trace(
-            *(body, paths, skin, coverages, ranges, ball),
-            occlusion=occlusion,
-            progress=tell,
-        )
+        return trace(body, paths, skin, cells, ranges, ball, progress=show)
 
     directions = follow("directions", direction_paths(body, ball, far))
     paths, link = surface_paths(body, ball, far, seed)
@@ -306,7 +302,7 @@ def analyse(
     thrown = follow("throws", paths)
     at_contact = thrown.contact.clamp(max=paths.shape[1] - 1)
     return Analysis(
-        cells=tuple(Cell(coverage=c, range=r) for c in coverages for r in ranges),
+        cells=tuple(Cell(coverage=c, range=r) for c in sensors for r in ranges),
         directions=directions,
         surface=surface,
         surface_link=tuple(robot.links[i] for i in link),

@@ -175,9 +175,7 @@ def sparse_sources(config: EnvConfig, skin: Skin) -> dict[str, SparseSource]:
     """
     if config.history > 1:
         return {}
-    balls = config.task.throws.balls
-    robot = config.robot_config
-    rays = config.sensor.sparse_rays(robot, skin, balls)
+    rays = config.pipeline(skin).sparse_rays(config.task.throws.balls)
     return {} if rays is None else {"signal": rays}
 
 

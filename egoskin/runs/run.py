@@ -111,7 +111,7 @@ class Run:
         """
         skin = config.env.skin.build(config.env.robot_config)
         # Sensors that do not fit each other are found now, not in a worker.
-        config.env.sensor.filled(skin)
+        config.env.pipeline(skin)
         _check_memory(config, skin)
         path = config.run_dir
         if path is None:

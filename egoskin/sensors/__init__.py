@@ -5,8 +5,9 @@ project's environment, another simulator, a recording or a real robot.
 """
 
 from egoskin.sensors.field import FieldSensor
-from egoskin.sensors.history import History, HoldLast
+from egoskin.sensors.history import History, KeepLast
 from egoskin.sensors.imperfections.corruption import Corruption
+from egoskin.sensors.pipeline import MASK_ALL, SensorPipeline
 from egoskin.sensors.ray import RaySensor
 from egoskin.sensors.signals import BeamMinimum, Binary, Localization, Proximity
 from egoskin.sensors.skin.coverage import Field, Ray
@@ -23,6 +24,7 @@ from egoskin.sensors.tactile import (
 )
 
 __all__ = [
+    "MASK_ALL",
     "BeamMinimum",
     "Binary",
     "ContactFree",
@@ -32,11 +34,12 @@ __all__ = [
     "Field",
     "FieldSensor",
     "History",
-    "HoldLast",
+    "KeepLast",
     "Localization",
     "Proximity",
     "Ray",
     "RaySensor",
+    "SensorPipeline",
     "Skin",
     "Tactile",
     "contact_free",

@@ -32,8 +32,7 @@ class FieldSensor(ProximitySensor):
     ``object_active [*B, O]``. Writes ``distance [*B, S]`` [m], infinite where nothing
     is in range and NaN where the input is not finite, and ``object_detected [*B, O]``,
     whether any sensor detects the object. A sensor inside an object reads 0. Distances
-    are those of the state given: forward kinematics from the joint positions. (A sensor
-    that measures to the centre reads the distance to it, inside as well.)
+    are those of the state given: forward kinematics from the joint positions.
 
     A sensor with a half angle below 180 degrees sees an object if the object's
     closest point lies within that angle of the normal.
@@ -43,6 +42,7 @@ class FieldSensor(ProximitySensor):
         chain: Kinematic chain of the robot, rooted at the base.
         objects: Shape of each object, ``O`` of them, or of the only one.
         max_range: A distance is detected if it is at most this [m]; may be infinite.
+            None if all sensors have a range of their own.
         coverage: What a sensor sees.
         body: The robot's shapes, to hide what lies behind them: an object is seen if
             the straight path to its closest point is free. Empty: transparent.
@@ -58,14 +58,13 @@ class FieldSensor(ProximitySensor):
     """
 
     _cos_half: Tensor | None
-    _to_centre: Tensor | None
 
     def __init__(
         self,
         skin: Skin,
         chain: pk.Chain,
         objects: Shape | Sequence[Shape],
-        max_range: float,
+        max_range: float | None = None,
         coverage: Field | None = None,
         *,
         body: Sequence[Primitive] = (),
@@ -85,21 +84,15 @@ class FieldSensor(ProximitySensor):
             in_keys,
             out_keys,
         )
-        # None where every sensor sees all around, or measures to the surface.
-        cos_half = to_centre = None
+        # None where every sensor sees all around.
+        cos_half = None
         if any(f.half_angle_deg < 180 for f in fields):
             angles = [math.cos(math.radians(f.half_angle_deg)) for f in fields]
             cos_half = torch.tensor(angles, dtype=torch.float64)[:, None]
-        if any(f.measure == "centre" for f in fields):
-            to_centre = torch.tensor([[f.measure == "centre"] for f in fields])
         self.register_buffer("_cos_half", cos_half)
-        self.register_buffer("_to_centre", to_centre)
         if compile:
-            self._use_kernels(
-                "field",
-                cos_half=None if cos_half is None else cos_half.numpy(),
-                to_centre=None if to_centre is None else to_centre.numpy(),
-            )
+            cone = None if cos_half is None else cos_half.numpy()
+            self._use_kernels("field", cos_half=cone)
 
     def distances(self, scene: Scene) -> Tensor:
         """Return readings of each object [m], ``[O, B, S]``."""
@@ -118,9 +111,9 @@ class FieldSensor(ProximitySensor):
         """Readings of one object [m], ``[S, B]``."""
         # From each sensor to the object's centre, in the sensor's link.
         x, y, z = v = view.centre[:, self._link] - skin["offset"]
-        to_centre = exact_sqrt(x * x + y * y + z * z)
         if isinstance(shape, Sphere):
             # |c| - r: the object's frame differs by a shift alone.
+            to_centre = exact_sqrt(x * x + y * y + z * z)
             distance = (to_centre - shape.radius).clamp(min=0.0)
         else:
             distance = shape.signed_distance(*self._in_object(view, v)).clamp(min=0.0)
@@ -132,9 +125,6 @@ class FieldSensor(ProximitySensor):
             # cos(angle) < cos(half angle); an object about the sensor is all around.
             beside = (along < skin["cos_half"] * reach) & ~(distance <= 0)
             distance = torch.where(beside, torch.inf, distance)
-        if self._to_centre is not None:
-            measured = torch.where(distance == torch.inf, distance, to_centre)
-            distance = torch.where(self._to_centre, measured, distance)
         # Written so that NaN stays NaN.
         gone = distance > skin["range"]
         return torch.where(gone, torch.inf, distance)

@@ -117,7 +117,7 @@ class ProximitySensor(RowTransform):
     """What field and ray sensors share: keys, checks, the loop over objects.
 
     Args:
-        skin: The sensors, filled; all of the coverage that the subclass computes.
+        skin: The sensors, resolved; all of the coverage that the subclass computes.
         chain: Kinematic chain of the robot, rooted at the base.
         objects: Shape of each object, ``O`` of them, or of the only one.
         num_readings: Readings of each sensor: ``()`` or ``(K,)``.
@@ -171,7 +171,8 @@ class ProximitySensor(RowTransform):
         self._kinematics = LinkKinematics(chain, links)
 
         def constant(name: str, value: object, dtype: torch.dtype) -> None:
-            self.register_buffer(name, torch.as_tensor(value, dtype=dtype))
+            # A copy: a mask changes the ranges of this sensor, not of the skin.
+            self.register_buffer(name, torch.as_tensor(value, dtype=dtype).clone())
 
         # Constants are float64; a scene has them in the dtype of its inputs.
         constant("_link", [links.index(name) for name in skin.links], torch.int64)
@@ -481,22 +482,27 @@ class ProximitySensor(RowTransform):
 
 
 def checked(
-    skin: Skin, coverage: Coverage, max_range: float, kind: type[Coverage]
+    skin: Skin, coverage: Coverage, max_range: float | None, kind: type[Coverage]
 ) -> tuple[Skin, list]:
-    """Return the skin with nothing left open, and its coverages.
+    """Return the skin, resolved, and its coverages.
 
     Args:
         skin: The sensors.
         coverage: For sensors without one of their own.
-        max_range: For sensors without a range of their own [m].
+        max_range: For sensors without a range of their own [m]; None: all have one.
         kind: The coverage that all sensors must have.
 
     Raises:
-        ValueError: If the range is not positive, or a sensor is of another kind.
+        ValueError: If the range is not positive, a sensor has none, or one is of
+            another kind.
     """
-    if not max_range > 0:
+    if max_range is not None and not max_range > 0:
         raise ValueError(f"max_range must be positive, got {max_range}")
-    skin = skin.filled(coverage, max_range)
+    if not skin.is_resolved:
+        skin = skin.resolved(coverage, np.nan if max_range is None else max_range)
+    if np.isnan(skin.range).any():
+        index = int(np.isnan(skin.range).argmax())
+        raise ValueError(f"sensor {index} has no range of its own: give max_range")
     for index, own in enumerate(skin.coverage):
         if not isinstance(own, kind):
             raise ValueError(

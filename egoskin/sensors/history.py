@@ -1,4 +1,4 @@
-"""Memory of observations: the last few of them, or what was seen last."""
+"""Memory of observations: the last few of them, or the last that detected anything."""
 
 from __future__ import annotations
 
@@ -78,29 +78,24 @@ class History(StatefulTransform):
         return specs
 
 
-class HoldLast(StatefulTransform):
-    """What was seen last: the signal while anything is detected, then its last value.
+class KeepLast(StatefulTransform):
+    """The signal while anything is detected, then its last value.
 
     Reads ``signal [*B, F]`` (of `Localization`, for example) and any number of
     ``object_detected [*B, O]`` (something is detected if one of them says so); writes
     ``last_signal [*B, F]``, zero until something is detected in the episode.
 
     Args:
-        flags: Number of entries at the end of the signal that tell of the present (a
-            validity flag) and are not held.
         in_keys: Keys of the signal and of the detections (one or more).
-        out_keys: Key of the signal seen last.
+        out_keys: Key of the last signal.
     """
 
     def __init__(
         self,
         in_keys: Sequence[NestedKey] = ("signal", "object_detected"),
         out_keys: Sequence[NestedKey] = ("last_signal",),
-        *,
-        flags: int = 0,
     ) -> None:
         super().__init__(in_keys, out_keys, state_keys=out_keys)
-        self.flags = flags
 
     def start(
         self,
@@ -117,11 +112,9 @@ class HoldLast(StatefulTransform):
         """Return the signal where anything is detected, its last value elsewhere."""
         signal, *detections = inputs
         detected = torch.stack([d.any(-1, keepdim=True) for d in detections]).any(0)
-        held = signal.shape[-1] - self.flags
-        last = torch.where(detected, signal, state[0])[..., :held]
-        return [torch.cat((last, signal[..., held:]), -1)]
+        return [torch.where(detected, signal, state[0])]
 
     def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
-        """Return the spec of the signal seen last."""
+        """Return the spec of the last signal."""
         one = spec[self.in_keys[0]]
         return [Unbounded(shape=one.shape, dtype=one.dtype)]

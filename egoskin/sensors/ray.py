@@ -52,6 +52,7 @@ class RaySensor(ProximitySensor):
         chain: Kinematic chain of the robot, rooted at the base.
         objects: Shape of each object, ``O`` of them, or of the only one.
         max_range: A distance is detected if it is at most this [m]; may be infinite.
+            None if all sensors have a range of their own.
         coverage: What a sensor sees.
         reduce: "min" writes the minimum over each sensor's beams, without the grid.
         body: The robot's shapes, to hide what lies behind them; empty: transparent.
@@ -78,7 +79,7 @@ class RaySensor(ProximitySensor):
         skin: Skin,
         chain: pk.Chain,
         objects: Shape | Sequence[Shape],
-        max_range: float,
+        max_range: float | None = None,
         coverage: Ray | None = None,
         *,
         reduce: Literal["none", "min"] = "none",
@@ -99,10 +100,10 @@ class RaySensor(ProximitySensor):
                 "the sensors of one RaySensor must have the same number of beams; got "
                 f"grids {', '.join(str(kind.grid) for kind in kinds)}"
             )
-        self._num_beams, self._sub_beams = directions[0].shape[:2]
+        self._num_beams = len(directions[0])
         self.reduce, self._cull = reduce, cull
-        # [3, U, K M] for U different coverages, and which of them each sensor has.
-        beams = torch.stack(directions).flatten(1, 2).movedim(-1, 0)
+        # [3, U, K] for U different coverages, and which of them each sensor has.
+        beams = torch.stack(directions).movedim(-1, 0)
         beam_of = torch.tensor([kinds.index(r) for r in rays])
         # Cosine and sine of the half angles of the pyramid about each sensor's beams,
         # along x and along y.
@@ -133,7 +134,6 @@ class RaySensor(ProximitySensor):
             self._use_kernels(
                 "ray",
                 beams=self._num_beams,
-                sub_beams=self._sub_beams,
                 cull=cull,
                 reduce=reduce == "min",
                 bound=np.array(bounds),
@@ -231,8 +231,6 @@ class RaySensor(ProximitySensor):
         # Written so that NaN stays NaN.
         gone = distance > skin["range"][sensor]
         distance = torch.where(gone, torch.inf, distance)
-        if self._sub_beams > 1:
-            distance = distance.unflatten(-1, (-1, self._sub_beams)).amin(-1)
         least = distance.amin(-1)
         return (least if self.reduce == "min" else distance), least
 

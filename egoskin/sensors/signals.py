@@ -11,15 +11,13 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Literal
 
-import pytorch_kinematics as pk
 import torch
 from tensordict import NestedKey
 from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 
-from egoskin.robots.kinematics import LinkKinematics, rotate_inverse
+from egoskin.robots.kinematics import rotate_inverse
 from egoskin.sensors.geometry import ProximitySensor
 from egoskin.transform import RowTransform
 
@@ -34,8 +32,6 @@ class _Reading(RowTransform):
         max_range: The sensor whose measurements these are, for its own ranges. Or
             ranges [m], one or one for each sensor, that may be infinite: a measurement
             beyond finds nothing, however far the sensor sees.
-        validity: Whether the signal's second half says which measurements found
-            anything, 1 or 0: a proximity of 1 may be an object at the range exactly.
         in_keys: Key of the measurements.
         out_keys: Key of the signal.
 
@@ -48,7 +44,6 @@ class _Reading(RowTransform):
     def __init__(
         self,
         max_range: ProximitySensor | float | Sequence[float],
-        validity: bool,
         in_keys: Sequence[NestedKey],
         out_keys: Sequence[NestedKey],
     ) -> None:
@@ -59,7 +54,6 @@ class _Reading(RowTransform):
         if not (limit > 0).all():
             raise ValueError(f"max_range must be positive, got {max_range}")
         self.register_buffer("_range", limit.reshape(-1))
-        self.validity = validity
 
     def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Return the signal, ``[B, S ...]`` flattened.
@@ -73,22 +67,11 @@ class _Reading(RowTransform):
                 f"{ranges} ranges do not fit the {sensors} sensors of "
                 f"{self.in_keys[0]!r}"
             )
-        distance = inputs[0].flatten(1)
-        signal = self.signal(distance)
-        if self.validity:
-            signal = torch.cat((signal, self.found(distance)), -1)
-        return (signal,)
+        return (self.signal(inputs[0].flatten(1)),)
 
     @abstractmethod
     def signal(self, distance: Tensor) -> Tensor:
         """Return the signal of measurements [m], ``[B, n]`` each."""
-
-    def found(self, distance: Tensor) -> Tensor:
-        """Return 1 for what is measured in range, 0 for nothing, NaN for NaN."""
-        # Nothing is infinitely far, whatever the range.
-        limit = self._limits(distance).clamp(max=torch.finfo(distance.dtype).max)
-        inside = (distance <= limit).to(distance)
-        return torch.where(distance.isnan(), distance, inside)
 
     def _limits(self, distance: Tensor) -> Tensor:
         """Ranges [m] in the dtype of the measurements, ``[n]`` or one for all."""
@@ -100,7 +83,7 @@ class _Reading(RowTransform):
     def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
         """Return the spec of the signal."""
         measured = spec[self.in_keys[0]]
-        size = measured.shape[len(spec.shape) :].numel() * (2 if self.validity else 1)
+        size = measured.shape[len(spec.shape) :].numel()
         shape = torch.Size((*spec.shape, size))
         return (Bounded(0.0, 1.0, shape=shape, dtype=measured.dtype),)
 
@@ -118,7 +101,6 @@ class Proximity(_Reading):
             d / (d + 1 m).
         closeness: Write 1 - signal instead: 1 at the sensor, 0 at the range and for
             nothing.
-        validity: Append for each measurement whether it found anything.
         in_keys: Key of the measurements.
         out_keys: Key of the signal.
 
@@ -131,11 +113,10 @@ class Proximity(_Reading):
         max_range: ProximitySensor | float | Sequence[float],
         *,
         closeness: bool = False,
-        validity: bool = False,
         in_keys: Sequence[NestedKey] = ("distance",),
         out_keys: Sequence[NestedKey] = ("signal",),
     ) -> None:
-        super().__init__(max_range, validity, in_keys, out_keys)
+        super().__init__(max_range, in_keys, out_keys)
         self._unlimited = bool(self._range.isinf().any())
         self.closeness = closeness
 
@@ -174,11 +155,14 @@ class Binary(_Reading):
         in_keys: Sequence[NestedKey] = ("distance",),
         out_keys: Sequence[NestedKey] = ("signal",),
     ) -> None:
-        super().__init__(max_range, False, in_keys, out_keys)
+        super().__init__(max_range, in_keys, out_keys)
 
     def signal(self, distance: Tensor) -> Tensor:
-        """Return the signal of measurements [m], ``[B, n]`` each."""
-        return self.found(distance)
+        """Return 1 for what is measured in range, 0 for nothing, NaN for NaN."""
+        # Nothing is infinitely far, whatever the range.
+        limit = self._limits(distance).clamp(max=torch.finfo(distance.dtype).max)
+        inside = (distance <= limit).to(distance)
+        return torch.where(distance.isnan(), distance, inside)
 
 
 class SkinOrder(RowTransform):
@@ -186,44 +170,41 @@ class SkinOrder(RowTransform):
 
     Reads a signal for each group, ``[*B, n]`` of its sensors one after the other, and
     writes ``signal [*B, N]``: the readings of the skin's first sensor, of its second
-    and so on, then their validity, if the signals have one.
+    and so on.
 
     Args:
         groups: The sensors of each group, which together are all.
-        validity: Whether the second half of each signal tells of its validity.
+        num_readings: Readings of each sensor of a group.
         in_keys: Key of the signal of each group.
         out_keys: Key of the signal of all.
     """
 
+    _order: Tensor
+
     def __init__(
         self,
         groups: Sequence[Sequence[int]],
+        num_readings: Sequence[int],
         *,
-        validity: bool = False,
         in_keys: Sequence[NestedKey],
         out_keys: Sequence[NestedKey] = ("signal",),
     ) -> None:
         super().__init__(in_keys, out_keys)
-        self._groups = [list(group) for group in groups]
-        self._halves = 2 if validity else 1
+        # The sensor that each number comes from.
+        owner = [
+            torch.tensor(group).repeat_interleave(each)
+            for group, each in zip(groups, num_readings, strict=True)
+        ]
+        self.register_buffer("_order", torch.cat(owner).argsort(stable=True))
 
     def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Return the signal of all, ``[B, N]``."""
-        # Which sensor, of which half, each number comes from.
-        sensors = sum(map(len, self._groups))
-        owners = []
-        for group, signal in zip(self._groups, inputs, strict=True):
-            each = signal.shape[1] // (self._halves * len(group))
-            owner = torch.tensor([group, [s + sensors for s in group]])[: self._halves]
-            owners.append(owner.flatten().repeat_interleave(each))
-        order = torch.cat(owners).argsort(stable=True).to(inputs[0].device)
-        return (torch.cat(inputs, -1)[:, order],)
+        return (torch.cat(inputs, -1)[:, self._order],)
 
     def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
         """Return the spec of the signal of all."""
-        size = sum(spec[key].shape[-1] for key in self.in_keys)
-        shape, dtype = torch.Size((*spec.shape, size)), spec[self.in_keys[0]].dtype
-        return (Bounded(0.0, 1.0, shape=shape, dtype=dtype),)
+        shape = torch.Size((*spec.shape, len(self._order)))
+        return (Bounded(0.0, 1.0, shape=shape, dtype=spec[self.in_keys[0]].dtype),)
 
 
 class BeamMinimum(RowTransform):
@@ -255,7 +236,7 @@ class BeamMinimum(RowTransform):
 
 
 class Localization(RowTransform):
-    """Position of the detected object nearest to the robot's centre frame.
+    """Position of the detected object nearest to the robot's base, in its frame.
 
     Reads ``base_pose [*B, 7]``, ``object_pose [*B, O, 7]``, ``joint_pos [*B, J]`` and
     any number of ``object_detected [*B, O]`` (an object counts if one of them says
@@ -263,103 +244,40 @@ class Localization(RowTransform):
     one does in a row that holds NaN: where the sensors are is then unknown.
 
     Args:
-        scale: Divide the position by this [m] (the range, for values below about 1).
-        slots: "nearest" object, or "all": ``signal [*B, 3 O]``, zeros for those that
-            are not detected.
-        yaw_only: Axes that turn with the heading but stay level.
-        centre: Link whose frame the position is given in, with the chain of the
-            robot; None is the base.
-        validity: Append for each slot whether it holds a detected object, 1 or 0.
         in_keys: Keys of base pose, object pose, joint positions and detections (one
             or more).
         out_keys: Key of the signal.
-
-    Raises:
-        ValueError: If the link is not in the chain or the scale not positive.
     """
 
     def __init__(
         self,
-        *,
-        scale: float = 1.0,
-        slots: Literal["nearest", "all"] = "nearest",
-        yaw_only: bool = False,
-        centre: tuple[pk.Chain, str] | None = None,
-        validity: bool = False,
         in_keys: Sequence[NestedKey] = (
             *("base_pose", "object_pose", "joint_pos"),
             "object_detected",
         ),
         out_keys: Sequence[NestedKey] = ("signal",),
     ) -> None:
-        if not scale > 0:
-            raise ValueError(f"scale must be positive, got {scale}")
-        if slots not in ("nearest", "all"):
-            raise ValueError(f"slots must be 'nearest' or 'all', got {slots!r}")
-        if yaw_only and centre is not None:
-            raise ValueError("yaw_only levels the base's axes: give no centre link")
         super().__init__(in_keys, out_keys)
-        self.scale, self.slots, self.validity = scale, slots, validity
-        self.yaw_only = yaw_only
-        self._centre = None
-        if centre is not None:
-            chain, link = centre
-            self._centre = LinkKinematics(chain, (link,))
 
     def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
-        """Return the signal, ``[B, 3]``, or more by slots and validity."""
+        """Return the signal, ``[B, 3]``."""
         base_pose, object_pose, joint_pos, *detections = inputs
         detected = torch.stack(detections).any(0)
         offset_w = object_pose[..., :3] - base_pose[:, None, :3]
         quat = base_pose[:, 3:] / base_pose[:, 3:].norm(dim=-1, keepdim=True)
         each = quat[:, None].expand(-1, offset_w.shape[1], -1)
         position = rotate_inverse(each, offset_w)
-        away = offset_w.square().sum(-1)
-        if self.yaw_only:
-            position = self._level(quat, offset_w)
-        elif self._centre is not None:
-            position = self._in_link(joint_pos, position)
-            away = position.square().sum(-1)
         # Bad joints leave open where the sensors are, a bad orientation of an object
         # where its surface is: 0 NaN = NaN.
         bad = joint_pos.sum(-1, keepdim=True) + object_pose[..., 3:].sum(-1)
         position = position + 0.0 * bad[..., None]
-        if self.slots == "nearest":
-            nearest = away.masked_fill(~detected, torch.inf).argmin(-1, keepdim=True)
-            position = position.gather(1, nearest[..., None].expand(-1, -1, 3))
-            detected = detected.any(-1, keepdim=True)
+        away = offset_w.square().sum(-1)
+        nearest = away.masked_fill(~detected, torch.inf).argmin(-1, keepdim=True)
+        position = position.gather(1, nearest[..., None].expand(-1, -1, 3))[:, 0]
         # A detected object of NaN stays NaN; what is not in play may be anywhere.
-        seen = position.masked_fill(~detected[..., None], 0.0)
-        signal = seen.flatten(1) / self.scale
-        if self.validity:
-            flag = detected.to(signal.dtype) + 0.0 * seen.sum(-1)
-            signal = torch.cat((signal, flag), -1)
-        return (signal,)
-
-    def _in_link(self, joint_pos: Tensor, position: Tensor) -> Tensor:
-        """Positions in the base frame, taken to the centre link's, ``[B, O, 3]``."""
-        assert self._centre is not None
-        origin, rotation = self._centre.poses_b(joint_pos)
-        x, y, z = (position - origin).unbind(-1)
-        # p_link = R^T (p - o), written out: the same bits in every batch.
-        columns = rotation.movedim(-1, 0).unbind(0)
-        return torch.stack(
-            [c[..., 0] * x + c[..., 1] * y + c[..., 2] * z for c in columns], -1
-        )
-
-    def _level(self, quat: Tensor, offset_w: Tensor) -> Tensor:
-        """Positions in axes that turn with the heading alone, ``[B, O, 3]``."""
-        w, x, y, z = quat.unbind(-1)
-        # The heading is the direction of the base's x axis on the ground.
-        c, s = 1 - 2 * (y * y + z * z), 2 * (x * y + w * z)
-        length = (c * c + s * s).sqrt().clamp(min=1e-9)
-        c, s = (c / length)[:, None], (s / length)[:, None]
-        dx, dy, dz = offset_w.unbind(-1)
-        return torch.stack((c * dx + s * dy, c * dy - s * dx, dz), -1)
+        return (position.masked_fill(~detected.any(-1, keepdim=True), 0.0),)
 
     def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
         """Return the spec of the signal."""
-        slots = spec[self.in_keys[1]].shape[-2] if self.slots == "all" else 1
-        size = slots * (4 if self.validity else 3)
         dtype = spec[self.in_keys[0]].dtype
-        return (Unbounded(shape=torch.Size((*spec.shape, size)), dtype=dtype),)
+        return (Unbounded(shape=torch.Size((*spec.shape, 3)), dtype=dtype),)

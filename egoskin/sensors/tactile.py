@@ -1,7 +1,7 @@
 """Touch: which links are in contact, and what other tasks make of it.
 
 Everything counts contact per link, ``[*B, L]``; which of the ``L`` links matter is
-told by shell patterns of their names. For a walking task the feet are left out::
+named by shell patterns. For a walking task the feet are left out::
 
     body = [name for name in robot.links if name not in robot.feet]
     ContactTermination(robot.links, body)

@@ -41,6 +41,8 @@ class Migration:
 
     added: Mapping[str, Any] = field(default_factory=dict)
     """Fields that are new, and their values with which nothing changes."""
+    renamed: Mapping[str, str] = field(default_factory=dict)
+    """Fields that have another name now, by the old one."""
     removed: Mapping[str, Any] = field(default_factory=dict)
     """Fields that are no more, and their values without effect (or any)."""
 
@@ -67,6 +69,7 @@ _MIGRATIONS = {
         },
     ),
     2: Migration(
+        renamed={"env.sensor.localization.hold": "env.sensor.keep_last"},
         removed={
             "env.task.one_action_scale": None,
             "env.task.clip_targets": False,
@@ -75,6 +78,18 @@ _MIGRATIONS = {
             "env.task.throws.mass": 0.4,
             "env.task.throws.speed_is": "horizontal",
             "env.task.throws.on_ground": "inactive",
+            # Distance to a ball's centre; an angle of view along each axis; beams from
+            # edge to edge of the view, and several in a zone; a signal for each ball;
+            # whether a signal is one; a position over the range, and in other frames.
+            "env.sensor.field.measure": "surface",
+            "env.sensor.ray.fov": "diagonal",
+            "env.sensor.ray.beams": "centres",
+            "env.sensor.ray.sub_beams": 1,
+            "env.sensor.per_object": False,
+            "env.sensor.validity": False,
+            "env.sensor.localization.over_range": False,
+            "env.sensor.localization.frame": "base",
+            "env.sensor.localization": {},
         },
     ),
 }
@@ -211,6 +226,10 @@ def migrate(
     """
     config, retired = copy.deepcopy(dict(config)), {}
     for step in range(number, FORMAT):
+        for old, new in _MIGRATIONS[step].renamed.items():
+            (*path, key), (*to, name) = old.split("."), new.split(".")
+            if key in (holder := _object(config, path)):
+                _object(config, to, make=True)[name] = holder.pop(key)
         for name, without_effect in _MIGRATIONS[step].removed.items():
             *path, key = name.split(".")
             value = _object(config, path).pop(key, without_effect)

@@ -319,7 +319,7 @@ def resolve(study: Study) -> Manifest:
                 skins[key] = skin, content_hash(skin.to_dict())
             skin, digest = skins[key]
             # Sensors that do not fit each other.
-            config.env.sensor.filled(skin)
+            config.env.pipeline(skin)
         except (ValueError, OSError) as error:
             raise ValueError(f"{what}: {error}") from error
         cell = Cell(name=cell_name(base, config), config=config, skin_sha256=digest)

@@ -192,7 +192,7 @@ def _blocks(
         )
     else:
         yield Text("Unknown: no cell has two seeds that differ.")
-    seen = folder.path / "coverage.json"
+    seen = folder.path / "visibility.json"
     if seen.is_file():
         yield Heading("What is seen before any training")
         yield _seen_rows(read_json(seen))

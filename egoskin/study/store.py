@@ -29,9 +29,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from egoskin.evaluation.throw_set import play_bank, standard_task, summarize
-from egoskin.make import MASK_ALL
 from egoskin.policies.policy import Policy, load_policy
 from egoskin.runs.run import Run
+from egoskin.sensors import MASK_ALL
 from egoskin.storage.formats import content_hash, read_sealed, sealed_json
 from egoskin.storage.serialization import read_json
 from egoskin.storage.tensor_file import load_tensors, write_file

@@ -148,10 +148,10 @@ def painter_of(
         RenderingError: If no OpenGL context can be made.
         ValueError: If the size is odd or below 16.
     """
-    sensor = config.sensor
+    sensors = config.pipeline(skin)
     return Painter(
         config.robot_config,
-        sensor.filled(skin) if sensor.uses_skin else None,
+        sensors.skin if sensors.groups else None,
         config.task.throws.balls,
         size=size,
         camera=camera,
@@ -195,12 +195,12 @@ def render_recording(
     for step in range(1, steps + 1):
         if int(step * fps / hz) > int((step - 1) * fps / hz) or step == steps:
             due.append(step)
-    frames = []
+    sensors, frames = config.pipeline(skin), []
     for step in due:
         state = recording.states[step]
         frame = painter.draw(
             state,
-            config.sensor.detecting(skin, state),
+            sensors.detecting(state),
             time=step / hz,
             num_avoided=int(state["balls_avoided"].sum()),
             ending=ending if step == steps else None,

@@ -11,10 +11,9 @@ from egoskin.agents.networks import (
     Agent,
     KeyedMLP,
     NetworkConfig,
-    RunningNorm,
     SharedStdNormal,
-    SignalNorm,
 )
+from egoskin.agents.normalizers import RunningNorm, SignalNorm
 
 SIZES = {"observation": 6, "signal": 5, "privileged_observation": 4}
 ACTOR = ["observation", "signal"]
@@ -104,7 +103,7 @@ def test_signals_weigh_as_much_however_many_they_are(size: int):
     assert len(signal.unique()) == size + 1
 
 
-def test_the_actor_does_not_see_what_only_the_critic_is_told():
+def test_the_actor_does_not_see_what_only_the_critic_observes():
     agent, batch = make_agent(), make_batch()
     changed = batch.clone()
     changed["privileged_observation"] += 1.0

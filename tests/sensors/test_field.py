@@ -65,12 +65,11 @@ def draw_objects(model: mujoco.MjModel, rng) -> tuple[Shape, ...]:
 def mujoco_field(model, skin, state) -> tuple[np.ndarray, ...]:
     """What MuJoCo says of each row, sensor and object, ``[n, S, O]``.
 
-    Distance (negative inside) and distance to the centre [m]; cosine of the closest
-    point's angle from the normal.
+    Distance, negative inside [m]; cosine of the closest point's angle from the normal.
     """
     data, ends = mujoco.MjData(model), np.zeros(6)
     speck = model.geom("speck").id
-    result = np.zeros((3, len(state), len(skin), len(KINDS)))
+    result = np.zeros((2, len(state), len(skin), len(KINDS)))
     for row, values in enumerate(state.unbind(0)):
         data.qpos[:7] = values["base_pose"]
         data.qpos[7:] = values["joint_pos"]
@@ -86,19 +85,16 @@ def mujoco_field(model, skin, state) -> tuple[np.ndarray, ...]:
                 distance = mujoco.mj_geomDistance(model, data, speck, geom.id, 99, ends)
                 way = ends[3:] - place
                 cosine = way @ turn @ skin.normal[s] / max(np.linalg.norm(way), TINY)
-                away = np.linalg.norm(geom.xpos - place)
-                result[:, row, s, o] = distance + TINY, away, cosine
+                result[:, row, s, o] = distance + TINY, cosine
     return tuple(result)
 
 
 def draw_skin(skin: Skin, rng) -> Skin:
-    """The skin with ranges, half angles and measures drawn for each sensor."""
+    """The skin with ranges and half angles drawn for each sensor."""
     fields = [
         Field(),
         Field(half_angle_deg=90),
         Field(half_angle_deg=rng.uniform(5, 175)),
-        Field(half_angle_deg=rng.uniform(5, 175), measure="centre"),
-        Field(measure="centre"),
     ]
     return replace(
         skin,
@@ -113,10 +109,9 @@ def test_distances_are_those_of_mujoco(skin, scene, random_state, seed, dtype):
     mixed = draw_skin(skin.select(rng.permutation(len(skin))[:20]), rng)
     objects = draw_objects(scene, rng)
     state = turned(random_state(8, seed, dtype, objects=4), seed)
-    signed, away, cosine = mujoco_field(scene, mixed, state)
-    to_centre = np.array([f.measure == "centre" for f in mixed.coverage])[:, None]
+    signed, cosine = mujoco_field(scene, mixed, state)
     half = np.array([f.half_angle_deg for f in mixed.coverage])[:, None]
-    truth = np.where(to_centre, away, signed.clip(0))
+    truth = signed.clip(0)
     # An object that a sensor is inside is all around it.
     beside = (cosine < np.cos(np.radians(half))) & (half < 180) & (signed > 0)
     limit = mixed.range[:, None]
@@ -312,18 +307,6 @@ def test_a_cone_sees_what_lies_within_its_half_angle():
     sensor = one_sensor(2, box, coverage=Field(half_angle_deg=10))
     assert look(sensor, (1, 0, 1)) == (0.75, [True])
     assert look(sensor, (2, 0, 1))[1] == [False]
-
-
-def test_the_distance_to_the_centre_is_an_option():
-    # |(.6, 0, .8)| = 1; in range if the centre is.
-    centre = Field(measure="centre")
-    assert look(one_sensor(1.01, coverage=centre), (0.6, 0, 0.8)) == (
-        pytest.approx(1),
-        [True],
-    )
-    assert look(one_sensor(0.99, coverage=centre), (0.6, 0, 0.8))[1] == [False]
-    sensor = one_sensor(9, (SHAPES[1],), coverage=centre)
-    assert look(sensor, (0, 3, 4)) == (pytest.approx(5), [True])
 
 
 # --- invariances ----------------------------------------------------------------

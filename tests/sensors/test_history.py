@@ -1,4 +1,4 @@
-"""What a history and a held signal hold, by hand."""
+"""What a history and the last signal are, by hand."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torchrl.envs.utils import check_env_specs
 from egoskin.envs.dodgeball import DodgeballEnv
 from egoskin.robots.config import H1_2
 from egoskin.sensors import FieldSensor, Localization, place_sensors
-from egoskin.sensors.history import History, HoldLast
+from egoskin.sensors.history import History, KeepLast
 from throwing import TASK
 
 
@@ -67,39 +67,31 @@ def test_history_is_bounded_where_its_entry_is():
     assert spec["frees"].dtype == torch.float64
 
 
-def test_hold_last_by_hand():
+def test_the_last_signal_by_hand():
     signal = torch.tensor([[0.0], [1], [2], [0], [0], [0], [5], [0]])
     seen = torch.tensor(
         [[0, 0], [1, 0], [0, 1], [0, 0], [0, 0], [0, 0], [1, 1], [0, 0]]
     )
     data = stored([0, 0, 0, 0, 1, 0, 0, 0], signal=signal, object_detected=seen.bool())
-    held = HoldLast()(data)["last_signal"][:, 0].tolist()
+    last = KeepLast()(data)["last_signal"][:, 0].tolist()
     # The episode that starts at step 5 knows nothing of the one before.
-    assert held == [0, 1, 2, 2, 2, 0, 5, 5]
+    assert last == [0, 1, 2, 2, 2, 0, 5, 5]
 
 
-def test_a_flag_of_the_present_is_not_held():
-    signal = torch.tensor([[3.0, 4.0, 1.0], [0.0, 0.0, 0.0], [5.0, 6.0, 1.0]])
-    seen = torch.tensor([[1], [0], [1]]).bool()
-    data = stored([0, 0, 0], signal=signal, object_detected=seen)
-    held = HoldLast(flags=1)(data)["last_signal"].tolist()
-    assert held == [[3, 4, 1], [3, 4, 0], [5, 6, 1]]
-
-
-def test_what_sensors_of_any_kind_detect_is_held():
+def test_what_sensors_of_any_kind_detect_is_kept():
     # A skin of two kinds has two detections.
     signal = torch.tensor([[1.0], [2], [3]])
     field = torch.tensor([[1], [0], [0]]).bool()
     ray = torch.tensor([[0], [1], [0]]).bool()
     data = stored([0, 0, 0], signal=signal, field=field, ray=ray)
-    hold = HoldLast(["signal", "field", "ray"])
-    assert hold(data)["last_signal"].tolist() == [[1], [2], [2]]
+    keep = KeepLast(["signal", "field", "ray"])
+    assert keep(data)["last_signal"].tolist() == [[1], [2], [2]]
 
 
 def test_a_detected_zero_is_a_sight():
     signal, seen = torch.tensor([[1.0], [0.0]]), torch.ones(2, 1).bool()
     data = stored([0, 0], signal=signal, object_detected=seen)
-    assert HoldLast()(data)["last_signal"].tolist() == [[1], [0]]
+    assert KeepLast()(data)["last_signal"].tolist() == [[1], [0]]
 
 
 @pytest.mark.parametrize(
@@ -123,7 +115,7 @@ def test_the_last_position_and_its_history_in_the_task():
             [
                 FieldSensor(skin, H1_2.chain, balls, 1.5),
                 Localization(),
-                HoldLast(),
+                KeepLast(),
                 History(2, ["last_signal"], ["signals"]),
             ]
         ),
@@ -131,10 +123,10 @@ def test_the_last_position_and_its_history_in_the_task():
     check_env_specs(env)
     data = env.rollout(80, break_when_any_done=False)
     seen = data["object_detected"].any(-1)
-    signal, held = data["signal"], data["last_signal"]
+    signal, last = data["signal"], data["last_signal"]
     assert signal[seen].any()
-    assert torch.equal(held[seen], signal[seen])
+    assert torch.equal(last[seen], signal[seen])
     assert not signal[~seen].any()
     lost = ~seen[:, 1:] & ~data["next", "done"][:, :-1, 0]
-    assert torch.equal(held[:, 1:][lost], held[:, :-1][lost])
-    assert torch.equal(data["signals"][..., 3:], held)
+    assert torch.equal(last[:, 1:][lost], last[:, :-1][lost])
+    assert torch.equal(data["signals"][..., 3:], last)

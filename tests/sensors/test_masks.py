@@ -1,4 +1,4 @@
-"""Masked sensors are as if they were not there: the others feel what they felt."""
+"""Masked sensors are as if they were not there: the others sense what they sensed."""
 
 from __future__ import annotations
 
@@ -12,16 +12,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from egoskin.evaluation.throw_set import play_bank
-from egoskin.make import (
-    MASK_ALL,
-    EnvConfig,
-    check_mask,
-    make_env,
-    make_worker_env,
-    masked_sensors,
-)
+from egoskin.make import EnvConfig, make_env, make_worker_env
 from egoskin.robots.config import H1_2
-from egoskin.sensors import Field, FieldSensor, Ray, RaySensor, Skin, place_sensors
+from egoskin.sensors import (
+    MASK_ALL,
+    Field,
+    FieldSensor,
+    Ray,
+    RaySensor,
+    Skin,
+    place_sensors,
+)
 from egoskin.sensors.config import SensorConfig
 from egoskin.sensors.kernels.compilation import SETTING, can_compile
 from egoskin.shapes import Box, Sphere
@@ -29,6 +30,7 @@ from sensing import SEED, assert_same_bits, measure
 from throwing import TASK
 
 SKIN = place_sensors(H1_2, 24, seed=0)
+SENSING = EnvConfig().pipeline(SKIN)
 BALLS = [Sphere(radius=0.15), Sphere(radius=0.3)]
 FAR = {"range": 5.0}
 SENSORS = {
@@ -36,7 +38,6 @@ SENSORS = {
     "field, binary": SensorConfig(**FAR, signal="binary"),
     "field, closeness": SensorConfig(**FAR, signal="closeness"),
     "field, localization": SensorConfig(**FAR, signal="localization"),
-    "field, each object": SensorConfig(**FAR, per_object=True),
     "field, occluded": SensorConfig(**FAR, occlusion=True),
     "ray": SensorConfig(**FAR, coverage="ray", ray=Ray(grid=(4, 4))),
     "ray, reduced": SensorConfig(
@@ -162,7 +163,7 @@ def test_a_copied_sensor_keeps_its_mask(random_state):
 def test_a_masked_link_is_one_without_sensors(sensor, compiled, monkeypatch):
     monkeypatch.setenv(SETTING, str(int(compiled)))
     mask = ("torso_link", "left_elbow_link")
-    masked = masked_sensors(SKIN, mask)
+    masked = SENSING.masked(mask)
     assert 0 < len(masked) < len(SKIN)
     assert {SKIN.links[i] for i in masked} == set(mask)
     fewer, kept = without(SKIN, masked)
@@ -172,8 +173,8 @@ def test_a_masked_link_is_one_without_sensors(sensor, compiled, monkeypatch):
         flown(sensor, SKIN),
     )
     assert torch.equal(got["object_detected"], expected["object_detected"])
-    told = "privileged_observation"
-    assert torch.equal(got[told], plain[told])
+    critic = "privileged_observation"
+    assert torch.equal(got[critic], plain[critic])
     if sensor.signal == "localization":
         assert torch.equal(got["signal"], expected["signal"])
         assert got["signal"].any()
@@ -212,17 +213,17 @@ def test_all_sensors_masked_by_name_are_all_sensors_masked():
     assert torch.equal(by_name["signal"], all_of_them["signal"])
     assert (by_name["signal"] == 1).all()
     # It does not matter how the names are listed.
-    assert masked_sensors(SKIN, ["all"]) == masked_sensors(SKIN, MASK_ALL)
-    assert masked_sensors(SKIN, MASK_ALL) == list(range(len(SKIN)))
+    assert SENSING.masked(["all"]) == SENSING.masked(MASK_ALL)
+    assert SENSING.masked(MASK_ALL) == list(range(len(SKIN)))
 
 
 def test_an_oracle_is_masked_as_a_whole():
     config = EnvConfig(task=TASK, sensor=SensorConfig(coverage="oracle"))
-    told, masked = (
+    sees, masked = (
         make_worker_env(config, SKIN, num_envs=4, seed=0, mask=mask).rollout(20)
         for mask in ((), MASK_ALL)
     )
-    assert told["signal"].any()
+    assert sees["signal"].any()
     assert not masked["signal"].any()
 
 
@@ -242,7 +243,7 @@ def test_workers_mask_as_one_process_does():
         finally:
             pool.close()
     assert torch.equal(*seen)
-    masked = masked_sensors(SKIN, mask)
+    masked = SENSING.masked(mask)
     assert (seen[0][:, masked] == 1).all()
     assert (seen[0] < 1).any()
 
@@ -251,23 +252,23 @@ def test_workers_mask_as_one_process_does():
 
 
 class Ducks(torch.nn.Module):
-    """Folds as soon as any sensor feels anything."""
+    """Folds as soon as any sensor detects anything."""
 
     def forward(self, td):
-        felt = (td["signal"] < 1).any(-1, keepdim=True)
+        detected = (td["signal"] < 1).any(-1, keepdim=True)
         action = torch.zeros(len(td), len(H1_2.joints))
         action[:, [i for i, n in enumerate(H1_2.joints) if "hip_pitch" in n]] = -2.0
-        return td.set("action", felt * action)
+        return td.set("action", detected * action)
 
 
-def test_a_policy_that_feels_nothing_does_what_one_does_without_sensors():
+def test_a_policy_whose_sensors_are_masked_does_what_one_does_without_sensors():
     config = EnvConfig(task=TASK)
     bank = {"bank_seed": 0, "episodes": 16, "num_workers": 1}
-    feels = play_bank(Ducks(), config, SKIN, **bank)
+    senses = play_bank(Ducks(), config, SKIN, **bank)
     masked = play_bank(Ducks(), config, SKIN, **bank, mask=MASK_ALL)
     still = play_bank(None, config, SKIN, **bank)
     assert torch.equal(masked.steps, still.steps)
-    assert not torch.equal(feels.steps, still.steps)
+    assert not torch.equal(senses.steps, still.steps)
 
 
 @pytest.mark.parametrize(
@@ -288,17 +289,17 @@ def test_a_policy_that_feels_nothing_does_what_one_does_without_sensors():
 def test_a_mask_that_masks_nothing_is_refused(sensor, mask, message):
     config = EnvConfig(sensor=SensorConfig(**sensor))
     with pytest.raises(ValueError, match=message):
-        check_mask(config, SKIN, mask)
+        config.pipeline(SKIN).check_mask(mask)
     with pytest.raises(ValueError, match=message):
         play_bank(None, config, SKIN, bank_seed=0, episodes=2, mask=mask)
 
 
 @pytest.mark.parametrize("mask", [(), MASK_ALL, ["all"], ("torso_link",)])
 def test_a_mask_of_links_with_sensors_is_taken(mask):
-    check_mask(EnvConfig(), SKIN, mask)
+    SENSING.check_mask(mask)
 
 
 def test_a_link_without_sensors_in_this_skin_is_refused():
-    skin, _ = without(SKIN, masked_sensors(SKIN, ("torso_link",)))
+    skin, _ = without(SKIN, SENSING.masked(("torso_link",)))
     with pytest.raises(ValueError, match="no sensor on 'torso_link'"):
-        check_mask(EnvConfig(), skin, ("torso_link",))
+        EnvConfig().pipeline(skin).check_mask(("torso_link",))

@@ -22,6 +22,7 @@ from sensing import (
     KINDS,
     SEED,
     SHAPES,
+    along_axes,
     assert_same_bits,
     assert_same_bits_in_any_batch,
     measure,
@@ -38,8 +39,7 @@ def draw_skin(skin: Skin, rng) -> Skin:
     rays = [
         SMALL,
         Ray(grid=(4, 4), fov_deg=rng.uniform(10, 170), measure="depth"),
-        Ray(grid=(2, 8), fov_deg=rng.uniform(10, 120), fov="axis"),
-        Ray(grid=(8, 2), beams="edges"),
+        Ray(grid=(2, 8), fov_deg=rng.uniform(10, 120)),
     ]
     return replace(
         skin,
@@ -79,7 +79,7 @@ def mujoco_rays(model, skin, state) -> np.ndarray:
         for s, link in enumerate(skin.links):
             turn = data.body(link).xmat.reshape(3, 3)
             place = data.body(link).xpos + turn @ skin.position[s]
-            beams = skin.coverage[s].directions()[:, 0]
+            beams = skin.coverage[s].directions()
             ways = (beams @ (turn @ frames[s]).T).ravel()
             for o in range(len(KINDS)):
                 groups = np.arange(6) == o + 1
@@ -115,7 +115,7 @@ def test_hits_are_those_of_mujoco(skin, random_state, seed, dtype):
     truth = hits[0.0]
     away = inside(sizes, mixed, state)[:, :, None]
     truth = np.where(away == 0, 0, truth)
-    slant = np.stack([r.directions()[:, 0, 2] for r in mixed.coverage])
+    slant = np.stack([r.directions()[:, 2] for r in mixed.coverage])
     depth = np.array([r.measure == "depth" for r in mixed.coverage])[:, None]
     slant = np.where(depth, slant, 1.0)[..., None]
     truth = truth * slant
@@ -165,7 +165,7 @@ def test_grazing_beams_are_right_to_a_millimetre(skin, random_state):
     sensor = RaySensor(skin, chain, [Sphere(radius=radius)], 9, SMALL)
     position, rotation = sensor.poses_b(state["joint_pos"].double())
     rows, s, k = np.arange(n), rng.integers(64, size=n), rng.integers(16, size=n)
-    beam = torch.from_numpy(SMALL.directions()[k, 0])
+    beam = torch.from_numpy(SMALL.directions()[k])
     base, quat = state["base_pose"].double().split((3, 4), -1)
     place = base + rotate(quat, position[rows, s])
     way = rotate(quat, (rotation[rows, s] @ beam[..., None])[..., 0])
@@ -258,7 +258,7 @@ def test_depth_is_the_component_along_the_normal():
     assert look(limited, (0, 0, 1.25))[0] == pytest.approx([1] * 64)
     assert look(one_sensor(1.0625, WALL), (0, 0, 1.25))[0][0] == INF
     # And a ball at the end of the longest beam is not culled: its depth is in range.
-    wide = Ray(grid=(1, 2), fov_deg=170, fov="axis", measure="depth")
+    wide = Ray(grid=(1, 2), fov_deg=along_axes(170), measure="depth")
     # tan(85 deg) / 2 = 5.715: at depth 1 the beam is 5.802 m long.
     ball = (Sphere(radius=0.01),)
     found, _ = look(one_sensor(1, ball, wide), (0.99 * 5.71503, 0, 0.99))
@@ -275,7 +275,7 @@ def test_the_range_itself_counts_as_hit():
 def test_rows_look_along_y_and_columns_along_x():
     # Sensor frame of an upward normal: x and y of the base. 90 deg along each axis,
     # 2 x 4 beams: tangents -.75 -.25 .25 .75 in x and -.5 .5 in y.
-    view = Ray(grid=(2, 4), fov_deg=90, fov="axis")
+    view = Ray(grid=(2, 4), fov_deg=along_axes(90))
     ball = (Sphere(radius=0.1),)
     place = (0.75, -0.5, 1)
     hit = math.hypot(*place) - 0.1
@@ -314,41 +314,6 @@ def test_the_nearest_of_several_objects_is_measured():
     assert look(one_sensor(9, objects, ONE), *places) == ([0.75], [True, True])
     apart = one_sensor(1, objects, ONE, per_object=True)
     assert look(apart, *places) == ([[INF, 0.75]], [False, True])
-
-
-def test_edge_beams_see_the_corner_of_the_view():
-    # A small ball in the corner: tangents .4333 both, of a field of 2 x 2 beams.
-    ball, place = (Sphere(radius=0.01),), (0.43332, 0.43332, 1)
-    edges = Ray(grid=(2, 2), beams="edges")
-    reach = math.hypot(*place) - 0.01
-    found, _ = look(one_sensor(9, ball, edges), place)
-    assert found == [INF, INF, INF, pytest.approx(reach, abs=1e-5)]
-    assert look(one_sensor(9, ball, Ray(grid=(2, 2))), place)[0] == [INF] * 4
-
-
-def test_a_zone_reads_the_nearest_of_its_sub_beams():
-    # A ball between zone centres (pitch .1083) is too small for them: the 3 x 3
-    # sub-beams lie .0361 apart, the edge ones at .0361 from the centre.
-    ball, place = (Sphere(radius=0.01),), (0.05417 + 0.03611, 0.05417 + 0.03611, 1)
-    assert look(one_sensor(9, ball), place)[1] == [False]
-    found, detected = look(one_sensor(9, ball, Ray(sub_beams=3)), place)
-    assert detected == [True]
-    # Zone (4, 4), the first on the positive side of both axes.
-    assert [i for i, d in enumerate(found) if d < INF] == [4 * 8 + 4]
-
-
-@given(SEED)
-def test_sub_beams_are_the_minimum_of_a_finer_grid(skin, random_state, seed):
-    state = turned(random_state(6, seed, objects=4), seed)
-    coarse, fine = (
-        measure(RaySensor(skin, H1_2.chain, SHAPES, RANGE, view), state)[0]
-        for view in (Ray(grid=(2, 4), sub_beams=2), Ray(grid=(4, 8)))
-    )
-    zones = fine.unflatten(-1, (2, 2, 4, 2)).amin((-3, -1)).flatten(-2)
-    # The same tangents may round differently.
-    seen = zones.isfinite() & coarse.isfinite()
-    assert (zones.isfinite() ^ coarse.isfinite()).float().mean() < 1e-3
-    torch.testing.assert_close(coarse[seen], zones[seen], rtol=0, atol=1e-4)
 
 
 # --- what may not change a bit --------------------------------------------------

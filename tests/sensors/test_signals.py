@@ -66,8 +66,8 @@ def test_the_range_of_a_signal_is_that_of_its_sensor(kind, robot, skin, random_s
     signal = Proximity(sensor)(state)["signal"]
     torch.testing.assert_close(signal, expected)
     # A number is a cut: nothing beyond 1 m, whatever the sensor sees.
-    cut = Proximity(1.0, validity=True)(state)["signal"].unflatten(1, (2, -1))[:, 1]
-    assert torch.equal(cut.bool(), (distance <= 1.0).flatten(1))
+    cut = Proximity(1.0)(state)["signal"] < 1.0
+    assert torch.equal(cut, (distance < 1.0).flatten(1))
     assert torch.equal(Binary(sensor)(state)["signal"].bool(), seen.flatten(1))
 
 
@@ -85,20 +85,16 @@ def test_a_measurement_beyond_the_range_of_its_sensor_finds_nothing(dtype):
     found = torch.tensor([[1, 0, 0, math.nan], [0, 0, 1, 1]], dtype=dtype)
     (binary,) = Binary(ranges).compute(distance)
     torch.testing.assert_close(binary, found, rtol=0, atol=0, equal_nan=True)
-    (signal,) = Proximity(ranges, validity=True).compute(distance)
-    torch.testing.assert_close(signal[:, 4:], found, rtol=0, atol=0, equal_nan=True)
+    (signal,) = Proximity(ranges).compute(distance)
     assert signal[:, :2].tolist() == [[1, 1], [1, 1]]
 
 
 def test_signals_of_groups_come_in_the_order_of_the_skin():
-    # Sensors 0 and 3 have one reading, 1 and 2 have two; then what is valid.
-    order = SkinOrder(
-        [[0, 3], [1, 2]], validity=True, in_keys=["a", "b"], out_keys=["signal"]
-    )
-    one = torch.tensor([[0, 30, 100, 130]])
-    two = torch.tensor([[10, 11, 20, 21, 110, 111, 120, 121]])
+    # Sensors 0 and 3 have one reading, 1 and 2 have two.
+    order = SkinOrder([[0, 3], [1, 2]], [1, 2], in_keys=["a", "b"])
+    one, two = torch.tensor([[0, 30]]), torch.tensor([[10, 11, 20, 21]])
     (signal,) = order.compute(one, two)
-    assert signal.tolist() == [[0, 10, 11, 20, 21, 30, 100, 110, 111, 120, 121, 130]]
+    assert signal.tolist() == [[0, 10, 11, 20, 21, 30]]
 
 
 def localize(base_pose, centres, detected) -> list[float]:
@@ -163,17 +159,16 @@ def test_localization_of_an_object_turned_by_nan_is_nan():
     assert signal.isnan().all()
 
 
-@pytest.mark.parametrize("slots", ["nearest", "all"])
-def test_localization_in_a_row_of_nan_is_nan_and_so_is_its_validity(slots):
+def test_localization_in_a_row_of_nan_is_nan():
     pose = torch.tensor([[[1.0, 0, 0, 1, 0, 0, 0]]]).expand(3, -1, -1)
     base = torch.tensor([UPRIGHT]).repeat(3, 1)
     joints = torch.zeros(3, 4)
     base[0, 1], joints[1, 2] = math.nan, math.nan
     detected = torch.ones(3, 1, dtype=torch.bool)
-    localization = Localization(slots=slots, validity=True)
+    localization = Localization()
     (signal,) = localization.compute(base, pose, joints, detected)
     assert signal[:2].isnan().all()
-    assert signal[2].tolist() == [1, 0, 0, 1]
+    assert signal[2].tolist() == [1, 0, 0]
     # What is not detected says nothing of where it is.
     (signal,) = localization.compute(base, pose, joints, ~detected)
-    assert signal.tolist() == [[0] * 4] * 3
+    assert signal.tolist() == [[0] * 3] * 3

@@ -20,7 +20,7 @@ from torchrl.envs import (
 from torchrl.envs.utils import check_env_specs
 
 from egoskin.rng import Stream, uniform
-from egoskin.sensors.history import History, HoldLast
+from egoskin.sensors.history import History, KeepLast
 from egoskin.sensors.imperfections.corruption import Corruption
 from egoskin.sensors.imperfections.models import (
     Bias,
@@ -121,7 +121,7 @@ BUILDERS = {
     "corruption": partial(Corruption, EVERYTHING, dt=0.1, seed=3),
     "one robot": partial(Corruption, EVERYTHING, dt=0.1, seed=3, redraw_traits=False),
     "history": partial(History, 3, ["distance", "signal"], ["distances", "signals"]),
-    "hold last": partial(HoldLast),
+    "last signal": partial(KeepLast),
 }
 every_transform = pytest.mark.parametrize("build", BUILDERS.values(), ids=BUILDERS)
 
@@ -278,14 +278,14 @@ def test_a_row_reset_after_another_goes_on_from_its_own_state(build):
 
 
 @every_transform
-@pytest.mark.parametrize("told_by", ["done", "is_init"])
-def test_stored_steps_give_what_the_environment_gave(build, told_by):
+@pytest.mark.parametrize("marked_by", ["done", "is_init"])
+def test_stored_steps_give_what_the_environment_gave(build, marked_by):
     env = make(build, 5)
     data = env.rollout(STEPS, break_when_any_done=False)
     assert data.batch_size == (5, STEPS)
     transform = build()
     stored = data.select(*transform.in_keys, ("next", "done"))
-    if told_by == "is_init":
+    if marked_by == "is_init":
         done = stored.pop("next")["done"]
         first = torch.ones_like(done[:, :1])
         stored["is_init"] = torch.cat((first, done[:, :-1]), 1)

@@ -344,6 +344,16 @@ def test_an_option_of_format_2_goes_and_is_told_where_it_had_an_effect(
         assert migrate(config, 2) == ({"env": to_plain(EnvConfig())}, retired)
 
 
+def test_sensor_options_of_format_2_go_or_have_another_name():
+    position = {"hold": True, "frame": "base", "over_range": False}
+    sensor = {"validity": False, "ray": {"sub_beams": 1, "grid": [4, 4]}}
+    old = {"env": {"sensor": {**sensor, "localization": position}}}
+    sensor = {"keep_last": True, "ray": {"grid": [4, 4]}}
+    assert migrate(old, 2) == ({"env": {"sensor": sensor}}, {})
+    position["frame"] = "torso"
+    assert migrate(old, 2)[1] == {"env.sensor.localization.frame": "torso"}
+
+
 def test_stored_policies_without_a_seal_load_and_say_so(capsys):
     path = (
         ROOT / "studies/version-1/results/blind-seed0/policies/000065536000.safetensors"

@@ -17,7 +17,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from egoskin.agents.networks import RunningNorm
+from egoskin.agents.normalizers import RunningNorm
 from egoskin.agents.ppo import PPO, PPOConfig
 from egoskin.agents.rollout import collect
 from egoskin.commands.bench.report import Row, show

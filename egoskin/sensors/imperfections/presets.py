@@ -40,7 +40,7 @@ def time_of_flight() -> tuple[Model, ...]:
         FalsePositives(probability=1e-4, max_range=4.0),
         # Assumption: one sensor in a hundred has failed.
         DeadSensors(probability=0.01),
-        # Range from the source; assumption: 2 cm is the nearest it can tell.
+        # Range from the source; assumption: 2 cm is the nearest it can measure.
         RangeLimits(minimum=0.02, maximum=4.0),
         Quantisation(step=0.001),
         SampleAndHold(rate_hz=15.0),

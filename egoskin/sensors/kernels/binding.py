@@ -24,14 +24,13 @@ SOURCE = Path(__file__).with_name("kernels.cpp")
 _NAMES = {torch.float32: "float32", torch.float64: "float64"}
 _COUNTS = (
     *("joints", "steps", "links", "sensors", "objects"),
-    *("beams", "sub_beams", "cull", "reduce", "apart"),
+    *("beams", "cull", "reduce", "apart"),
 )
 _ARRAYS = (
     *("joint", "parent", "frame", "link"),
     *("constant", "by_cos", "by_sin", "shift", "slide"),
     *("offset", "axes", "range", "radius", "squared", "bound", "farthest"),
-    *("cos_half", "to_centre"),
-    *("reach", "pyramid", "directions", "grid", "depth"),
+    *("cos_half", "reach", "pyramid", "directions", "grid", "depth"),
 )
 
 

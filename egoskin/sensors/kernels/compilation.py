@@ -140,8 +140,8 @@ def _compile(command: list[str], source: Path) -> bytes:
         )
         if ended.returncode:
             lines = ended.stderr.splitlines() or [f"exit status {ended.returncode}"]
-            told = next((line for line in lines if "error" in line), lines[-1])
-            raise RuntimeError(f"{command[0]}: {told.strip()}")
+            fault = next((line for line in lines if "error" in line), lines[-1])
+            raise RuntimeError(f"{command[0]}: {fault.strip()}")
         return made.read_bytes()
 
 

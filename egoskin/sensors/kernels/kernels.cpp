@@ -27,7 +27,7 @@ extern "C" {
 // kernel's type; matrices are row-major.
 struct Tables {
   int64_t joints, steps, links, sensors, objects;
-  int64_t beams, sub_beams;    // of each sensor, and of each beam; 0 for a field
+  int64_t beams;               // of each sensor; 0 for a field
   int64_t cull, reduce, apart; // flags: skip what cannot hit, minimum, per object
   const int64_t *joint;        // of each step; -1: none               [steps]
   const int64_t *parent;       // frame that a step starts from        [steps]
@@ -42,11 +42,10 @@ struct Tables {
   const void *farthest;        // from the base that it is in range    [objects]
   // Field.
   const void *cos_half;        // null: every sensor sees all around   [sensors]
-  const uint8_t *to_centre;    // null: all measure to the surface     [sensors]
   // Ray.
   const void *reach;           // farthest that a beam may hit         [sensors]
   const void *pyramid;         // cosines, then sines of the half angles [sensors, 4]
-  const void *directions;      // of each kind of grid        [grids, 3, beams * sub]
+  const void *directions;      // of each kind of grid          [grids, 3, beams]
   const int64_t *grid;         // of each sensor                       [sensors]
   const uint8_t *depth;        // null: all measure along the beam     [sensors]
 };
@@ -427,8 +426,6 @@ void field(const Tables &t, const Inputs &in, T *out, uint8_t *detected) {
                         ~(distance <= T(0));
           distance = beside ? filled<T>(inf) : distance;
         }
-        if (t.to_centre && t.to_centre[sensor])
-          distance = distance == inf ? distance : reach;
         auto gone = (distance > as<T>(t.range)[sensor]) | ~on;
         distance = gone ? filled<T>(inf) : distance;
         found |= distance != inf;
@@ -525,10 +522,10 @@ void find_pairs(const Tables &t, const Block<T> &block, int64_t count,
 }
 
 // RaySensor.read: what the beams of a pair measure; returns the least. `out` has room
-// for whole vectors of sub-beams.
+// for whole vectors.
 template <class T> T read_beams(const Tables &t, const Pair<T> &pair, V<T> *out) {
   const T inf = std::numeric_limits<T>::infinity();
-  const int64_t sensor = pair.sensor, vectors = (t.beams * t.sub_beams + W - 1) / W;
+  const int64_t sensor = pair.sensor, vectors = (t.beams + W - 1) / W;
   const T *directions = as<T>(t.directions) + 3 * W * vectors * t.grid[sensor];
   const T px = -pair.centre[0], py = -pair.centre[1], pz = -pair.centre[2];
   const T squared = as<T>(t.squared)[pair.object], range = as<T>(t.range)[sensor];
@@ -552,16 +549,9 @@ template <class T> T read_beams(const Tables &t, const Pair<T> &pair, V<T> *out)
     out[i] = distance;
     nearest = distance < nearest ? distance : nearest;
   }
-  T *reading = reinterpret_cast<T *>(out);
-  if (t.sub_beams > 1)
-    for (int64_t beam = 0; beam < t.beams; beam++) {
-      T first = reading[beam * t.sub_beams];
-      for (int64_t i = 1; i < t.sub_beams; i++)
-        first = lesser(first, reading[beam * t.sub_beams + i]);
-      reading[beam] = first;
-    }
   // Only where the centre is NaN or infinite may a reading be NaN.
   if (away - away == T(0)) return least_of<T>(nearest);
+  const T *reading = reinterpret_cast<const T *>(out);
   return std::accumulate(reading, reading + t.beams, inf, lesser<T>);
 }
 
@@ -590,7 +580,7 @@ template <class T, class Deliver>
 void rays(const Tables &t, const Inputs &in, uint8_t *detected, Deliver deliver) {
   Block<T> block(t);
   std::vector<Pair<T>> pairs[W];
-  const int64_t vectors = (t.beams * t.sub_beams + W - 1) / W;
+  const int64_t vectors = (t.beams + W - 1) / W;
   std::vector<V<T>> buffer(2 * vectors);
   block.finite = finite<T>(t, in);
   const std::vector<int64_t> reached = rows_in_reach<T>(t, in, block.finite);

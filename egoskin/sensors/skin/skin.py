@@ -32,6 +32,11 @@ _CONVENTIONS = {
 }
 _FIELDS = ("format", "robot", "conventions", "provenance", "types", "sensors")
 _OPTIONAL = ("range", "roll_deg", "radius", "type")
+# What types of older files say as well, and the only values that are still measured.
+_DROPPED: dict[str, dict[str, Any]] = {
+    "field": {"measure": "surface"},
+    "ray": {"fov": "diagonal", "beams": "centres", "sub_beams": 1},
+}
 # Unit normals must be unit to this.
 _UNIT_TOLERANCE = 1e-3
 FARTHEST = 2.0
@@ -64,6 +69,13 @@ def _coverage(name: str, entry: object) -> Coverage:
         )
     default = KINDS[kind]()
     known = [f.name for f in fields(default)]
+    for field_name, only in _DROPPED[kind].items():
+        value = values.pop(field_name, only)
+        if value != only:
+            raise ValueError(
+                f"type {name!r}: {field_name!r} is no more, all are {only!r}; got "
+                f"{value!r}"
+            )
     for field_name, value in values.items():
         _check_known(f"type {name!r}", field_name, known)
         if isinstance(value, list):
@@ -285,8 +297,13 @@ class Skin:
             **{name: getattr(self, name)[list(index)] for name in arrays},
         )
 
-    def filled(self, coverage: Coverage, max_range: float) -> Skin:
-        """Return the skin with what it leaves to the configuration filled in.
+    @property
+    def is_resolved(self) -> bool:
+        """Whether every sensor has a coverage and a range."""
+        return None not in self.coverage and not np.isnan(self.range).any()
+
+    def resolved(self, coverage: Coverage, max_range: float) -> Skin:
+        """Return the skin with a coverage and a range for every sensor.
 
         Args:
             coverage: For sensors that have none of their own.
@@ -299,18 +316,18 @@ class Skin:
         )
 
     def groups(self) -> list[list[int]]:
-        """Return the sensors of a `filled` skin that one transform computes together.
+        """Return the sensors of a `resolved` skin that one transform computes together.
 
         Those are of one kind: fields, or grids of beams of one size.
         """
         groups: dict[object, list[int]] = {}
         for index, own in enumerate(self.coverage):
-            kind = (own.grid, own.sub_beams) if isinstance(own, Ray) else "field"
+            kind = own.grid if isinstance(own, Ray) else "field"
             groups.setdefault(kind, []).append(index)
         return list(groups.values())
 
     def reach(self) -> np.ndarray:
-        """Return how far each sensor of a `filled` skin sees at most [m], ``[S]``."""
+        """Return how far each sensor of a `resolved` skin sees at most [m], ``[S]``."""
         slant = [1.0 if c is None else c.slant for c in self.coverage]
         return self.range * np.array(slant)
 

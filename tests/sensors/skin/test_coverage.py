@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from egoskin.sensors import Field, Ray
+from sensing import along_axes
 
 
 def test_the_default_view_is_63_degrees_from_corner_to_corner():
@@ -22,8 +23,8 @@ def test_the_default_view_is_63_degrees_from_corner_to_corner():
         46.86, abs=0.01
     )
     beams = ray.directions()
-    assert beams.shape == (64, 1, 3)
-    tangent = beams[:, 0, :2] / beams[:, 0, 2:]
+    assert beams.shape == (64, 3)
+    tangent = beams[:, :2] / beams[:, 2:]
     # The first zone's centre: half a zone from the edge, .43332 - .05416 = .37916.
     assert tangent[0] == pytest.approx([-0.37916, -0.37916], abs=1e-5)
     # Row by row: the next zone is one to the right in x, the next row one up in y.
@@ -31,16 +32,17 @@ def test_the_default_view_is_63_degrees_from_corner_to_corner():
     assert tangent[8] - tangent[0] == pytest.approx([0, 0.10833], abs=1e-5)
     assert tangent[63] == pytest.approx([0.37916, 0.37916], abs=1e-5)
     # The corner beam: atan(sqrt(2) * .37916) = 28.2 deg off the axis.
-    corner = math.degrees(math.acos(beams[0, 0, 2]))
+    corner = math.degrees(math.acos(beams[0, 2]))
     assert corner == pytest.approx(28.2, abs=0.01)
 
 
-def test_the_view_can_be_given_along_each_axis():
-    # tan(22.5 deg) = sqrt(2) - 1
-    ray = Ray(grid=(2, 2), fov_deg=45, fov="axis")
+def test_a_view_along_each_axis_is_one_from_corner_to_corner():
+    # The data sheet's 45 degrees along each axis: tan(22.5 deg) = sqrt(2) - 1.
+    assert along_axes(45) == pytest.approx(60.7, abs=0.05)
+    ray = Ray(grid=(2, 2), fov_deg=along_axes(45))
     assert ray.half_extent == pytest.approx(math.sqrt(2) - 1)
     # Centres of two zones: at half of the half extent.
-    tangent = ray.directions()[:, 0, :2] / ray.directions()[:, 0, 2:]
+    tangent = ray.directions()[:, :2] / ray.directions()[:, 2:]
     half = (math.sqrt(2) - 1) / 2
     expected = [[-half, -half], [half, -half], [-half, half], [half, half]]
     np.testing.assert_allclose(tangent, expected, atol=1e-12)
@@ -48,52 +50,27 @@ def test_the_view_can_be_given_along_each_axis():
 
 def test_rows_lie_along_y_and_columns_along_x():
     # fov 90 along each axis: tangents from -1 to 1; one row, four columns.
-    beams = Ray(grid=(1, 4), fov_deg=90, fov="axis").directions()[:, 0]
+    beams = Ray(grid=(1, 4), fov_deg=along_axes(90)).directions()
     np.testing.assert_allclose(beams[:, 0] / beams[:, 2], [-0.75, -0.25, 0.25, 0.75])
     np.testing.assert_allclose(beams[:, 1], 0, atol=1e-15)
-
-
-def test_edge_beams_reach_the_corners_of_the_view():
-    beams = Ray(beams="edges").directions()
-    # Corner to corner: the full 63 degrees.
-    assert np.degrees(np.arccos(beams[0, 0] @ beams[63, 0])) == pytest.approx(63)
-    tangent = beams[:, 0, :2] / beams[:, 0, 2:]
-    # Seven steps from edge to edge.
-    assert tangent[1, 0] - tangent[0, 0] == pytest.approx(2 * 0.43332 / 7, abs=1e-5)
-
-
-def test_sub_beams_are_those_of_a_finer_grid():
-    # A zone of 3 x 3 sub-beams holds nine zones of a grid three times as fine.
-    coarse = Ray(grid=(2, 4), sub_beams=3).directions()
-    fine = Ray(grid=(6, 12)).directions()[:, 0].reshape(6, 12, 3)
-    assert coarse.shape == (8, 9, 3)
-    for row in range(2):
-        for column in range(4):
-            patch = fine[3 * row : 3 * row + 3, 3 * column : 3 * column + 3]
-            np.testing.assert_allclose(
-                coarse[4 * row + column], patch.reshape(9, 3), atol=1e-15
-            )
 
 
 @given(
     st.integers(1, 9),
     st.integers(1, 9),
     st.floats(0.1, 179),
-    st.sampled_from(["diagonal", "axis"]),
-    st.integers(1, 3),
 )
-def test_beams_are_unit_symmetric_and_inside_the_view(rows, columns, angle, fov, sub):
-    ray = Ray(grid=(rows, columns), fov_deg=angle, fov=fov, sub_beams=sub)
+def test_beams_are_unit_symmetric_and_inside_the_view(rows, columns, angle):
+    ray = Ray(grid=(rows, columns), fov_deg=angle)
     beams = ray.directions()
-    assert beams.shape == (ray.num_beams, sub**2, 3)
+    assert beams.shape == (ray.num_beams, 3)
     np.testing.assert_allclose(np.linalg.norm(beams, axis=-1), 1, atol=1e-12)
     tangent = beams[..., :2] / beams[..., 2:]
     assert (np.abs(tangent) < ray.half_extent).all()
     # Turned half a turn about the normal, the last beam is the first.
-    np.testing.assert_allclose(beams[::-1, ::-1] * [-1, -1, 1], beams, atol=1e-12)
-    if fov == "diagonal":
-        # No beam is farther off the normal than half the diagonal.
-        assert (beams[..., 2] > math.cos(math.radians(angle / 2)) - 1e-12).all()
+    np.testing.assert_allclose(beams[::-1] * [-1, -1, 1], beams, atol=1e-12)
+    # No beam is farther off the normal than half the diagonal.
+    assert (beams[..., 2] > math.cos(math.radians(angle / 2)) - 1e-12).all()
 
 
 @pytest.mark.parametrize(
@@ -105,20 +82,11 @@ def test_beams_are_unit_symmetric_and_inside_the_view(rows, columns, angle, fov,
             lambda: Field(half_angle_deg=math.nan),
             "half_angle_deg must be a finite number, got nan",
         ),
-        (
-            lambda: Field(measure="center"),
-            "measure must be surface or centre, got 'cent",
-        ),
         (lambda: Ray(grid=(0, 8)), r"grid must be two positive integers, got \(0, 8\)"),
         (lambda: Ray(grid=(8,)), "grid must be two positive integers"),
         (lambda: Ray(fov_deg=180), "fov_deg must be below 180, got 180"),
         (lambda: Ray(fov_deg=math.nan), "fov_deg must be a finite number"),
         (lambda: Ray(grid=(10**9, 1)), "grid must be at most 1,024, got"),
-        (lambda: Ray(sub_beams=0), "sub_beams must be a positive integer"),
-        (lambda: Ray(beams="edges", sub_beams=2), "needs a grid of at least 2 x 2"),
-        (lambda: Ray(beams="edges", grid=(1, 4)), "needs a grid of at least 2 x 2"),
-        (lambda: Ray(fov="axes"), "fov must be diagonal or axis, got 'axes'"),
-        (lambda: Ray(beams="corners"), "beams must be centres or edges"),
         (lambda: Ray(measure="distance"), "measure must be beam or depth"),
     ],
 )

@@ -244,16 +244,16 @@ def test_all_bad_rows_are_told_at_once_or_left_out(skip, load):
     if skip:
         skin = load(content, skip_invalid=True)
         np.testing.assert_array_equal(skin.position, [FRONT, FRONT])
-        told = skin.provenance["left_out"]
-        assert len(told) == len(bad)
+        listed = skin.provenance["left_out"]
+        assert len(listed) == len(bad)
     else:
         with pytest.raises(ValueError, match="10 sensors cannot be read") as error:
             load(content)
-        told = str(error.value).splitlines()
+        listed = str(error.value).splitlines()
         # What to do is said once for all rows.
         assert str(error.value).count("the links of h1_2 are") == 1
     for line in bad:
-        assert sum(f"export:{line}: " in text for text in told) == 1
+        assert sum(f"export:{line}: " in text for text in listed) == 1
 
 
 @pytest.mark.parametrize(

@@ -248,7 +248,8 @@ def skin_content(*sensors: object) -> dict:
                 ({"grid": [8.5, 8]}, "grid must be two positive integers"),
                 ({"fov_deg": 10**400}, "fov_deg must be in"),
                 ({"fov_deg": "63"}, "'fov_deg' must be like 63.0, got '63'"),
-                ({"sub_beams": 1.5}, "'sub_beams' must be like 1, got 1.5"),
+                ({"measure": 1.5}, "'measure' must be like \"beam\", got 1.5"),
+                ({"sub_beams": 3}, "'sub_beams' is no more, all are 1; got 3"),
             )
         ),
     ],
@@ -258,6 +259,19 @@ def test_a_bad_file_is_refused_with_its_name_and_its_fault(tmp_path, content, me
     path.write_text(content if isinstance(content, str) else json.dumps(content))
     with pytest.raises(ValueError, match=f"bad.json: .*{message}"):
         Skin.load(path)
+
+
+def test_a_type_of_an_older_file_is_the_same_without_what_was_dropped():
+    ray = {"fov": "diagonal", "beams": "centres", "sub_beams": 1, "measure": "depth"}
+    types = {
+        "ray": {"coverage": "ray", "grid": [4, 4], **ray},
+        "field": {"coverage": "field", "half_angle_deg": 90.0, "measure": "surface"},
+    }
+    skin = Skin.from_dict({**skin_content(SENSOR), "types": types})
+    assert skin.types == {
+        "ray": Ray(grid=(4, 4), measure="depth"),
+        "field": Field(half_angle_deg=90),
+    }
 
 
 def test_a_skin_of_another_robot_is_refused_though_its_links_are_named_alike(tmp_path):

@@ -196,7 +196,7 @@ def _check_new(sensor: Sensor, first: dict[str, str]) -> None:
 
 def _metres_per_unit(path: Path, export: Export, scale: float | None) -> float:
     """Metres of one unit of the file; ValueError if that is doubtful."""
-    if export.unit_is_told and scale not in (None, export.unit):
+    if export.unit_is_given and scale not in (None, export.unit):
         raise ValueError(
             f"{path}: the header says {export.unit:g} m to the unit, scale says "
             f"{scale:g}; leave out one of the two (--scale)"

@@ -93,10 +93,10 @@ class Export:
 
     dialect: str
     sensors: list[Sensor]
-    # Metres of one unit of the positions; None if the file does not tell.
+    # Metres of one unit of the positions; None if the file does not say.
     unit: float | None = 1.0
-    # The header itself tells that unit.
-    unit_is_told: bool = False
+    # The header itself says that unit.
+    unit_is_given: bool = False
     # Metres of one unit of the radii; None if it is that of the positions.
     radius_unit: float | None = None
     # Numbers of entries that are no proximity sensors.
@@ -110,7 +110,7 @@ class Links:
         robot_name: Name of the robot, for error texts.
         links: Its links.
         link_map: The user's: link by a part of a path or by all of it.
-        parent: The user's link for sensors whose link the file does not tell.
+        parent: The user's link for sensors whose link the file does not name.
 
     Raises:
         ValueError: If the user names a link that the robot does not have.
@@ -178,7 +178,7 @@ class Links:
         )
 
     def default(self, where: str, name: str = "") -> str:
-        """The user's link for sensors whose link the file does not tell.
+        """The user's link for sensors whose link the file does not name.
 
         Args:
             where: File and line.

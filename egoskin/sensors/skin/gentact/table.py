@@ -149,7 +149,7 @@ def read_table(text: str, path: Path, names: Links, problems: Problems) -> Expor
             sensors.append(_read_sensor(record, names, link, where))
     # Before it had stems the print export came in one unit or another.
     unit = 1.0 if not is_print else 1e-3 if _STEM[0] in columns else None
-    told = units.get("x")
+    given = units.get("x")
     radius_unit = units.get("radius")
     # Since it writes headings, its positions have a unit of their own.
     if radius_unit is None and is_print and (unit is not None or kinds["headings"]):
@@ -157,8 +157,8 @@ def read_table(text: str, path: Path, names: Links, problems: Problems) -> Expor
     return Export(
         dialect=",".join(header),
         sensors=sensors,
-        unit=unit if told is None else told,
-        unit_is_told=told is not None,
+        unit=unit if given is None else given,
+        unit_is_given=given is not None,
         radius_unit=radius_unit,
         skipped={k: n for k, n in kinds.items() if k != "sensors"} if is_print else {},
     )

@@ -1,0 +1,274 @@
+"""From a skin and a configuration to the signal: the one place where both are resolved.
+
+Contract: a `SensorPipeline` resolves the skin once. Whatever else wants to know of a
+sensor's coverage, range or group asks it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from tensordict import TensorDictBase
+from torchrl.envs import Transform
+
+from egoskin.rng import offset_seed
+from egoskin.robots.config import RobotConfig
+from egoskin.sensors.config import SensorConfig
+from egoskin.sensors.field import FieldSensor
+from egoskin.sensors.history import KeepLast
+from egoskin.sensors.imperfections.corruption import Corruption
+from egoskin.sensors.imperfections.presets import PRESETS
+from egoskin.sensors.ray import RaySensor, SparseRays
+from egoskin.sensors.signals import Binary, Localization, Proximity, SkinOrder
+from egoskin.sensors.skin.coverage import Ray
+from egoskin.sensors.skin.skin import Skin
+from egoskin.shapes import Shape
+
+MASK_ALL = ("all",)
+"""Mask of all sensors, and of what an oracle observes."""
+
+# The golden ratio's bits: seeds far apart for sensors of different kinds.
+_GROUP_SEED = 0x9E3779B9
+
+
+def masks_all(mask: Sequence[str]) -> bool:
+    """Whether a mask is that of all sensors."""
+    return tuple(mask) == MASK_ALL
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SensorGroup:
+    """Sensors of one kind, which one transform computes."""
+
+    suffix: str
+    """Ending of the group's keys: ``distance{suffix}`` and so on; "" if it is alone."""
+    index: list[int]
+    """Which sensors of the skin these are."""
+    skin: Skin
+    """They alone, resolved."""
+
+    @property
+    def is_ray(self) -> bool:
+        """Whether they are grids of beams."""
+        return isinstance(self.skin.coverage[0], Ray)
+
+
+class SensorPipeline:
+    """What the sensors of a skin on a robot are, measure and signal.
+
+    Args:
+        config: What they measure, and what is signalled of it.
+        robot: The robot.
+        skin: The sensors; those that leave their coverage or range to the
+            configuration get them here.
+
+    Raises:
+        ValueError: If the configuration does not fit the skin.
+    """
+
+    def __init__(self, config: SensorConfig, robot: RobotConfig, skin: Skin) -> None:
+        self.config, self.robot = config, robot
+        self.skin = skin.resolved(config.default_coverage, config.range)
+        """The sensors, each with a coverage and a range."""
+        groups = self.skin.groups() if config.uses_skin else []
+        self.groups = [
+            SensorGroup(
+                suffix=f"_{i}" if len(groups) > 1 else "",
+                index=index,
+                skin=self.skin.select(index),
+            )
+            for i, index in enumerate(groups)
+        ]
+        """The sensors by kind; none without a skin."""
+        if config.reduce != "none" and not any(g.is_ray for g in self.groups):
+            raise ValueError(
+                f"reduce={config.reduce} is for ray sensors, and the skin has none: "
+                "use coverage=ray"
+            )
+
+    def num_readings(self, group: SensorGroup) -> int:
+        """Return how many readings each sensor of a group signals, ``K`` or 1."""
+        coverage = group.skin.coverage[0]
+        if isinstance(coverage, Ray) and self.config.reduce == "none":
+            return coverage.num_beams
+        return 1
+
+    @property
+    def signal_size(self) -> int:
+        """Numbers that the signal of a row has; 0 without a skin."""
+        if self.config.signal == "localization":
+            return 3
+        return sum(len(g.index) * self.num_readings(g) for g in self.groups)
+
+    # --- masks ------------------------------------------------------------------
+
+    def check_mask(self, mask: Sequence[str]) -> None:
+        """Raise ValueError for a mask that masks nothing; the text lists what does.
+
+        Args:
+            mask: Links whose sensors detect nothing, or `MASK_ALL`.
+        """
+        if not mask:
+            return
+        if self.config.coverage == "none":
+            raise ValueError("a blind robot has no sensors to mask")
+        if masks_all(mask):
+            return
+        if not self.groups:
+            raise ValueError("an oracle has no sensors on links: mask all of it")
+        links = sorted(set(self.skin.links))
+        for name in mask:
+            if name not in links:
+                raise ValueError(
+                    f"mask: no sensor on {name!r}; links with sensors: "
+                    f"{', '.join(links)}"
+                )
+
+    def masked(self, mask: Sequence[str]) -> list[int]:
+        """Return the indices of the sensors that a mask masks.
+
+        Args:
+            mask: Links, or `MASK_ALL`.
+        """
+        every = masks_all(mask)
+        return [i for i, name in enumerate(self.skin.links) if every or name in mask]
+
+    # --- transforms -------------------------------------------------------------
+
+    def sensors(
+        self, objects: Sequence[Shape], masked: Collection[int] = ()
+    ) -> list[FieldSensor | RaySensor]:
+        """Return the transforms that measure, one for each group.
+
+        Args:
+            objects: Shapes of what is sensed.
+            masked: Indices of sensors that detect nothing.
+        """
+        sensors: list[FieldSensor | RaySensor] = []
+        for group in self.groups:
+            args = (group.skin, self.robot.chain, objects)
+            keys = ("distance", "object_detected")
+            common: dict[str, Any] = {
+                "body": self.robot.primitives if self.config.occlusion else (),
+                "out_keys": [f"{key}{group.suffix}" for key in keys],
+                "compile": True,
+            }
+            if group.is_ray:
+                sensor = RaySensor(*args, reduce=self.config.reduce, **common)
+            else:
+                sensor = FieldSensor(*args, **common)
+            sensor.mask([i for i, own in enumerate(group.index) if own in masked])
+            sensors.append(sensor)
+        return sensors
+
+    def transforms(
+        self,
+        objects: Sequence[Shape],
+        *,
+        dt: float,
+        seed: int = 0,
+        row_offset: int = 0,
+        out_key: str = "signal",
+        masked: Collection[int] = (),
+    ) -> list[Transform]:
+        """Return the transforms that write the signal (none without a skin).
+
+        It holds the readings of the skin's first sensor, of its second and so on, of
+        whatever kinds they are.
+
+        Args:
+            objects: Shapes of what is sensed.
+            dt: Duration of a control step [s].
+            seed: Seed of what real sensors draw.
+            row_offset: Global index of the first row.
+            out_key: Key of the signal.
+            masked: Indices of sensors that detect nothing.
+        """
+        if not self.groups:
+            return []
+        config = self.config
+        transforms: list[Transform] = [*self.sensors(objects, masked)]
+        suffixes = [group.suffix for group in self.groups]
+        if config.signal == "localization":
+            detected = [f"object_detected{suffix}" for suffix in suffixes]
+            position = "position" if config.keep_last else out_key
+            keys = ["base_pose", "object_pose", "joint_pos", *detected]
+            transforms.append(Localization(keys, [position]))
+            if config.keep_last:
+                transforms.append(KeepLast([position, *detected], [out_key]))
+            return transforms
+        signals = [f"signal{suffix}" if suffix else out_key for suffix in suffixes]
+        readings = [f"distance{suffix}" for suffix in suffixes]
+        if config.corruption != "none":
+            models = PRESETS[config.corruption]()
+            joints = ["joint_vel"] if any(m.per_speed > 0 for m in models) else []
+            distances, readings = readings, [f"reading{suffix}" for suffix in suffixes]
+            transforms += [
+                Corruption(
+                    models,
+                    dt=dt,
+                    # Two groups of sensors must not fail alike.
+                    seed=offset_seed(seed, number * _GROUP_SEED),
+                    row_offset=row_offset,
+                    in_keys=[distance, *joints],
+                    out_keys=[reading],
+                )
+                for number, (distance, reading) in enumerate(
+                    zip(distances, readings, strict=True)
+                )
+            ]
+        skins = [group.skin for group in self.groups]
+        transforms += map(self._signal, skins, readings, signals)
+        if len(signals) > 1:
+            transforms.append(
+                SkinOrder(
+                    [group.index for group in self.groups],
+                    [self.num_readings(group) for group in self.groups],
+                    in_keys=signals,
+                    out_keys=[out_key],
+                )
+            )
+        return transforms
+
+    def sparse_rays(self, objects: Sequence[Shape]) -> SparseRays | None:
+        """Return what gives the signal as sparse rows, or None if it is not sparse.
+
+        Sparse are the beams of ideal rays of one grid and one range.
+
+        Args:
+            objects: Shapes of what is sensed.
+        """
+        config = self.config
+        measured = config.signal != "localization" and config.corruption == "none"
+        grid = config.reduce == "none" and len(self.groups) == 1
+        one_range = len(set(self.skin.range.tolist())) == 1
+        if not (measured and grid and one_range and self.groups[0].is_ray):
+            return None
+        (sensor,) = self.sensors(objects)
+        assert isinstance(sensor, RaySensor)
+        reading = self._signal(self.skin.select([0]), "distance", "signal")
+        return SparseRays(sensor, reading)
+
+    def detecting(self, state: TensorDictBase) -> np.ndarray:
+        """Return which sensors detect something in one row, ``[S]`` bool.
+
+        Args:
+            state: One row of the environment's output, raw keys kept.
+        """
+        result = np.zeros(len(self.skin), dtype=bool)
+        for group in self.groups:
+            distance = state[f"distance{group.suffix}"].reshape(len(group.index), -1)
+            result[group.index] = distance.isfinite().any(-1).numpy()
+        return result
+
+    def _signal(self, skin: Skin, in_key: str, out_key: str) -> Proximity | Binary:
+        """Return the signal of some sensors' readings."""
+        keys: dict[str, Any] = {"in_keys": [in_key], "out_keys": [out_key]}
+        # A corrupted reading may be one of something beyond the range.
+        ranges = skin.range.tolist()
+        if self.config.signal == "binary":
+            return Binary(ranges, **keys)
+        return Proximity(ranges, closeness=self.config.signal == "closeness", **keys)

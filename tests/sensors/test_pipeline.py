@@ -1,0 +1,116 @@
+"""From skin and configuration to a signal: resolved once, in the order of the skin."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import Composite, Unbounded
+
+from egoskin.make import EnvConfig, make_worker_env
+from egoskin.robots.config import H1_2
+from egoskin.sensors import Field, Ray, SensorPipeline, Skin, place_sensors
+from egoskin.sensors.config import SensorConfig
+from egoskin.shapes import Sphere
+from throwing import TASK
+
+BALLS = [Sphere(radius=0.15), Sphere(radius=0.3)]
+BIG, SMALL, HALF = Ray(grid=(4, 4)), Ray(grid=(2, 3)), Field(half_angle_deg=90)
+
+
+@pytest.fixture(scope="module")
+def mixed() -> Skin:
+    """Nine sensors of three kinds by turns, each with a range of its own."""
+    return replace(
+        place_sensors(H1_2, 9, seed=0),
+        coverage=(BIG, Field(), SMALL, None, HALF, SMALL, BIG, None, Field()),
+        range=np.linspace(0.3, 2.0, 9),
+    )
+
+
+def measured(config: SensorConfig, skin: Skin, state: TensorDict) -> TensorDict:
+    """Stored states, each the first of an episode, with all that is made of them."""
+    stored = state.clone().unsqueeze(-1)
+    stored["is_init"] = torch.ones(*stored.shape, 1, dtype=torch.bool)
+    for transform in SensorPipeline(config, H1_2, skin).transforms(BALLS, dt=1 / 60):
+        stored = transform(stored)
+    return stored
+
+
+@pytest.mark.parametrize("options", [{}, {"reduce": "min"}], ids=["all", "least"])
+@pytest.mark.parametrize("kind", ["proximity", "binary"])
+def test_a_mixed_skin_signals_sensor_by_sensor(mixed, random_state, kind, options):
+    config = SensorConfig(signal=kind, range=1.0, **options)
+    state = random_state(200, seed=3)
+    # By the skin of a single sensor, which cannot be out of order.
+    parts = []
+    for i, coverage in enumerate(mixed.coverage):
+        own = options if isinstance(coverage, Ray) else {}
+        alone = SensorConfig(signal=kind, range=1.0, **own)
+        parts.append(measured(alone, mixed.select([i]), state)["signal"])
+    assert len({part.shape for part in parts}) == (1 if "reduce" in options else 3)
+    assert all(len(part.unique()) > 1 for part in parts)
+    signal = measured(config, mixed, state)["signal"]
+    assert torch.equal(signal, torch.cat(parts, -1))
+    pipeline = SensorPipeline(config, H1_2, mixed)
+    assert pipeline.signal_size == signal.shape[-1]
+    spec = Composite(
+        {key: Unbounded(x.shape, dtype=x.dtype) for key, x in state.items()},
+        shape=[200],
+    )
+    for transform in pipeline.transforms(BALLS, dt=1 / 60):
+        spec = transform.transform_observation_spec(spec)
+    assert spec["signal"].is_in(signal[:, 0])
+
+
+@pytest.mark.parametrize(
+    ("options", "size"),
+    [
+        ({}, 12),
+        ({"coverage": "ray"}, 12 * 64),
+        ({"coverage": "ray", "reduce": "min"}, 12),
+        ({"coverage": "ray", "signal": "localization", "keep_last": True}, 3),
+        ({"coverage": "none"}, 0),
+    ],
+)
+def test_a_skin_is_resolved_once_on_its_way_to_the_kernel(options, size, monkeypatch):
+    config = EnvConfig(task=TASK, sensor=SensorConfig(range=1.25, **options))
+    skin, resolved, calls = place_sensors(H1_2, 12, seed=0), Skin.resolved, []
+
+    def counting(self, *args):
+        calls.append(args)
+        return resolved(self, *args)
+
+    monkeypatch.setattr(Skin, "resolved", counting)
+    env = make_worker_env(config, skin, num_envs=2, seed=0)
+    assert calls == [(config.sensor.default_coverage, 1.25)]
+    pipeline = config.pipeline(skin)
+    assert pipeline.signal_size == size
+    assert (pipeline.skin.range == 1.25).all()
+    if size:
+        assert env.observation_spec["signal"].shape == (2, size)
+    else:
+        assert "signal" not in env.observation_spec
+
+
+def test_a_reduction_of_nothing_is_refused():
+    with pytest.raises(ValueError, match="reduce=min is for ray sensors, and the skin"):
+        EnvConfig(sensor=SensorConfig(reduce="min")).pipeline()
+
+
+@pytest.mark.parametrize("preset", ["time_of_flight", "acoustic"])
+@pytest.mark.parametrize("reach", [0.2, 0.6])
+def test_a_real_sensor_signals_nothing_from_beyond_its_range(
+    skin, random_state, preset, reach
+):
+    # False positives go up to 4 m and 0.5 m, noise beyond any range.
+    config = SensorConfig(signal="binary", range=reach, corruption=preset)
+    stored = measured(config, skin, random_state(4000, seed=1))
+    reading = stored["reading"]
+    beyond = (reading > reach) & (reading < math.inf)
+    assert beyond.sum() > 50
+    assert torch.equal(stored["signal"], (reading <= reach).float())
