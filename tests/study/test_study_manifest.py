@@ -108,7 +108,7 @@ def test_a_cell_is_named_by_what_differs():
         ({"sensor.rang": 1}, "no field 'sensor.rang'; do you mean 'range'"),
         ({"sensr.range": 1}, "no field 'sensr'; do you mean 'sensor'|no field 'sensr'"),
         ({"sensor.range": "far"}, "range"),
-        ({"sensor.range": -1.0}, "sensor.range=-1.0.*must be positive"),
+        ({"sensor.range": -1.0}, "sensor.range=-1.0.*must be at least 0.001"),
         ({"sensor.reduce": "min"}, "is for ray sensors"),
         ({"seed": 1}, "seed cannot be chosen here"),
         ({"total_frames": 1}, "total_frames cannot be chosen here"),

@@ -314,3 +314,9 @@ def test_an_unknown_link_is_refused_with_the_closest_name():
         match=r"sensor 0 sits on 'xyz', which h1_2 does not have\. Its links",
     ):
         skin.check_links(H1_2.links)
+
+
+def test_placing_sensors_beside_a_skin_file_is_refused(tmp_path):
+    config = SkinConfig(path=tmp_path / "my.json", num_sensors=10)
+    with pytest.raises(ValueError, match=r"skin\.num_sensors has no effect beside"):
+        config.build(H1_2)
