@@ -96,7 +96,7 @@ def store(
         "masked": {"success": estimate(0.01)} if skinned else None,
         "standard": manifest.evaluation.standard,
         "trained_on": run.config.env.standard,
-        "bank_seed": manifest.evaluation.throw_set,
+        "throw_set": manifest.evaluation.throw_set,
         "frames": end,
         "mask": [],
     }

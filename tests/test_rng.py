@@ -86,7 +86,7 @@ def test_a_number_is_the_upper_24_bits_of_its_word():
 def test_row_episode_counter_and_block_are_the_words_of_the_counter(
     seed, row, episode, counter, stream
 ):
-    # Fixed for good: a bank of throws or a start must not change with a version.
+    # Fixed for good: a throw set or a start must not change with a version.
     got = draw([row], seed=seed, stream=stream, episode=episode, counter=counter)
     words = [
         philox(torch.tensor([row, episode, counter, b]), (seed, stream)) for b in (0, 1)

@@ -30,6 +30,7 @@ _RENAMED = {
     "--coverage": "--visibility",
     "--numb": "--mask",
     "--throw": "--standard",
+    "--bank-seed": "--throw-set",
 }
 NUMBERS = ConstructorRegistry()
 """How options are read, while it is entered: a whole number also as 1e6."""

@@ -1,4 +1,4 @@
-"""Evaluate a policy on a fixed bank of throws.
+"""Evaluate a policy on a fixed throw set.
 
 egoskin evaluate runs/NAME
 egoskin evaluate localization
@@ -36,15 +36,15 @@ PICTURE_SUFFIXES = (".png", ".svg", ".pdf")
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateConfig:
-    """Play a bank of throws with the mean action of a trained policy."""
+    """Play a throw set with the mean action of a trained policy."""
 
     policy: Annotated[Path, tyro.conf.Positional]
     """Run folder (its latest checkpoint), checkpoint, policy file, or the name of a
     policy that comes with the package."""
-    bank_seed: int = 0
-    """Seed of the bank of throws."""
+    throw_set: int = 0
+    """Seed of the throw set."""
     episodes: int = 1024
-    """Throw sequences in the bank."""
+    """Throw sequences in the throw set."""
     standard: Literal["2", "1", "paper", "run"] = "2"
     """Version of the standard throw to judge by, whatever the policy was trained on;
     run: the throws and ends of its training."""
@@ -56,8 +56,8 @@ class EvaluateConfig:
     behaviour: bool = False
     """Also say what the policy does: hits by kind of throw, displacement, effort."""
     check_substeps: int | None = None
-    """Play the bank once more with this many physics steps in each control step, and
-    say what is lost (8: 480 Hz)."""
+    """Play it once more with this many physics steps in each control step, and say what
+    is lost (8: 480 Hz)."""
     map: Path | None = None
     """Picture to draw of success against speed, tempo, height and direction of the
     throws, within and beyond what is trained on (a quarter of the episodes each)."""
@@ -66,7 +66,7 @@ class EvaluateConfig:
 
     def __post_init__(self) -> None:
         """Raise ValueError for values with which nothing can be played."""
-        check_seed(self.bank_seed, "bank_seed")
+        check_seed(self.throw_set, "throw_set")
         check_counts(self, "episodes", "check_substeps")
         check_num_workers(self.episodes, self.num_workers, "episodes")
         check_output(self.json, "--json")
@@ -109,7 +109,7 @@ def table(result: Evaluation, title: str, age: float) -> str:
     rows = [
         (f"success (no contact for {age:g} s)", interval(result.success, 100, "%")),
         ("  no contact for 5 s", interval(result.success_5s, 100, "%")),
-        ("  same bank, robot held rigid", share(result.rigid_success)),
+        ("  same throw set, robot held rigid", share(result.rigid_success)),
         ("survival time (at most 10 s)", interval(result.survival_time, 1, "s")),
         *((f"ended within {age:g} s by {how}", share(x)) for how, x in ends.items()),
         ("first balls avoided", share(result.avoided.first_ball)),
@@ -201,8 +201,8 @@ def main(args: list[str]) -> None:
     def on_point(done: int, total: int) -> None:
         line.show(f"map: {done} of {total} points")
 
-    bank: dict[str, Any] = {
-        "bank_seed": config.bank_seed,
+    which: dict[str, Any] = {
+        "throw_set": config.throw_set,
         "episodes": config.episodes,
         "num_workers": config.num_workers,
         "mask": config.masked,
@@ -212,17 +212,17 @@ def main(args: list[str]) -> None:
     substeps = config.check_substeps or env_config.task.physics.substeps
     finer = with_substeps(env_config, substeps)
     if config.behaviour:
-        result, behaviour = behave(policy, env_config, policy.skin, **bank)
+        result, behaviour = behave(policy, env_config, policy.skin, **which)
     else:
-        result = evaluate(policy, env_config, policy.skin, **bank)
+        result = evaluate(policy, env_config, policy.skin, **which)
     if config.check_substeps is not None:
-        checked = evaluate(policy, finer, policy.skin, **bank)
+        checked = evaluate(policy, finer, policy.skin, **which)
     line.finish()
     trained = policy.env_config.standard
     played = trained if config.standard == "run" else config.standard
     title = (
         f"{config.policy}: {policy.policy_spec.frames:,} frames on standard {trained}; "
-        f"standard {played}, bank {config.bank_seed} of "
+        f"standard {played}, throw set {config.throw_set} of "
         f"{counted(config.episodes, 'episode')}"
     )
     if config.masked:
@@ -234,7 +234,7 @@ def main(args: list[str]) -> None:
         **dataclasses.asdict(result),
         "standard": played,
         "trained_on": trained,
-        "bank_seed": config.bank_seed,
+        "throw_set": config.throw_set,
         "frames": policy.policy_spec.frames,
         "mask": config.masked,
     }
@@ -252,7 +252,7 @@ def main(args: list[str]) -> None:
             policy,
             env_config,
             policy.skin,
-            bank_seed=config.bank_seed,
+            throw_set=config.throw_set,
             episodes=max(config.episodes // 4, 1),
             mask=config.masked,
             on_point=on_point,

@@ -1,7 +1,7 @@
 """Render an episode: a film, and a contact sheet of the moments that tell it best.
 
 egoskin film runs/NAME --longest-of 16 --out dodge.mp4
-egoskin film runs/NAME --bank-seed 0 --episode 7 --standard run
+egoskin film runs/NAME --throw-set 0 --episode 7 --standard run
 egoskin film --hold --sensor.range 1 --out rigid.gif
 """
 
@@ -63,10 +63,10 @@ class RenderConfig:
     """Film to write, .mp4 or .gif."""
     sheet: Path | None = None
     """Contact sheet to write, .png; None: beside the film, under the same name."""
-    bank_seed: int = 0
-    """Seed of the bank of throws, as in evaluate.py."""
+    throw_set: int = 0
+    """Seed of the throw set, as in evaluate.py."""
     episode: int = 0
-    """Which episode of the bank."""
+    """Which episode of the throw set."""
     longest_of: int = 1
     """Of this many episodes, from --episode on, show the one that lasts longest."""
     standard: Literal["2", "1", "paper", "run"] = "2"
@@ -90,7 +90,7 @@ class RenderConfig:
         """Raise ValueError for what cannot be rendered or written."""
         check_path(self.out, FILM_SUFFIXES)
         check_path(self.sheet_path, (".png",))
-        check_seed(self.bank_seed, "bank_seed")
+        check_seed(self.throw_set, "throw_set")
         check_counts(self, "longest_of")
         if self.episode < 0:
             raise ValueError(f"episode must not be negative, got {self.episode}")
@@ -129,7 +129,7 @@ def main(args: list[str]) -> None:
             env_config,
             skin,
             policy,
-            bank_seed=config.bank_seed,
+            throw_set=config.throw_set,
             first=config.episode,
             episodes=config.longest_of,
             hold=config.hold,
@@ -153,7 +153,7 @@ def main(args: list[str]) -> None:
     line.finish()
     last = frames[-1]
     print(
-        f"episode {recording.row} of bank {config.bank_seed}: {last.time:.2f} s, "
+        f"episode {recording.row} of throw set {config.throw_set}: {last.time:.2f} s, "
         f"{counted(last.num_avoided, 'ball')} avoided, ends with: {last.ending}; film "
         f"{config.out}, contact sheet {config.sheet_path}"
     )

@@ -1,13 +1,13 @@
 """Ask what the body could still do when a ball is in reach of the skin.
 
 egoskin upper-bound field_proximity
-egoskin upper-bound runs/NAME --throws 64 --ball 2 --json ceiling.json
+egoskin upper-bound runs/NAME --throws 64 --ball 2 --json upper-bound.json
 
-The first ball of each episode of a bank (--ball 2: the second) is played by a policy
-until it is in reach of a sensor. From there on actions are searched that, added to the
-policy's, avoid the ball, and then that it does not fall. What the search finds the body
-and the warning time allow (it may miss what is possible); what the policy misses of it
-is a matter of learning, or of what its sensors do not tell.
+The first ball of each episode of a throw set (--ball 2: the second) is played by a
+policy until it is in reach of a sensor. From there on actions are searched that, added
+to the policy's, avoid the ball, and then that it does not fall. What the search finds
+the body and the warning time allow (it may miss what is possible); what the policy
+misses of it is a matter of learning, or of what its sensors do not tell.
 """
 
 from __future__ import annotations
@@ -23,7 +23,12 @@ import tyro
 from torch import Tensor
 
 from egoskin.evaluation.throw_set import standard_task
-from egoskin.evaluation.upper_bound import Ceiling, Outcome, SearchConfig, find_ceiling
+from egoskin.evaluation.upper_bound import (
+    Outcome,
+    SearchConfig,
+    UpperBound,
+    find_upper_bound,
+)
 from egoskin.policies.policy import load_policy
 from egoskin.progress import counted
 from egoskin.rng import check_seed
@@ -36,15 +41,15 @@ BOUNDS = (0.0, 0.7, 0.9, 1.1, 1.3, 2.0)
 
 @dataclass(frozen=True, kw_only=True)
 class CeilingConfig:
-    """Search the actions with which the balls of a bank would be avoided."""
+    """Search the actions with which the balls of a throw set would be avoided."""
 
     policy: Annotated[Path, tyro.conf.Positional]
     """Run folder (its latest checkpoint), checkpoint, policy file, or the name of a
     policy that comes with the package."""
-    bank_seed: int = 0
-    """Seed of the bank of standard throws."""
+    throw_set: int = 0
+    """Seed of the throw set."""
     throws: int = 32
-    """Episodes of the bank."""
+    """Episodes of the throw set."""
     ball: int = 1
     """Which ball of each episode; none is thrown after it."""
     reach: float = 2.0
@@ -56,14 +61,14 @@ class CeilingConfig:
 
     def __post_init__(self) -> None:
         """Raise ValueError for values with which nothing can be searched."""
-        check_seed(self.bank_seed, "bank_seed")
+        check_seed(self.throw_set, "throw_set")
         check_counts(self, "throws", "ball")
         if not self.reach > 0:
             raise ValueError(f"reach must be positive, got {self.reach}")
         check_output(self.json, "--json")
 
 
-def groups(result: Ceiling) -> list[dict[str, float | int]]:
+def groups(result: UpperBound) -> list[dict[str, float | int]]:
     """Return counts by height aimed at: throws, and what becomes of them."""
     rows = []
     for low, high in zip(BOUNDS, BOUNDS[1:], strict=False):
@@ -86,7 +91,7 @@ def groups(result: Ceiling) -> list[dict[str, float | int]]:
     return rows
 
 
-def table(result: Ceiling, title: str) -> str:
+def table(result: UpperBound, title: str) -> str:
     """Return the counts as text."""
     lines = [
         title,
@@ -121,11 +126,11 @@ def main(args: list[str]) -> None:
             flush=True,
         )
 
-    result = find_ceiling(
+    result = find_upper_bound(
         policy,
         standard_task(policy.env_config),
         config.search,
-        bank_seed=config.bank_seed,
+        throw_set=config.throw_set,
         throws=config.throws,
         reach=config.reach,
         ball=config.ball,
@@ -134,7 +139,8 @@ def main(args: list[str]) -> None:
     title = (
         f"{config.policy}: {policy.policy_spec.frames:,} frames; "
         f"{counted(len(result.height), 'throw')} (ball {config.ball} of the episodes) "
-        f"of bank {config.bank_seed} that came within {config.reach:g} m of a sensor"
+        f"of throw set {config.throw_set} that came within {config.reach:g} m of a "
+        "sensor"
     )
     print(table(result, title))
     if config.json is not None:

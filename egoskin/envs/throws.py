@@ -2,7 +2,7 @@
 
 A throw is made of draws that do not depend on the robot (direction, distance, height,
 speed, interval, point aimed at) and is turned into a position and a velocity for the
-pose the robot has at release. One bank of draws therefore serves every policy.
+pose the robot has at release. One throw set of draws therefore serves every policy.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from egoskin.shapes import Sphere
 
 GRAVITY = 9.81
 # Points of the body that throws are aimed at: dense enough that two neighbours are
-# 2 cm apart, and fixed, so that a bank of throws means the same for every run.
+# 2 cm apart, and fixed, so that a throw set means the same for every run.
 _NUM_AIM_POINTS, _AIM_SEED = 4096, 0
 # A robot that runs away faster than this share of the ball's speed is led as if it
 # ran at it; otherwise no throw could reach it.
@@ -217,7 +217,7 @@ class Thrower:
         """Return the random part of the n-th throws of some episodes.
 
         Args:
-            seed: Seed of the run or of the bank.
+            seed: Seed of the run or of the throw set.
             row: Global agent row, ``[n]`` int64.
             episode: Episode of that row, ``[n]`` int64.
             throw: Index of the throw in the episode, ``[n]`` int64.

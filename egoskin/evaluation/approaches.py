@@ -326,7 +326,7 @@ def throw_paths(
         body: The robot they are aimed at.
         config: The throws.
         num_throws: How many, ``n``.
-        seed: Seed of the run or of the bank.
+        seed: Seed of the run or of the throw set.
         dt: Time step of the simulation that they are thrown in [s].
 
     Returns:

@@ -1,4 +1,4 @@
-"""A bank of throws -> what a policy does: which it dodges, where it goes, how hard.
+"""A throw set -> what a policy does: which it dodges, where it goes, how hard.
 
 Everything comes from the environment's state. Throws are sorted by what they are at a
 robot that stands in its default pose, so a throw is in the same group for every policy.
@@ -22,7 +22,7 @@ from egoskin.evaluation.throw_set import (
     Estimate,
     Evaluation,
     evaluate,
-    play_bank,
+    play_throws,
     throw_seed,
     wilson,
 )
@@ -111,7 +111,7 @@ class Waiting:
 
 @dataclass(frozen=True, kw_only=True)
 class Behaviour:
-    """What a policy does with a bank of throws, within 10 s."""
+    """What a policy does with a throw set, within 10 s."""
 
     throws: dict[str, list[Group]]
     """Groups by number of the ball, direction, height aimed at, speed at arrival, time
@@ -123,7 +123,7 @@ class Behaviour:
     motion: Motion
     """How it moves."""
     motion_zero_action: Motion
-    """The same of the zero action, which asks for the default pose, on the bank."""
+    """The same of the zero action, which asks for the default pose."""
 
 
 def behave(
@@ -131,33 +131,33 @@ def behave(
     config: EnvConfig,
     skin: Skin,
     *,
-    bank_seed: int,
+    throw_set: int,
     episodes: int,
     num_workers: int | None = None,
     mask: Sequence[str] = (),
     on_step: Callable[[int, int], None] | None = None,
 ) -> tuple[Evaluation, Behaviour]:
-    """Return how a policy fares on a bank of throws, and what it does there.
+    """Return how a policy fares on a throw set, and what it does there.
 
     Args:
         policy: Writes ``action`` into a TensorDict; None is the zero action.
-        config: Robot, task (its throws are those of the bank), sensors.
+        config: Robot, task (its throws are those of the throw set), sensors.
         skin: The skin.
-        bank_seed: Seed of the bank.
-        episodes: Size of the bank.
+        throw_set: Seed of the throw set.
+        episodes: Size of the throw set.
         num_workers: Physics threads; the result does not depend on it.
         mask: Links whose sensors detect nothing, or `egoskin.sensors.MASK_ALL`.
         on_step: Called with (steps done, episodes still running).
     """
-    bank: dict[str, Any] = {
-        "bank_seed": bank_seed,
+    which: dict[str, Any] = {
+        "throw_set": throw_set,
         "episodes": episodes,
         "num_workers": num_workers,
     }
-    seen, still = (Watcher(config, bank_seed, episodes) for _ in range(2))
+    seen, still = (Watcher(config, throw_set, episodes) for _ in range(2))
     watching: dict[str, Any] = {"mask": mask, "on_step": on_step, "watch": seen}
-    result = evaluate(policy, config, skin, **bank, **watching)
-    play_bank(None, config, skin, **bank, watch=still)
+    result = evaluate(policy, config, skin, **which, **watching)
+    play_throws(None, config, skin, **which, watch=still)
     behaviour = Behaviour(
         throws=seen.groups(),
         waiting=seen.waiting(),
@@ -169,15 +169,15 @@ def behave(
 
 
 class Watcher:
-    """Sees every step of a bank (`egoskin.evaluation.throw_set.Watch`) and sums up.
+    """Sees every step of a throw set (`throw_set.Watch`) and sums up.
 
     Args:
         config: What the environment is made of.
-        bank_seed: Seed of the bank.
-        episodes: Size of the bank, ``N``.
+        throw_set: Seed of the throw set.
+        episodes: Size of the throw set, ``N``.
     """
 
-    def __init__(self, config: EnvConfig, bank_seed: int, episodes: int) -> None:
+    def __init__(self, config: EnvConfig, throw_set: int, episodes: int) -> None:
         task, robot = config.task, config.robot_config
         self._hz, self._balls = task.physics.control_hz, task.throws.num_balls
         self._limit = round(task.success_s * self._hz)
@@ -188,7 +188,7 @@ class Watcher:
         row = torch.arange(episodes).repeat_interleave(count)
         index = torch.arange(count).repeat(episodes)
         # The throws of each episode in turn, [N * K].
-        seed = throw_seed(config, bank_seed)
+        seed = throw_seed(config, throw_set)
         self._draw = self._thrower.draw(seed, row, row * 0, index)
         gap = (self._draw.interval * self._hz).round().long().clamp(min=1)
         gap = gap.reshape(episodes, count)

@@ -18,7 +18,7 @@ from torch import nn
 
 from egoskin.envs.balls import PASSED_DISTANCE
 from egoskin.envs.throws import ThrowConfig
-from egoskin.evaluation.throw_set import Estimate, play_bank, summarize
+from egoskin.evaluation.throw_set import Estimate, play_throws, summarize
 from egoskin.make import EnvConfig
 from egoskin.sensors import Skin
 
@@ -143,7 +143,7 @@ def operating_map(
     config: EnvConfig,
     skin: Skin,
     *,
-    bank_seed: int,
+    throw_set: int,
     episodes: int,
     num_workers: int | None = None,
     mask: Sequence[str] = (),
@@ -155,7 +155,7 @@ def operating_map(
         policy: Writes ``action`` into a TensorDict; None is the zero action.
         config: Robot, task, sensors.
         skin: The skin.
-        bank_seed: Seed of the throws.
+        throw_set: Seed of the throws.
         episodes: Episodes of each point.
         num_workers: Processes; the result does not depend on it.
         mask: Links whose sensors detect nothing, or `egoskin.sensors.MASK_ALL`.
@@ -179,11 +179,11 @@ def operating_map(
                 throws = what.vary(throws, value)
             throws = _with_enough_balls(throws)
             task = dataclasses.replace(config.task, throws=throws)
-            played = play_bank(
+            played = play_throws(
                 policy,
                 dataclasses.replace(config, task=task),
                 skin,
-                bank_seed=bank_seed,
+                throw_set=throw_set,
                 episodes=episodes,
                 num_workers=num_workers,
                 mask=mask,

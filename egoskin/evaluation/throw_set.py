@@ -1,8 +1,9 @@
-"""A fixed bank of throws -> how well a policy dodges, with intervals.
+"""A fixed throw set -> how well a policy dodges, with intervals.
 
-The bank of seed ``s`` is the draws of episode 0 of rows 0 to ``episodes - 1``: azimuth,
-distance, height, speed, interval, link and point aimed at. Draws are counter-based, so
-nothing is stored, and every policy, skin and number of workers meets the same throws.
+The throw set of seed ``s`` is the draws of episode 0 of rows 0 to ``episodes - 1``:
+azimuth, distance, height, speed, interval, link and point aimed at. Draws are
+counter-based, so nothing is stored, and every policy, skin and number of workers meets
+the same throws.
 No training meets them (`throw_seed`). All times count from the first throw.
 """
 
@@ -64,7 +65,7 @@ class Avoided:
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """How a policy fares on a bank of throws.
+    """How a policy fares on a throw set.
 
     Success is read at the task's ``success_s``, 3 s of the standard task; success and
     the shares of the ends up to then add up to 1. Times count from the first throw.
@@ -85,16 +86,16 @@ class Evaluation:
     diverged: float
     """Share whose simulation failed."""
     rigid_success: float
-    """Success on the same bank of the robot held rigid in its default pose."""
+    """Success on the same throw set of the robot held rigid in its default pose."""
     avoided: Avoided
     """Balls avoided per ball that arrived, within 10 s."""
     episodes: int
-    """Size of the bank."""
+    """Size of the throw set."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Episodes:
-    """How each episode of a bank ended, ``[N]`` each."""
+    """How each episode of a throw set ended, ``[N]`` each."""
 
     steps: Tensor
     """Length from the first throw on [control steps]; not positive if it was not thrown
@@ -131,12 +132,12 @@ def mean_estimate(values: Tensor) -> Estimate:
 
 
 @torch.no_grad()
-def play_bank(
+def play_throws(
     policy: nn.Module | TensorDictModuleBase | None,
     config: EnvConfig,
     skin: Skin,
     *,
-    bank_seed: int,
+    throw_set: int,
     episodes: int,
     first: int = 0,
     num_workers: int | None = None,
@@ -145,24 +146,24 @@ def play_bank(
     on_step: Callable[[int, int], None] | None = None,
     watch: Watch | None = None,
 ) -> Episodes:
-    """Return how the episodes of a bank end.
+    """Return how the episodes of a throw set end.
 
     Args:
         policy: Writes ``action`` into a TensorDict; None is the zero action.
         config: Robot, task, sensors.
         skin: The skin.
-        bank_seed: Seed of the bank.
+        throw_set: Seed of the throw set.
         episodes: Number of episodes, all played side by side.
         first: Row of the first of them; with ``watch`` alone.
         num_workers: Processes; the result does not depend on it.
         hold: Whether the robot is held rigid in its default pose.
         mask: Links whose sensors detect nothing, or `egoskin.sensors.MASK_ALL`.
         on_step: Called with (steps done, episodes still running).
-        watch: Sees every step; the bank is then played in this process, with threads
-            instead of workers, and comes to the same.
+        watch: Sees every step; the throws are then played in this process, with
+            threads instead of workers, and come to the same.
     """
     assert first == 0 or watch is not None
-    seed = throw_seed(config, bank_seed)
+    seed = throw_seed(config, throw_set)
     config.pipeline(skin).check_mask(mask)
     shared: dict[str, Any] = {
         "num_envs": episodes,
@@ -241,21 +242,21 @@ def standard_task(config: EnvConfig, version: Standard = "2") -> EnvConfig:
     return dataclasses.replace(config, task=evaluation_task(version, config.task))
 
 
-def throw_seed(config: EnvConfig, bank_seed: int) -> int:
-    """Return the seed of a bank's draws.
+def throw_seed(config: EnvConfig, throw_set: int) -> int:
+    """Return the seed of a throw set's draws.
 
     It is one that no training uses. Version 1 of the standard throw alone keeps the
     draws it had, which are those of the first episodes of a training with that seed.
     """
-    return bank_seed if config.standard == "1" else held_out(bank_seed)
+    return throw_set if config.standard == "1" else held_out(throw_set)
 
 
 def summarize(played: Episodes, rigid: Episodes, task: DodgeballConfig) -> Evaluation:
-    """Return the figures of a bank from how its episodes ended.
+    """Return the figures of a throw set from how its episodes ended.
 
     Args:
         played: Episodes of the policy.
-        rigid: Episodes of the rigid robot on the same bank.
+        rigid: Episodes of the rigid robot on the same throw set.
         task: The task, for its control rate and the age of success.
     """
     control_hz = task.physics.control_hz
@@ -290,33 +291,33 @@ def evaluate(
     config: EnvConfig,
     skin: Skin,
     *,
-    bank_seed: int,
+    throw_set: int,
     episodes: int,
     num_workers: int | None = None,
     mask: Sequence[str] = (),
     on_step: Callable[[int, int], None] | None = None,
     watch: Watch | None = None,
 ) -> Evaluation:
-    """Return how a policy fares on a bank of throws, beside the rigid robot.
+    """Return how a policy fares on a throw set, beside the rigid robot.
 
     Args:
         policy: Writes ``action`` into a TensorDict; None is the zero action.
-        config: Robot, task (its throws are those of the bank), sensors.
+        config: Robot, task (its throws are those of the throw set), sensors.
         skin: The skin.
-        bank_seed: Seed of the bank.
-        episodes: Size of the bank.
+        throw_set: Seed of the throw set.
+        episodes: Size of the throw set.
         num_workers: Processes; the result does not depend on it.
         mask: Links whose sensors detect nothing, or `egoskin.sensors.MASK_ALL`.
         on_step: Called with (steps done, episodes still running).
-        watch: Sees every step of the policy's episodes, see `play_bank`.
+        watch: Sees every step of the policy's episodes, see `play_throws`.
     """
 
     def play(who: Any, hold: bool) -> Episodes:
-        return play_bank(
+        return play_throws(
             who,
             config,
             skin,
-            bank_seed=bank_seed,
+            throw_set=throw_set,
             episodes=episodes,
             num_workers=num_workers,
             hold=hold,

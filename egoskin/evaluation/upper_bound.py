@@ -74,7 +74,7 @@ class Outcome:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ceiling:
+class UpperBound:
     """What a policy makes of some balls, and what could be made of them."""
 
     height: Tensor
@@ -104,18 +104,18 @@ class _Start:
 
 
 @torch.no_grad()
-def find_ceiling(
+def find_upper_bound(
     policy: Policy,
     config: EnvConfig,
     search: SearchConfig,
     *,
-    bank_seed: int,
+    throw_set: int,
     throws: int,
     reach: float,
     ball: int = 1,
     on_iteration: Callable[[int, Outcome], None] | None = None,
-) -> Ceiling:
-    """Search the actions with which the balls of a bank would be avoided.
+) -> UpperBound:
+    """Search the actions with which the balls of a throw set would be avoided.
 
     The policy plays until the ball is within reach of a sensor. From there on a plan, a
     few vectors of actions that last some control steps each, is added to its actions:
@@ -125,10 +125,10 @@ def find_ceiling(
 
     Args:
         policy: Writes the mean action.
-        config: Robot, task (its throws are those of the bank), sensors.
+        config: Robot, task (its throws are those of the throw set), sensors.
         search: Plans and search.
-        bank_seed: Seed of the bank.
-        throws: Number of episodes of the bank.
+        throw_set: Seed of the throw set.
+        throws: Number of episodes of the throw set.
         reach: Distance from a sensor to the ball's surface at which plans start [m].
         ball: Which ball of each episode, from 1; none is thrown after it.
         on_iteration: Called with (iterations done, the best outcome so far).
@@ -142,10 +142,10 @@ def find_ceiling(
     """
     if config.sensor.corruption != "none":
         raise ValueError(
-            "a ceiling is searched with ideal sensors, but the policy's have "
+            "an upper bound is searched with ideal sensors, but the policy's have "
             f"corruption={config.sensor.corruption}"
         )
-    hz, seed = config.task.physics.control_hz, throw_seed(config, bank_seed)
+    hz, seed = config.task.physics.control_hz, throw_seed(config, throw_set)
     if (steps := round(search.stand_s * hz)) < 1:
         raise ValueError(
             f"stand_s must be at least one control step, got {search.stand_s}"
@@ -209,13 +209,13 @@ def find_ceiling(
     height, _ = thrower.at_standing_robot(
         thrower.draw(seed, start.throw, zero, zero + ball - 1)
     )
-    return Ceiling(height=height, policy=own, best=best)
+    return UpperBound(height=height, policy=own, best=best)
 
 
 def _until_in_reach(
     env: TransformedEnv, policy: Policy, config: EnvConfig, reach: float, ball: int = 1
 ) -> _Start:
-    """Play a bank; return the state of each episode when its n-th ball is in reach."""
+    """Play a throw set; return each episode's state when its n-th ball is in reach."""
     throws = env.batch_size[0]
     sensor = SensorConfig(coverage="field", signal="binary", range=reach)
     balls = config.task.throws.balls

@@ -76,7 +76,7 @@ class SensorConfig:
 
     coverage: Literal["field", "ray", "none", "oracle"] = "field"
     """Spherical field, grid of beams, no sensor at all (a blind robot), or no sensor
-    but the truth: position and velocity of every ball, to find the task's ceiling."""
+    but the truth: position and velocity of every ball, the most that could be told."""
     signal: Literal["localization", "proximity", "closeness", "binary"] = "proximity"
     """Ball position if any sensor detects it; distance / range; 1 - that; in range?"""
     range: Annotated[float, Interval(ge=1e-3, le=math.inf)] = 2.0

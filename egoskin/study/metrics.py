@@ -188,7 +188,7 @@ def runs_csv(manifest: Manifest, results: Sequence[Result]) -> str:
                 run.seed,
                 evaluation["trained_on"],
                 evaluation["standard"],
-                evaluation["bank_seed"],
+                evaluation["throw_set"],
                 evaluation["episodes"],
                 run.end,
                 *("" if v is None else repr(float(v)) for v in values),

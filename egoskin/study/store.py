@@ -28,7 +28,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-from egoskin.evaluation.throw_set import play_bank, standard_task, summarize
+from egoskin.evaluation.throw_set import play_throws, standard_task, summarize
 from egoskin.policies.policy import Policy, load_policy
 from egoskin.runs.run import Run
 from egoskin.sensors import MASK_ALL
@@ -397,10 +397,10 @@ def judge(
     """
     config = standard_task(policy.env_config, plan.standard)
     play = partial(
-        play_bank,
+        play_throws,
         config=config,
         skin=policy.skin,
-        bank_seed=plan.throw_set,
+        throw_set=plan.throw_set,
         episodes=plan.episodes,
         num_workers=1,
         on_step=on_step,
@@ -415,7 +415,7 @@ def judge(
         "masked": None if masked is None else dataclasses.asdict(masked),
         "standard": plan.standard,
         "trained_on": policy.env_config.standard,
-        "bank_seed": plan.throw_set,
+        "throw_set": plan.throw_set,
         "frames": policy.policy_spec.frames,
         "mask": [],
     }

@@ -23,7 +23,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
-from egoskin.evaluation.throw_set import play_bank
+from egoskin.evaluation.throw_set import play_throws
 from egoskin.make import EnvConfig
 from egoskin.robots.config import RobotConfig
 from egoskin.sensors import Ray, Skin
@@ -68,7 +68,7 @@ class Recording:
     """The states of one episode, from its start to the step that ends it."""
 
     row: int
-    """Row of the episode in its bank."""
+    """Row of the episode in its throw set."""
     states: list[TensorDictBase]
     """State after each control step, the start first, raw keys kept."""
     ending: str | None
@@ -80,23 +80,23 @@ def record_episodes(
     skin: Skin,
     policy: nn.Module | TensorDictModuleBase | None,
     *,
-    bank_seed: int = 0,
+    throw_set: int = 0,
     first: int = 0,
     episodes: int = 1,
     hold: bool = False,
     on_step: Callable[[int, int], None] | None = None,
 ) -> list[Recording]:
-    """Return recordings of some episodes of a bank of throws.
+    """Return recordings of some episodes of a throw set.
 
-    The starts and the throws are those of the bank's rows. (The motion is too, but for
-    rounding: a network's result depends on the batch size in its last bits.)
+    The starts and the throws are those of the throw set's rows. (The motion is too, but
+    for rounding: a network's result depends on the batch size in its last bits.)
 
     Args:
         config: What the environment is made of.
         skin: The sensors.
         policy: Writes ``action``; None for action 0, the default pose as position
             target.
-        bank_seed: Seed of the bank.
+        throw_set: Seed of the throw set.
         first: Row of the first episode.
         episodes: Number of episodes.
         hold: Whether the robot is held rigid in its default pose.
@@ -112,11 +112,11 @@ def record_episodes(
                 states[i].append(before[i].clone())
             states[i].append(after[i].clone())
 
-    play_bank(
+    play_throws(
         policy,
         config,
         skin,
-        bank_seed=bank_seed,
+        throw_set=throw_set,
         first=first,
         episodes=episodes,
         hold=hold,

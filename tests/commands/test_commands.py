@@ -114,14 +114,14 @@ def test_an_evaluation_has_the_figures_promised(evaluated):
         "episodes",
         "standard",
         "trained_on",
-        "bank_seed",
+        "throw_set",
         "frames",
         "mask",
     }
-    about = {"standard": "2", "trained_on": "2", "bank_seed": 0, "mask": []}
+    about = {"standard": "2", "trained_on": "2", "throw_set": 0, "mask": []}
     assert {key: result[key] for key in about} == about
     assert result["frames"] == 4 * BATCH
-    assert f"{4 * BATCH:,} frames on standard 2; standard 2, bank 0" in text
+    assert f"{4 * BATCH:,} frames on standard 2; standard 2, throw set 0" in text
     assert "success (no contact for 3 s)" in text
     assert "no contact for 5 s" in text
     assert result["success_5s"]["mean"] <= result["success"]["mean"]
@@ -165,7 +165,7 @@ def test_an_evaluation_says_by_which_standard_it_judges(evaluated):
         assert result["trained_on"] == "2"
         judged = "2" if standard == "run" else standard
         assert result["standard"] == judged
-        assert f"on standard 2; standard {judged}, bank 0" in text
+        assert f"on standard 2; standard {judged}, throw set 0" in text
         results[standard] = result["survival_time"]
     # It is judged by 2 as by the paper's, with the first ball at the start; on the
     # throws of its training that comes later, and version 1 is aimed elsewhere.
@@ -187,7 +187,7 @@ def test_an_evaluation_may_mask_all_sensors_or_those_of_some_links(
         played = evaluate(
             policy,
             *(task, policy.skin),
-            bank_seed=0,
+            throw_set=0,
             episodes=EPISODES,
             num_workers=1,
             mask=mask,
@@ -207,7 +207,7 @@ def test_an_evaluation_may_mask_all_sensors_or_those_of_some_links(
         (["--numb"], "--numb"),
         (["--map", "map.txt"], ".png"),
         (["--map", "no/map.png"], "no folder no"),
-        (["--bank-seed", str(2**32)], "bank_seed must be in [0, 2**32)"),
+        (["--throw-set", str(2**32)], "throw_set must be in [0, 2**32)"),
         (["--episodes", "0"], "episodes must be at least 1"),
         (["--check-substeps", "0"], "check_substeps must be at least 1, got 0"),
     ],
@@ -242,8 +242,8 @@ def test_an_evaluation_draws_an_operating_map(
     assert [point["values"] for point in both["points"]] == [[4.0, 1.0], [8.0, 1.0]]
 
 
-def test_a_ceiling_counts_what_policy_and_search_avoid(tmp_path: Path):
-    out = tmp_path / "ceiling.json"
+def test_an_upper_bound_counts_what_policy_and_search_avoid(tmp_path: Path):
+    out = tmp_path / "upper-bound.json"
     search = ("--search.samples", "4", "--search.iterations", "1")
     # So long that each plan sees its ball arrive, so short that it takes seconds.
     done = call(
@@ -252,7 +252,7 @@ def test_a_ceiling_counts_what_policy_and_search_avoid(tmp_path: Path):
         *(*search, "--search.stand-s", "0.75"),
     )
     assert done.returncode == 0, done.stderr
-    assert "12 throws (ball 1 of the episodes) of bank 0 that came" in done.stdout
+    assert "12 throws (ball 1 of the episodes) of throw set 0 that came" in done.stdout
     assert "iteration 1 of 1" in done.stderr
     rows = json.loads(out.read_text())["by_height_m"]
     assert sum(row["throws"] for row in rows) == 12

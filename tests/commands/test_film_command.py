@@ -13,7 +13,7 @@ from PIL import Image
 
 from calling import SCRIPTS, call, fail
 from egoskin.envs.throws import Thrower
-from egoskin.evaluation.throw_set import play_bank, throw_seed
+from egoskin.evaluation.throw_set import play_throws, throw_seed
 from egoskin.make import EnvConfig
 from egoskin.sensors import Skin
 
@@ -40,18 +40,18 @@ def test_it_writes_a_film_and_a_sheet(tmp_path: Path):
 def test_a_film_is_of_the_longest_of_the_episodes_that_are_evaluated(
     skin: Skin, tmp_path: Path
 ):
-    bank = {"bank_seed": 3, "episodes": 6, "num_workers": 1, "hold": True}
+    which = {"throw_set": 3, "episodes": 6, "num_workers": 1, "hold": True}
     config = EnvConfig()
     thrower = Thrower(config.task.throws, config.robot_config, 1 / 120)
     row = torch.arange(6)
     delay = thrower.first_delay(throw_seed(config, 3), row, row * 0)
-    ages = play_bank(None, config, skin, **bank).steps + (60 * delay).round().long()
+    ages = play_throws(None, config, skin, **which).steps + (60 * delay).round().long()
     longest = 2 + int(ages[2:].argmax())
     args = ["--out", str(tmp_path / "a.gif"), "--size", "160", "90", "--fps", "4"]
-    args += ["--bank-seed", "3", "--episode", "2", "--longest-of", "4", "--hold"]
+    args += ["--throw-set", "3", "--episode", "2", "--longest-of", "4", "--hold"]
     length = int(ages[longest]) / 60
-    expected = f"episode {longest} of bank 3: {length:.2f} s, 0 balls avoided, ends "
-    assert expected + "with: hit" in film(*args)
+    expected = f"episode {longest} of throw set 3: {length:.2f} s, 0 balls avoided, "
+    assert expected + "ends with: hit" in film(*args)
 
 
 @pytest.mark.parametrize(
@@ -62,7 +62,7 @@ def test_a_film_is_of_the_longest_of_the_episodes_that_are_evaluated(
         (["--sheet", "a.jpg"], "must end in .png"),
         (["--slowdown", "0"], "slowdown must be in (0, 100]"),
         (["--slowdown", "inf"], "slowdown must be in (0, 100]"),
-        (["--bank-seed", "-1"], "bank_seed must be in"),
+        (["--throw-set", "-1"], "throw_set must be in"),
         (["--episode", "-1"], "episode must not be negative"),
         (["--longest-of", "0"], "longest_of must be at least 1"),
         (["--fps", "61"], "fps must be in"),

@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from egoskin.envs.dodgeball import DodgeballConfig
 from egoskin.envs.throws import Thrower
 from egoskin.evaluation.behaviour import Group, Watcher, behave
-from egoskin.evaluation.throw_set import Episodes, evaluate, play_bank
+from egoskin.evaluation.throw_set import Episodes, evaluate, play_throws
 from egoskin.make import EnvConfig
 from egoskin.rng import held_out
 from egoskin.robots.config import H1_2
@@ -32,12 +32,12 @@ def make(**task) -> EnvConfig:
 
 @pytest.fixture(scope="module")
 def rigid() -> tuple[Watcher, Episodes, EnvConfig]:
-    """The rigid robot on a bank of balls that fly beside it."""
+    """The rigid robot on a throw set of balls that fly beside it."""
     config = make(throws=BESIDE)
     watcher = Watcher(config, 0, LAST)
     skin = config.skin.build(H1_2)
-    played = play_bank(
-        None, config, skin, bank_seed=0, episodes=LAST, hold=True, watch=watcher
+    played = play_throws(
+        None, config, skin, throw_set=0, episodes=LAST, hold=True, watch=watcher
     )
     return watcher, played, config
 
@@ -256,8 +256,8 @@ def test_balls_after_a_delay_are_those_that_the_environment_counts():
     config = make(throws=replace(BESIDE, first_delay=(0.3, 1.1)))
     skin = config.skin.build(H1_2)
     watcher = Watcher(config, 1, 32)
-    bank = {"bank_seed": 1, "episodes": 32}
-    played = play_bank(None, config, skin, **bank, hold=True, watch=watcher)
+    which = {"throw_set": 1, "episodes": 32}
+    played = play_throws(None, config, skin, **which, hold=True, watch=watcher)
     arrived, avoided = watcher._arrived, watcher._arrived & ~watcher._hit
     for counted, seen in ((played.arrived, arrived), (played.avoided, avoided)):
         assert torch.equal(seen[:, 0].long(), counted[:, 0].long())
@@ -330,9 +330,9 @@ def test_watching_changes_no_figure():
         def forward(self, td):
             return td.set("action", td["signal"] @ weights - weights.sum(0))
 
-    bank = {"bank_seed": 3, "episodes": 32}
-    result, behaviour = behave(Module(), config, skin, **bank)
-    assert result == evaluate(Module(), config, skin, **bank, num_workers=2)
+    which = {"throw_set": 3, "episodes": 32}
+    result, behaviour = behave(Module(), config, skin, **which)
+    assert result == evaluate(Module(), config, skin, **which, num_workers=2)
     first = [g for g in behaviour.throws["direction"] if g.first_hits is not None]
     assert first
     assert behaviour.motion.power > behaviour.motion_zero_action.power > 0

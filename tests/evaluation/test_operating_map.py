@@ -11,7 +11,7 @@ import torch
 from egoskin.envs.throws import ThrowConfig, Thrower
 from egoskin.evaluation import operating_map as maps
 from egoskin.evaluation.operating_map import check_map, draw_map, operating_map
-from egoskin.evaluation.throw_set import play_bank, standard_task, summarize
+from egoskin.evaluation.throw_set import play_throws, standard_task, summarize
 from egoskin.make import EnvConfig
 from egoskin.robots.config import H1_2
 from egoskin.sensors import MASK_ALL, place_sensors
@@ -118,8 +118,8 @@ def test_slow_balls_in_a_fast_sequence_all_arrive():
     for own in (throws, maps._with_enough_balls(throws)):
         task = replace(TASK, throws=own, episode_length_s=6.0)
         config = EnvConfig(task=task, sensor=SensorConfig(coverage="none"))
-        bank = {"bank_seed": 0, "episodes": 4, "num_workers": 1, "hold": True}
-        played = play_bank(None, config, SKIN, **bank)
+        which = {"throw_set": 0, "episodes": 4, "num_workers": 1, "hold": True}
+        played = play_throws(None, config, SKIN, **which)
         assert not played.hit.any()
         arrived.append(played.arrived.sum(1))
     assert (arrived[0] == 0).all()
@@ -136,7 +136,7 @@ def test_an_operating_map_is_the_success_on_each_throw(monkeypatch):
         None,
         config,
         SKIN,
-        bank_seed=5,
+        throw_set=5,
         episodes=16,
         num_workers=1,
         mask=MASK_ALL,
@@ -158,11 +158,11 @@ def test_an_operating_map_is_the_success_on_each_throw(monkeypatch):
         if len(point.values) == 2:
             throws = replace(throws, interval=(2.5, 2.5))
         task = replace(config.task, throws=throws)
-        played = play_bank(
+        played = play_throws(
             None,
             replace(config, task=task),
             SKIN,
-            bank_seed=5,
+            throw_set=5,
             episodes=16,
             num_workers=1,
         )
@@ -222,4 +222,4 @@ def test_no_map_is_made_of_an_actor_that_observes_each_ball():
     with pytest.raises(ValueError, match=message):
         check_map(config)
     with pytest.raises(ValueError, match=message):
-        operating_map(None, config, SKIN, bank_seed=0, episodes=1)
+        operating_map(None, config, SKIN, throw_set=0, episodes=1)

@@ -1,4 +1,4 @@
-"""Evaluation: figures by hand, the same bank for all, intervals."""
+"""Evaluation: figures by hand, the same throw set for all, intervals."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from egoskin.envs.throws import ThrowConfig, Thrower
 from egoskin.evaluation.throw_set import (
     Episodes,
     mean_estimate,
-    play_bank,
+    play_throws,
     standard_task,
     summarize,
     throw_seed,
@@ -160,7 +160,7 @@ def test_the_standard_throw_replaces_the_throw_of_the_run(version, aim):
 @pytest.mark.parametrize(
     ("version", "expected"), [("2", 2**32 + 5), ("1", 5), ("paper", 2**32 + 5)]
 )
-def test_no_training_meets_the_throws_of_a_bank_but_those_of_version_1(
+def test_no_training_meets_the_throws_of_a_throw_set_but_those_of_version_1(
     version, expected
 ):
     assert throw_seed(standard_task(EnvConfig(), version), 5) == expected
@@ -184,7 +184,7 @@ def make_case(version="2") -> dict:
     }
 
 
-def test_a_bank_goes_the_same_way_with_1_2_and_4_workers():
+def test_a_throw_set_ends_the_same_with_1_2_and_4_workers():
     case = make_case()
     torch.manual_seed(0)
     weights = 0.5 * torch.randn(64, 21)
@@ -198,7 +198,7 @@ def test_a_bank_goes_the_same_way_with_1_2_and_4_workers():
             return policy(td)
 
     first, *others = (
-        play_bank(Module(), **case, bank_seed=3, num_workers=n) for n in (1, 2, 4)
+        play_throws(Module(), **case, throw_set=3, num_workers=n) for n in (1, 2, 4)
     )
     for other in others:
         for field in dataclasses.fields(Episodes):
@@ -210,7 +210,7 @@ def test_a_bank_goes_the_same_way_with_1_2_and_4_workers():
 @pytest.mark.parametrize("version", ["2", "1"])
 def test_every_standard_throw_meets_a_robot_that_does_not_move(version):
     case = make_case(version)
-    rigid = play_bank(None, **case, bank_seed=3, num_workers=1, hold=True)
+    rigid = play_throws(None, **case, throw_set=3, num_workers=1, hold=True)
     assert summarize(rigid, rigid, DodgeballConfig()).rigid_success <= 0.01
 
 
@@ -223,9 +223,9 @@ def delayed(delay: tuple[float, float], **throws) -> EnvConfig:
 @pytest.mark.parametrize("num_workers", [1, 2])
 def test_episodes_count_from_the_first_throw_whatever_the_delay(num_workers):
     # The rigid robot stands where it stands, and meets the same throws.
-    bank = {"bank_seed": 3, "episodes": 64, "hold": True, "num_workers": num_workers}
+    which = {"throw_set": 3, "episodes": 64, "hold": True, "num_workers": num_workers}
     at_once, late = (
-        play_bank(None, config, skin_of(config), **bank)
+        play_throws(None, config, skin_of(config), **which)
         for config in (delayed((0.0, 0.0)), delayed((0.5, 1.5)))
     )
     for field in dataclasses.fields(Episodes):
@@ -239,8 +239,8 @@ def test_an_episode_lasts_its_whole_length_after_the_latest_first_throw():
     config = delayed((0.1, 0.4), aim="box", box_height=(50.0, 50.0))
     task = dataclasses.replace(config.task, episode_length_s=0.5)
     config = dataclasses.replace(config, task=task)
-    bank = {"bank_seed": 0, "episodes": 16, "hold": True, "num_workers": 1}
-    played = play_bank(None, config, skin_of(config), **bank)
+    which = {"throw_set": 0, "episodes": 16, "hold": True, "num_workers": 1}
+    played = play_throws(None, config, skin_of(config), **which)
     assert (played.steps == 30).all()
     assert not (played.hit | played.fallen | played.diverged).any()
 
@@ -262,8 +262,8 @@ def test_a_fall_before_the_first_throw_is_a_failure():
     action = torch.tensor(
         [-2.0 * ("hip_pitch" in name) for name in config.robot_config.joints]
     )
-    bank = {"bank_seed": 0, "episodes": 8, "num_workers": 1}
-    played = play_bank(Still(action), config, skin_of(config), **bank)
+    which = {"throw_set": 0, "episodes": 8, "num_workers": 1}
+    played = play_throws(Still(action), config, skin_of(config), **which)
     assert played.fallen.all()
     assert not played.arrived.any()
     row = torch.arange(8)
@@ -287,7 +287,9 @@ def test_ends_by_self_contact_are_told_apart():
         def forward(self, td):
             return td.set("action", inwards)
 
-    played = play_bank(Module(), config, skin, bank_seed=0, episodes=32, num_workers=1)
+    played = play_throws(
+        Module(), config, skin, throw_set=0, episodes=32, num_workers=1
+    )
     assert played.self_contact[:16].all()
     assert not played.self_contact[16:].any()
     # Every episode has one cause of its end.
@@ -295,10 +297,10 @@ def test_ends_by_self_contact_are_told_apart():
     assert (torch.stack(causes).sum(0) == 1).all()
 
 
-def test_another_bank_seed_is_another_bank():
+def test_another_seed_is_another_throw_set():
     case = make_case()
     first, again, other = (
-        play_bank(None, **case, bank_seed=seed, num_workers=1, hold=True).steps
+        play_throws(None, **case, throw_set=seed, num_workers=1, hold=True).steps
         for seed in (0, 0, 1)
     )
     assert torch.equal(first, again)

@@ -11,13 +11,13 @@ import torch
 from torchrl.envs import TransformedEnv
 
 from egoskin.evaluation.behaviour import Watcher
-from egoskin.evaluation.throw_set import play_bank, standard_task, throw_seed
+from egoskin.evaluation.throw_set import play_throws, standard_task, throw_seed
 from egoskin.evaluation.upper_bound import (
-    Ceiling,
     SearchConfig,
+    UpperBound,
     _play,
     _until_in_reach,
-    find_ceiling,
+    find_upper_bound,
 )
 from egoskin.make import EnvConfig, make_worker_env
 from egoskin.policies.policy import Policy, load_policy
@@ -54,31 +54,35 @@ def make(policy: Policy, config: EnvConfig, rows: int) -> TransformedEnv:
     )
 
 
-def find(policy: Policy, search: SearchConfig = SEARCH) -> Ceiling:
-    return find_ceiling(
-        policy, task(policy), search, bank_seed=0, throws=THROWS, reach=2.0
+def find(policy: Policy, search: SearchConfig = SEARCH) -> UpperBound:
+    return find_upper_bound(
+        policy, task(policy), search, throw_set=0, throws=THROWS, reach=2.0
     )
 
 
 @pytest.fixture(scope="module")
-def ceiling(policy: Policy) -> Ceiling:
+def bound(policy: Policy) -> UpperBound:
     return find(policy)
 
 
-def test_the_empty_plan_is_the_policy(policy: Policy, ceiling: Ceiling):
+def test_the_empty_plan_is_the_policy(policy: Policy, bound: UpperBound):
     config = task(policy)
     watcher = Watcher(config, 0, THROWS)
-    play_bank(policy, config, policy.skin, bank_seed=0, episodes=THROWS, watch=watcher)
+    play_throws(
+        policy, config, policy.skin, throw_set=0, episodes=THROWS, watch=watcher
+    )
     hit = watcher._hit[:, 0]
     # All of them come into range; some hit, some do not.
-    assert torch.equal(ceiling.policy.avoided, ~hit)
+    assert torch.equal(bound.policy.avoided, ~hit)
     assert 0 < int(hit.sum()) < THROWS
 
 
 def test_the_second_ball_comes_at_a_robot_that_has_dodged_the_first(policy: Policy):
     config = standard_task(policy.env_config)
     watcher = Watcher(config, 0, THROWS)
-    play_bank(policy, config, policy.skin, bank_seed=0, episodes=THROWS, watch=watcher)
+    play_throws(
+        policy, config, policy.skin, throw_set=0, episodes=THROWS, watch=watcher
+    )
     env = make(policy, config, THROWS)
     start = _until_in_reach(env, policy, config, reach=2.0, ball=2)
     first, second = watcher._hit[start.throw, :2].T
@@ -104,8 +108,8 @@ def test_no_ball_is_thrown_after_it(policy: Policy):
     assert (start.simulation["throw"] == 1).all()
 
 
-def test_a_search_finds_more_than_the_policy_does_and_loses_nothing(ceiling: Ceiling):
-    own, best = ceiling.policy, ceiling.best
+def test_a_search_finds_more_than_the_policy_does_and_loses_nothing(bound: UpperBound):
+    own, best = bound.policy, bound.best
     assert not (own.avoided & ~best.avoided).any()
     assert not (own.stood & ~best.stood).any()
     for outcome in (own, best):
@@ -125,13 +129,13 @@ def test_the_step_of_a_hit_is_not_survived(policy: Policy):
     assert not _play(env, policy, start, empty, steps + 1)[0][row]
 
 
-def test_an_age_limit_is_no_fall(policy: Policy, ceiling: Ceiling):
+def test_an_age_limit_is_no_fall(policy: Policy, bound: UpperBound):
     # Every plan crosses it: the balls come into reach from about 0.35 to 1 s on.
     long = task(policy)
     short = replace(long, task=replace(long.task, episode_length_s=1.05))
-    bank = {"bank_seed": 0, "throws": THROWS, "reach": 2.0}
-    found = find_ceiling(policy, short, SEARCH, **bank)
-    assert torch.equal(found.policy.stood, ceiling.policy.stood)
+    which = {"throw_set": 0, "throws": THROWS, "reach": 2.0}
+    found = find_upper_bound(policy, short, SEARCH, **which)
+    assert torch.equal(found.policy.stood, bound.policy.stood)
     assert found.policy.stood.any()
 
 
@@ -154,11 +158,11 @@ def test_corrupted_sensors_are_refused(policy: Policy):
     config = task(policy)
     sensor = replace(config.sensor, corruption="acoustic")
     with pytest.raises(ValueError, match=r"ideal sensors.*acoustic"):
-        find_ceiling(
+        find_upper_bound(
             policy,
             replace(config, sensor=sensor),
             SEARCH,
-            bank_seed=0,
+            throw_set=0,
             throws=1,
             reach=2.0,
         )
@@ -174,15 +178,15 @@ def test_a_search_repeats(policy: Policy):
 def test_balls_that_never_come_into_reach_are_an_error(policy: Policy):
     # No episode lasts until the fiftieth.
     with pytest.raises(ValueError, match="came within 2 m of a sensor"):
-        find_ceiling(
-            policy, task(policy), SEARCH, bank_seed=0, throws=4, reach=2.0, ball=50
+        find_upper_bound(
+            policy, task(policy), SEARCH, throw_set=0, throws=4, reach=2.0, ball=50
         )
 
 
 def test_a_plan_lasts_a_control_step_at_least(policy: Policy):
     short = SearchConfig(stand_s=0.001)
     with pytest.raises(ValueError, match="stand_s must be at least one control step"):
-        find_ceiling(policy, task(policy), short, bank_seed=0, throws=1, reach=2.0)
+        find_upper_bound(policy, task(policy), short, throw_set=0, throws=1, reach=2.0)
 
 
 @pytest.mark.parametrize("change", [{"samples": 3}, {"hold": 0}, {"stand_s": -1.0}])

@@ -331,7 +331,7 @@ def test_an_action_that_is_not_finite_ends_an_evaluation():
         bias[4] = torch.nan
     config = standard_task(policy.env_config)
     with pytest.raises(ValueError, match="action is not finite at step 1"):
-        evaluate(policy, config, policy.skin, bank_seed=0, episodes=4, num_workers=1)
+        evaluate(policy, config, policy.skin, throw_set=0, episodes=4, num_workers=1)
 
 
 def test_a_file_that_is_there_comes_before_a_name(tmp_path, monkeypatch):
@@ -360,7 +360,7 @@ def test_a_shipped_policy_loses_little_at_480_hz(name):
     physics = replace(config.task.physics, substeps=8)
     finer = replace(config, task=replace(config.task, physics=physics))
     success = [
-        evaluate(policy, c, policy.skin, bank_seed=0, episodes=1024).success.mean
+        evaluate(policy, c, policy.skin, throw_set=0, episodes=1024).success.mean
         for c in (config, finer)
     ]
     assert success[0] - success[1] <= 0.05

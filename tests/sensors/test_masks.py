@@ -11,7 +11,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from egoskin.evaluation.throw_set import play_bank
+from egoskin.evaluation.throw_set import play_throws
 from egoskin.make import EnvConfig, make_env, make_worker_env
 from egoskin.robots.config import H1_2
 from egoskin.sensors import (
@@ -263,10 +263,10 @@ class Ducks(torch.nn.Module):
 
 def test_a_policy_whose_sensors_are_masked_does_what_one_does_without_sensors():
     config = EnvConfig(task=TASK)
-    bank = {"bank_seed": 0, "episodes": 16, "num_workers": 1}
-    senses = play_bank(Ducks(), config, SKIN, **bank)
-    masked = play_bank(Ducks(), config, SKIN, **bank, mask=MASK_ALL)
-    still = play_bank(None, config, SKIN, **bank)
+    which = {"throw_set": 0, "episodes": 16, "num_workers": 1}
+    senses = play_throws(Ducks(), config, SKIN, **which)
+    masked = play_throws(Ducks(), config, SKIN, **which, mask=MASK_ALL)
+    still = play_throws(None, config, SKIN, **which)
     assert torch.equal(masked.steps, still.steps)
     assert not torch.equal(senses.steps, still.steps)
 
@@ -291,7 +291,7 @@ def test_a_mask_that_masks_nothing_is_refused(sensor, mask, message):
     with pytest.raises(ValueError, match=message):
         config.pipeline(SKIN).check_mask(mask)
     with pytest.raises(ValueError, match=message):
-        play_bank(None, config, SKIN, bank_seed=0, episodes=2, mask=mask)
+        play_throws(None, config, SKIN, throw_set=0, episodes=2, mask=mask)
 
 
 @pytest.mark.parametrize("mask", [(), MASK_ALL, ["all"], ("torso_link",)])

@@ -10,7 +10,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from egoskin.evaluation.throw_set import play_bank, throw_seed
+from egoskin.evaluation.throw_set import play_throws, throw_seed
 from egoskin.make import EnvConfig, make_worker_env
 from egoskin.robots.config import RobotConfig
 from egoskin.sensors import Skin
@@ -221,14 +221,14 @@ def test_without_a_skin_there_are_no_sensors_to_draw(coverage, skin: Skin):
     assert (frame.num_sensors, frame.num_detecting) == (0, 0)
 
 
-def test_recordings_are_of_the_rows_of_the_bank(skin: Skin):
+def test_recordings_are_of_the_rows_of_the_throw_set(skin: Skin):
     config = EnvConfig(task=TASK)
     recordings = record_episodes(
-        config, skin, None, bank_seed=3, first=5, episodes=2, hold=True
+        config, skin, None, throw_set=3, first=5, episodes=2, hold=True
     )
     assert [r.row for r in recordings] == [5, 6]
-    bank = {"bank_seed": 3, "episodes": 8, "num_workers": 1, "hold": True}
-    steps = play_bank(None, config, skin, **bank).steps
+    which = {"throw_set": 3, "episodes": 8, "num_workers": 1, "hold": True}
+    steps = play_throws(None, config, skin, **which).steps
     # The start, and a state after each step up to the end.
     assert [len(r.states) - 1 for r in recordings] == steps[5:7].tolist()
     env = make_worker_env(

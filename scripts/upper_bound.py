@@ -1,7 +1,7 @@
 """Search what the body could still do when a ball is in reach.
 
 As `egoskin upper-bound`:
-python scripts/ceiling.py runs/NAME
+python scripts/upper_bound.py runs/NAME
 """
 
 from __future__ import annotations
