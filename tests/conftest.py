@@ -10,6 +10,7 @@ draw_without_display()
 # isort: split
 
 import os
+import signal
 from collections.abc import Callable
 from pathlib import Path
 
@@ -29,6 +30,10 @@ settings.register_profile(
     "egoskin", deadline=None, derandomize=True, max_examples=50, database=None
 )
 settings.load_profile("egoskin")
+
+# A shell that starts the tests in the background ignores it, and children inherit that.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # Compiling takes longer than all the rest, and changes no result: only the tests of it
 # compile.
