@@ -20,7 +20,7 @@ from calling import BATCH, SMALL, call, fail, succeed
 from egoskin.commands.evaluate import EvaluateConfig
 from egoskin.evaluation import operating_map
 from egoskin.evaluation.throw_set import evaluate, standard_task
-from egoskin.make import MASK_ALL
+from egoskin.sensors import MASK_ALL
 from egoskin.storage.tensor_file import load_tensors
 
 
@@ -292,8 +292,8 @@ CELLS = [
         )
     ),
     ["--sensor.corruption", "time_of_flight", "--history", "3"],
-    ["--sensor.occlusion", "--sensor.per-object", "--sensor.validity"],
-    ["--sensor.signal", "localization", "--sensor.localization.hold"],
+    ["--sensor.occlusion"],
+    ["--sensor.signal", "localization", "--sensor.keep-last"],
     ["--sensor.range", "inf", "--sensor.field.half-angle-deg", "90"],
 ]
 
@@ -313,7 +313,7 @@ BAD_SKIN = """{"format": "egoskin-skin-1", "robot": "h1_2", "sensors": [
     ("args", "expected"),
     [
         (["--sensor.rnge", "1"], "--sensor.range"),
-        (["--sensor.range", "-1"], "must be positive"),
+        (["--sensor.range", "-1"], "range must be at least 0.001"),
         (["--sensor.signal", "smell"], "proximity"),
         (["--num-envs", "32", "--num-workers", "3"], "valid: 1, 2, 4, 8, 16, 32"),
         (["--task.physics.gains", "strong"], "real, rotor_inertia"),

@@ -311,7 +311,9 @@ def test_claims_of_a_header_take_no_memory(changes, tmp_path):
         changes = {"network": {**header["policy"]["network"], **changes["network"]}}
     save_changed(path, changes)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    with pytest.raises(ValueError, match=r"large.*(its header claims a size of|hidden must be at most)"):
+    with pytest.raises(
+        ValueError, match=r"large.*(its header claims a size of|hidden must be at most)"
+    ):
         egoskin.load_policy(path)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000
 
