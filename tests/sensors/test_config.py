@@ -35,7 +35,7 @@ from egoskin.sensors.config import SensorConfig
             {"signal": "localization", "corruption": "acoustic"},
             "corruption=acoustic needs a measured signal",
         ),
-        ({"range": 0.0}, "the sensor range must be positive, got 0"),
+        ({"range": 0.0}, "range must be at least 0.001, got 0"),
     ],
 )
 def test_what_has_no_effect_or_no_sense_is_refused(options, message):

@@ -103,7 +103,7 @@ def test_a_ray_sees_what_mujoco_sees_before_the_robot(skin, random_state, seed):
     assert (solid.isinf() | (solid == clear)).all()
     row, sensor, beam, _ = places = clear.isfinite().nonzero().unbind(1)
     hidden = solid[places].isinf().numpy()
-    ways = WIDE.directions()[beam, 0]
+    ways = WIDE.directions()[beam]
     assert_hidden_as_in_mujoco(hidden, some, state, row, sensor, ways, clear[places])
 
 
