@@ -232,7 +232,7 @@ class StudyFolder:
         source, end = self.run_path(planned.name), planned.end
         run, folder = Run.open(source), self.result_path(planned.name)
         policy, made = run.policy_path(end), record(run, end)
-        if made.command.split()[1].endswith("/job.py"):
+        if "/job.py" in made.command:
             # It was begun by a study; where its folder was is of no interest.
             command = f"python -m egoskin.study.job FOLDER {planned.name}"
             made = dataclasses.replace(made, command=command)

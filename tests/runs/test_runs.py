@@ -61,12 +61,13 @@ def trained(tmp_path_factory) -> Iterator[Trainer]:
 
 def test_a_run_learns_with_its_own_number_of_threads(config: TrainConfig):
     before = torch.get_num_threads()
+    others = set(threading.enumerate())
     run = Run.create(replace(config, learner_threads=3))
     try:
         with open_trainer(run) as trainer:
             trainer.iterate()
-            learners = [t for t in threading.enumerate() if "learner" in t.name]
-            assert len(learners) == 3
+            new = set(threading.enumerate()) - others
+            assert sum("learner" in thread.name for thread in new) == 3
             assert torch.get_num_threads() == 1
     finally:
         torch.set_num_threads(before)

@@ -104,6 +104,8 @@ def test_a_sheet_is_a_grid_filled_up_with_white():
     assert cells == sorted(set(cells))
 
 
+# imageio_ffmpeg closes no pipe of an ffmpeg that has ended by itself.
+@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
 @pytest.mark.parametrize("name", ["film.gif", "film.mp4"])
 def test_a_film_holds_the_frames_and_the_last_one_stands(name: str, tmp_path: Path):
     path = tmp_path / name
