@@ -109,7 +109,7 @@ def table(result: Evaluation, title: str, age: float) -> str:
     rows = [
         (f"success (no contact for {age:g} s)", interval(result.success, 100, "%")),
         ("  no contact for 5 s", interval(result.success_5s, 100, "%")),
-        ("  same throw set, robot held rigid", share(result.rigid_success)),
+        ("  same throws, robot held rigid", share(result.rigid_success)),
         ("survival time (at most 10 s)", interval(result.survival_time, 1, "s")),
         *((f"ended within {age:g} s by {how}", share(x)) for how, x in ends.items()),
         ("first balls avoided", share(result.avoided.first_ball)),
