@@ -8,6 +8,7 @@ goes on from its last checkpoint. (Extra `ray`.)
 from __future__ import annotations
 
 import os
+import socket
 import subprocess
 from collections.abc import Collection
 from pathlib import Path
@@ -27,6 +28,9 @@ from egoskin.study.runner import (
 )
 from egoskin.study.store import StudyFolder
 
+# How long the address of a cluster is tried [s].
+_CONNECT_S = 10.0
+
 
 def connect(address: str) -> int:
     """Connect to an existing cluster; return its number of cores.
@@ -38,6 +42,10 @@ def connect(address: str) -> int:
         ValueError: If there is none.
     """
     try:
+        if address != "auto":
+            # Ray would ask for minutes.
+            host, _, port = address.rpartition(":")
+            socket.create_connection((host, int(port)), _CONNECT_S).close()
         ray.init(
             address=address,
             log_to_driver=False,
@@ -45,7 +53,7 @@ def connect(address: str) -> int:
             # Nodes have egoskin installed: nothing is sent to them.
             runtime_env={"env_vars": _own_settings()},
         )
-    except (ConnectionError, ValueError, RuntimeError) as error:
+    except (OSError, ValueError, RuntimeError) as error:
         raise ValueError(
             f"no Ray cluster at {address!r} ({_first_line(error)}); begin one with: "
             "ray start --head"
