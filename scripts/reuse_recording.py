@@ -8,6 +8,7 @@ may as well come from motion capture or a real robot.
 
 from __future__ import annotations
 
+from egoskin.bounds import COUNT, check_bounds
 from egoskin.interrupts import end_quietly
 
 if __name__ == "__main__":
@@ -18,6 +19,7 @@ if __name__ == "__main__":
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import torch
 import tyro
@@ -29,7 +31,6 @@ from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
 from egoskin.envs.throws import ThrowConfig
 from egoskin.robots.config import H1_2
 from egoskin.sensors import FieldSensor, Ray, RaySensor, place_sensors
-from egoskin.storage.serialization import check_counts
 
 # The first ball at once: a recording is short.
 TASK = DodgeballConfig(throws=ThrowConfig(first_delay=(0.0, 0.0)))
@@ -43,14 +44,14 @@ class ReplayConfig:
 
     folder: Path | None = None
     """Memory-mapped recording, made there if there is none; None: a throw-away one."""
-    num_envs: int = 64
+    num_envs: Annotated[int, COUNT] = 64
     """Robots ``B`` in a new recording."""
-    num_steps: int = 60
+    num_steps: Annotated[int, COUNT] = 60
     """Control steps ``T`` in a new recording."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for counts that record nothing."""
-        check_counts(self, "num_envs", "num_steps")
+        check_bounds(self)
 
 
 def record(folder: Path, num_envs: int, num_steps: int) -> None:

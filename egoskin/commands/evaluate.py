@@ -19,6 +19,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from egoskin.bounds import COUNT, check_bounds
 from egoskin.evaluation.behaviour import Behaviour, Motion, behave
 from egoskin.evaluation.operating_map import check_map, draw_map, operating_map
 from egoskin.evaluation.throw_set import Estimate, Evaluation, evaluate, standard_task
@@ -28,7 +29,6 @@ from egoskin.progress import StatusLine, counted
 from egoskin.rng import check_seed
 from egoskin.sensors import MASK_ALL
 from egoskin.storage.files import check_output
-from egoskin.storage.serialization import check_counts
 from egoskin.viewer.film import check_path
 
 PICTURE_SUFFIXES = (".png", ".svg", ".pdf")
@@ -43,7 +43,7 @@ class EvaluateConfig:
     policy that comes with the package."""
     throw_set: int = 0
     """Seed of the throw set."""
-    episodes: int = 1024
+    episodes: Annotated[int, COUNT] = 1024
     """Throw sequences in the throw set."""
     standard: Literal["2", "1", "paper", "run"] = "2"
     """Version of the standard throw to judge by, whatever the policy was trained on;
@@ -55,7 +55,7 @@ class EvaluateConfig:
     """Processes that simulate; None: the largest divisor of episodes <= cores."""
     behaviour: bool = False
     """Also say what the policy does: hits by kind of throw, displacement, effort."""
-    check_substeps: int | None = None
+    check_substeps: Annotated[int | None, COUNT] = None
     """Play it once more with this many physics steps in each control step, and say what
     is lost (8: 480 Hz)."""
     map: Path | None = None
@@ -67,7 +67,7 @@ class EvaluateConfig:
     def __post_init__(self) -> None:
         """Raise ValueError for values with which nothing can be played."""
         check_seed(self.throw_set, "throw_set")
-        check_counts(self, "episodes", "check_substeps")
+        check_bounds(self)
         check_num_workers(self.episodes, self.num_workers, "episodes")
         check_output(self.json, "--json")
         if self.map is not None:

@@ -29,12 +29,12 @@ except (AttributeError, ImportError, RuntimeError) as fault:
     )
     raise SystemExit(2) from None
 
+from egoskin.bounds import COUNT, NOT_NEGATIVE, check_bounds
 from egoskin.evaluation.throw_set import standard_task
 from egoskin.make import EnvConfig
 from egoskin.policies.policy import load_policy
 from egoskin.progress import StatusLine, counted
 from egoskin.rng import check_seed
-from egoskin.storage.serialization import check_counts
 from egoskin.viewer.film import (
     FILM_SUFFIXES,
     check_path,
@@ -65,9 +65,9 @@ class RenderConfig:
     """Contact sheet to write, .png; None: beside the film, under the same name."""
     throw_set: int = 0
     """Seed of the throw set, as in evaluate.py."""
-    episode: int = 0
+    episode: Annotated[int, NOT_NEGATIVE] = 0
     """Which episode of the throw set."""
-    longest_of: int = 1
+    longest_of: Annotated[int, COUNT] = 1
     """Of this many episodes, from --episode on, show the one that lasts longest."""
     standard: Literal["2", "1", "paper", "run"] = "2"
     """Version of the standard throw; run: the throws and ends of the training."""
@@ -91,9 +91,7 @@ class RenderConfig:
         check_path(self.out, FILM_SUFFIXES)
         check_path(self.sheet_path, (".png",))
         check_seed(self.throw_set, "throw_set")
-        check_counts(self, "longest_of")
-        if self.episode < 0:
-            raise ValueError(f"episode must not be negative, got {self.episode}")
+        check_bounds(self)
         if not 0 < self.slowdown <= 100:
             raise ValueError(f"slowdown must be in (0, 100], got {self.slowdown}")
         if self.policy is not None and self.env != EnvConfig():

@@ -22,11 +22,12 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from egoskin.bounds import COUNT, POSITIVE, check_bounds
 from egoskin.commands.errors import parse_subcommand
 from egoskin.evaluation.visibility import analyse
 from egoskin.parallel import available_cores
 from egoskin.progress import counted
-from egoskin.storage.serialization import check_counts, to_plain
+from egoskin.storage.serialization import to_plain
 from egoskin.storage.tensor_file import write_file
 from egoskin.study.cost import Speed, cost, measure_all
 from egoskin.study.manifest import Manifest, load_study, resolve
@@ -96,7 +97,7 @@ class Plan:
     """Study: paper, paper-1000, findings, smoke, or a JSON file."""
     dir: Path | None = None
     """Folder to begin the study in, or to add cells and seeds to; None: only tell."""
-    steps_per_s: float | None = None
+    steps_per_s: Annotated[float | None, POSITIVE] = None
     """Environment steps per second and core; None: measured now, in half a minute for
     each way to share the cores among runs."""
     visibility: bool = False
@@ -104,8 +105,7 @@ class Plan:
 
     def __post_init__(self) -> None:
         """Raise ValueError for a speed that is none."""
-        if self.steps_per_s is not None and not self.steps_per_s > 0:
-            raise ValueError(f"steps_per_s must be positive, got {self.steps_per_s}")
+        check_bounds(self)
 
     def execute(self) -> None:
         """Tell, and write the manifest."""
@@ -202,12 +202,12 @@ class Run:
     """Where: the cores of this machine, or an existing Ray cluster (extra `ray`)."""
     ray_address: str = "auto"
     """Address of the Ray cluster, ``host:port``; auto: the one of this machine."""
-    parallel: int | None = None
+    parallel: Annotated[int | None, COUNT] = None
     """Runs side by side; None: as many as fill the cores."""
-    cores_per_run: int | None = None
+    cores_per_run: Annotated[int | None, COUNT] = None
     """Workers and learner threads of each run; None: measured, half a minute for each
     choice, unless the whole study is short (results do not depend on it)."""
-    tries: int = 3
+    tries: Annotated[int, COUNT] = 3
     """How often a run that fails is tried, in all."""
     again: bool = False
     """Whether runs that failed too often are tried again."""
@@ -216,7 +216,7 @@ class Run:
 
     def __post_init__(self) -> None:
         """Raise ValueError for counts that are none."""
-        check_counts(self, "parallel", "cores_per_run", "tries")
+        check_bounds(self)
         if not 0 <= self.nice < 20:
             raise ValueError(f"nice must be from 0 to 19, got {self.nice}")
 
@@ -350,18 +350,16 @@ class Slurm:
 
     dir: Folder
     """Folder of the study, which all nodes see."""
-    cores: int = 16
+    cores: Annotated[int, COUNT] = 16
     """Cores of each element, and runs side by side."""
-    elements: int | None = None
+    elements: Annotated[int | None, COUNT] = None
     """Elements of the array; None: as many as have a run for each core."""
-    hours: float = 24.0
+    hours: Annotated[float, POSITIVE] = 24.0
     """Time limit of each [h]."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for counts that are none."""
-        check_counts(self, "cores", "elements")
-        if not self.hours > 0:
-            raise ValueError(f"hours must be positive, got {self.hours}")
+        check_bounds(self)
 
     def execute(self) -> None:
         """Print the script."""

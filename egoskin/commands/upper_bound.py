@@ -13,6 +13,7 @@ misses of it is a matter of learning, or of what its sensors do not tell.
 from __future__ import annotations
 
 import json
+import math
 import sys
 import time
 from dataclasses import dataclass, field
@@ -22,6 +23,7 @@ from typing import Annotated
 import tyro
 from torch import Tensor
 
+from egoskin.bounds import COUNT, Interval, check_bounds
 from egoskin.evaluation.throw_set import standard_task
 from egoskin.evaluation.upper_bound import (
     Outcome,
@@ -33,14 +35,13 @@ from egoskin.policies.policy import load_policy
 from egoskin.progress import counted
 from egoskin.rng import check_seed
 from egoskin.storage.files import check_output
-from egoskin.storage.serialization import check_counts
 
 # Bounds of the groups by height aimed at [m].
 BOUNDS = (0.0, 0.7, 0.9, 1.1, 1.3, 2.0)
 
 
 @dataclass(frozen=True, kw_only=True)
-class CeilingConfig:
+class UpperBoundConfig:
     """Search the actions with which the balls of a throw set would be avoided."""
 
     policy: Annotated[Path, tyro.conf.Positional]
@@ -48,11 +49,11 @@ class CeilingConfig:
     policy that comes with the package."""
     throw_set: int = 0
     """Seed of the throw set."""
-    throws: int = 32
+    throws: Annotated[int, COUNT] = 32
     """Episodes of the throw set."""
-    ball: int = 1
+    ball: Annotated[int, COUNT] = 1
     """Which ball of each episode; none is thrown after it."""
-    reach: float = 2.0
+    reach: Annotated[float, Interval(gt=0, le=math.inf)] = 2.0
     """Distance from a sensor to the ball's surface at which the search starts [m]."""
     search: SearchConfig = field(default_factory=SearchConfig)
     """The search."""
@@ -62,9 +63,7 @@ class CeilingConfig:
     def __post_init__(self) -> None:
         """Raise ValueError for values with which nothing can be searched."""
         check_seed(self.throw_set, "throw_set")
-        check_counts(self, "throws", "ball")
-        if not self.reach > 0:
-            raise ValueError(f"reach must be positive, got {self.reach}")
+        check_bounds(self)
         check_output(self.json, "--json")
 
 
@@ -113,7 +112,7 @@ def table(result: UpperBound, title: str) -> str:
 
 def main(args: list[str]) -> None:
     """Run the command."""
-    config = tyro.cli(CeilingConfig, args=args)
+    config = tyro.cli(UpperBoundConfig, args=args)
     policy = load_policy(config.policy)
     began = time.perf_counter()
 

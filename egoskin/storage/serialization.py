@@ -61,14 +61,6 @@ def to_plain(value: Any) -> Any:
     return value
 
 
-def check_counts(config: Any, *names: str) -> None:
-    """Raise ValueError if a field that counts something is below 1; None is left."""
-    for name in names:
-        value = getattr(config, name)
-        if value is not None and value < 1:
-            raise ValueError(f"{name} must be at least 1, got {value}")
-
-
 def from_plain(kind: type[T], content: Any, what: str) -> T:
     """Return a configuration from the values that `to_plain` gave.
 

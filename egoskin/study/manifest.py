@@ -19,8 +19,9 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+from egoskin.bounds import COUNT, check_bounds
 from egoskin.envs.standards import Standard, training_task
 from egoskin.make import EnvConfig
 from egoskin.rng import check_seed
@@ -34,7 +35,6 @@ from egoskin.storage.formats import (
 )
 from egoskin.storage.serialization import (
     changed_fields,
-    check_counts,
     from_plain,
     read_json,
     to_plain,
@@ -59,7 +59,7 @@ class EvaluationPlan:
     """Version of the standard throw."""
     throw_set: int = 1000
     """Seed of the throw set: one that nothing was chosen on."""
-    episodes: int = 4096
+    episodes: Annotated[int, COUNT] = 4096
     """Throw sequences in the set."""
     masked: bool = True
     """Whether to judge it with all its sensors masked, too."""
@@ -67,7 +67,7 @@ class EvaluationPlan:
     def __post_init__(self) -> None:
         """Raise ValueError for a throw set that is none."""
         check_seed(self.throw_set, "throw_set")
-        check_counts(self, "episodes")
+        check_bounds(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +82,7 @@ class Study:
     """`Overrides` of each cell."""
     seeds: tuple[int, ...]
     """Seeds of each cell, in the order in which they are run."""
-    frames: int
+    frames: Annotated[int, COUNT]
     """Environment steps of each run."""
     standard: Standard = "2"
     """Version of the standard throw that is trained on."""
@@ -102,7 +102,7 @@ class Study:
             )
         for seed in self.seeds:
             check_seed(seed)
-        check_counts(self, "frames")
+        check_bounds(self)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,16 +6,17 @@ import statistics
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import mujoco
 import torch
 
+from egoskin.bounds import COUNT, check_bounds
 from egoskin.commands.bench.report import Row, show
 from egoskin.envs.physics import PhysicsConfig, Scene
 from egoskin.envs.physics.mujoco import MujocoPhysics, build_scene
 from egoskin.envs.throws import ThrowConfig
 from egoskin.make import EnvConfig
-from egoskin.storage.serialization import check_counts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,18 +27,18 @@ class PhysicsBench:
     (standard deviation 0.4 rad) in every control step and falls.
     """
 
-    num_envs: int = 256
+    num_envs: Annotated[int, COUNT] = 256
     """Simulations."""
-    steps: int = 30
+    steps: Annotated[int, COUNT] = 30
     """Control steps in each measurement."""
-    rounds: int = 15
+    rounds: Annotated[int, COUNT] = 15
     """How often each variant is measured, in turn."""
     json: Path | None = None
     """File to write the rows to."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for values that cannot be measured."""
-        check_counts(self, "num_envs", "steps", "rounds")
+        check_bounds(self)
 
 
 def physics_rows(config: PhysicsBench) -> list[Row]:

@@ -7,18 +7,18 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
 
+from egoskin.bounds import COUNT, check_bounds
 from egoskin.commands.bench.report import Row, show
 from egoskin.make import EnvConfig, make_worker_env
 from egoskin.parallel import keep_freed_memory
 from egoskin.robots.config import H1_2
 from egoskin.sensors import FieldSensor, Proximity, RaySensor, Skin
 from egoskin.shapes import Sphere
-from egoskin.storage.serialization import check_counts
 
 # States are taken this often along the rollout [control steps]: balls are in flight.
 _STRIDE = 8
@@ -36,11 +36,11 @@ class SensorBench:
     many bytes as the row's result into a buffer that exists, measured in turn.
     """
 
-    num_envs: int = 4096
+    num_envs: Annotated[int, COUNT] = 4096
     """Agents."""
-    snapshots: int = 6
+    snapshots: Annotated[int, COUNT] = 6
     """States of the rollout to measure on, in turn."""
-    rounds: int = 12
+    rounds: Annotated[int, COUNT] = 12
     """How often each row is measured on each state."""
     seed: int = 0
     """Seed of the rollout."""
@@ -49,7 +49,7 @@ class SensorBench:
 
     def __post_init__(self) -> None:
         """Raise ValueError for values that cannot be measured."""
-        check_counts(self, "num_envs", "snapshots", "rounds")
+        check_bounds(self)
 
 
 State = tuple[Tensor, Tensor, Tensor, Tensor]
