@@ -162,14 +162,14 @@ class _Build:
         self._build, self._report = build, report
         self._parent = os.getpid()
         # A worker has those of the server that forks it, which may be older.
-        self._settings = _settings()
+        self._settings = own_settings()
 
     def __call__(self) -> WorkerEnv:
         # TorchRL also builds one in the parent, to read its specs.
         in_worker = os.getpid() != self._parent
         if in_worker:
             keep_freed_memory()
-            for name in _settings():
+            for name in own_settings():
                 del os.environ[name]
             os.environ.update(self._settings)
             Thread(target=_end_with_parent, daemon=True).start()
@@ -185,7 +185,7 @@ class _Build:
         return built
 
 
-def _settings() -> dict[str, str]:
+def own_settings() -> dict[str, str]:
     """Return the package's own environment variables."""
     return {k: v for k, v in os.environ.items() if k.startswith("EGOSKIN_")}
 

@@ -7,7 +7,6 @@ goes on from its last checkpoint. (Extra `ray`.)
 
 from __future__ import annotations
 
-import os
 import socket
 import subprocess
 from collections.abc import Collection
@@ -17,6 +16,7 @@ from typing import Any
 import ray  # pyright: ignore[reportMissingImports]
 from ray.exceptions import RayError  # pyright: ignore[reportMissingImports]
 
+from egoskin.parallel import own_settings
 from egoskin.study.job import FAILED
 from egoskin.study.manifest import PlannedRun
 from egoskin.study.runner import (
@@ -51,18 +51,14 @@ def connect(address: str) -> int:
             log_to_driver=False,
             logging_level="ERROR",
             # Nodes have egoskin installed: nothing is sent to them.
-            runtime_env={"env_vars": _own_settings()},
+            runtime_env={"env_vars": own_settings()},
         )
     except (OSError, ValueError, RuntimeError) as error:
         raise ValueError(
-            f"no Ray cluster at {address!r} ({_first_line(error)}); begin one with: "
+            f"no Ray cluster at {address!r} ({_lines(error)[0]}); begin one with: "
             "ray start --head"
         ) from None
     return int(ray.cluster_resources().get("CPU", 1))
-
-
-def _own_settings() -> dict[str, str]:
-    return {k: v for k, v in os.environ.items() if k.startswith("EGOSKIN_")}
 
 
 class RayRunner(Runner):
@@ -91,7 +87,7 @@ class RayRunner(Runner):
                 try:
                     found[name] = ray.get(task)
                 except RayError as error:
-                    found[name] = FAILED, _last_line(error)
+                    found[name] = FAILED, _lines(error)[-1]
         return found
 
     def _stop(self) -> None:
@@ -122,9 +118,7 @@ def _work(path: str, name: str, nice: int, cores: int) -> tuple[int, str]:
     return status, how_it_ended(folder, name, status)
 
 
-def _first_line(error: BaseException) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
-
-
-def _last_line(error: BaseException) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[-1].strip()
+def _lines(error: BaseException) -> list[str]:
+    """Return the lines of an error's text, its type if it has none."""
+    lines = [line.strip() for line in str(error).strip().splitlines()]
+    return lines or [type(error).__name__]
