@@ -189,8 +189,12 @@ def _option(name: str) -> str:
     return f"--{name.replace('_', '-')}"
 
 
-def load_config(path: Path) -> TrainConfig:
+def load_config(path: Path, *, quiet: bool = False) -> TrainConfig:
     """Return the configuration of a run folder.
+
+    Args:
+        path: The folder.
+        quiet: Whether to say nothing of a file without a seal.
 
     Raises:
         ValueError: If it is none, or its configuration is damaged.
@@ -198,15 +202,21 @@ def load_config(path: Path) -> TrainConfig:
     file = path / "config.json"
     if not file.is_file():
         raise ValueError(f"{path} is no run folder: it has no config.json")
-    return from_plain(TrainConfig, read_config(file)[0], str(file))
+    return from_plain(TrainConfig, read_config(file, quiet=quiet)[0], str(file))
 
 
-def read_config(file: Path) -> tuple[dict[str, Any], str | None]:
+def read_config(
+    file: Path, *, quiet: bool = False
+) -> tuple[dict[str, Any], str | None]:
     """Return (configuration in the present format, hash of the skin if it holds one).
+
+    Args:
+        file: The file.
+        quiet: Whether to say nothing of one without a seal.
 
     Raises:
         ValueError: If it is damaged, or has options that are no more.
     """
-    content, number = read_sealed(file)
+    content, number = read_sealed(file, quiet=quiet)
     skin = content.pop(SKIN_HASH, None)
     return present_config(content, number, str(file)), skin

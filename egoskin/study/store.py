@@ -232,7 +232,7 @@ class StudyFolder:
         source, end = self.run_path(planned.name), planned.end
         run, folder = Run.open(source), self.result_path(planned.name)
         policy, made = run.policy_path(end), record(run, end)
-        if "/job.py" in made.command:
+        if made.command.startswith("python scripts/job.py"):
             # It was begun by a study; where its folder was is of no interest.
             command = f"python -m egoskin.study.job FOLDER {planned.name}"
             made = dataclasses.replace(made, command=command)
@@ -271,7 +271,7 @@ class StudyFolder:
                 + ", ".join(differs)
             )
         (file,) = folder.glob(_EVALUATION)
-        evaluation, _ = read_sealed(file)
+        evaluation = stored.evaluation
         if evaluation["frames"] != planned.end:
             raise ValueError(
                 f"{file} is of a policy of {evaluation['frames']:,} frames, not of "
@@ -280,7 +280,6 @@ class StudyFolder:
         digest = policy_hash(folder / "policies" / f"{planned.end:012d}.safetensors")
         if digest != evaluation["policy_sha256"]:
             raise ValueError(f"{file} is of another policy than the one beside it")
-        stored = dataclasses.replace(stored, evaluation=evaluation)
         return Result(run=planned, stored=stored, policy_sha256=digest)
 
     def results(self, manifest: Manifest) -> list[Result]:

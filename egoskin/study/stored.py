@@ -21,8 +21,9 @@ from typing import Any
 
 import numpy as np
 
-from egoskin.runs.run import SKIN_HASH, Run, TrainConfig
-from egoskin.storage.formats import present_config, read_sealed
+from egoskin.runs.config import load_config
+from egoskin.runs.run import Run, TrainConfig
+from egoskin.storage.formats import read_sealed
 from egoskin.storage.serialization import from_plain, read_json
 
 # Significant digits of stored metrics.
@@ -169,16 +170,14 @@ def load_run(path: Path) -> StoredRun:
     ).reshape(-1, 2)
     # No estimate before an episode could have lasted so long.
     curve = curve[np.isfinite(curve[:, 1])]
-    where = str(path / "config.json")
-    # Stored runs are under version control, with a seal or without.
-    content, number = read_sealed(path / "config.json", quiet=True)
-    content.pop(SKIN_HASH, None)
+    evaluation, _ = read_sealed(evaluations[-1])
     return StoredRun(
-        config=from_plain(TrainConfig, present_config(content, number, where), where),
+        # Stored runs are under version control, with a seal or without.
+        config=load_config(path, quiet=True),
         record=from_plain(Record, read_json(what), str(what)),
         frames=curve[:, 0],
         success=curve[:, 1],
-        evaluation=read_json(evaluations[-1]),
+        evaluation=evaluation,
     )
 
 
