@@ -110,9 +110,7 @@ class Run:
                 is too little memory.
         """
         skin = config.env.skin.build(config.env.robot_config)
-        # Sensors that do not fit each other are found now, not in a worker.
-        config.env.pipeline(skin)
-        _check_memory(config, skin)
+        _check_fits(config, skin)
         path = config.run_dir
         if path is None:
             kind = config.env.sensor.label()
@@ -400,8 +398,11 @@ class Run:
             self._events.close()
 
 
-def _check_memory(config: TrainConfig, skin: Skin) -> None:
-    """Raise ValueError if a training cannot fit into the memory of this machine."""
+def _check_fits(config: TrainConfig, skin: Skin) -> None:
+    """Raise ValueError if sensors or a training do not fit the skin or the memory.
+
+    That is found now, not in a worker.
+    """
     sources = sparse_sources(config.env, skin)
     one = make_worker_env(
         config.env, skin, num_envs=1, seed=config.seed, sparse=bool(sources)
