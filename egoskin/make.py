@@ -162,11 +162,11 @@ def make_worker_env(
         # With a history, what is new goes by other names.
         suffix = "" if config.history == 1 else "_now"
         default = torch.from_numpy(robot.default_joint_pos)
-        felt = [*Proprioception.STATE_KEYS]
+        observed = [*Proprioception.STATE_KEYS]
         if config.previous_action:
-            felt.append("previous_action")
+            observed.append("previous_action")
         transforms += [
-            Proprioception(default, felt, out_keys=[f"observation{suffix}"]),
+            Proprioception(default, observed, out_keys=[f"observation{suffix}"]),
             Privileged(
                 config.privileged,
                 len(robot.joints),

@@ -189,7 +189,7 @@ class DodgeballEnv(EnvBase):
         return self._physics
 
     def check_scene(self) -> None:
-        """Raise ValueError if MuJoCo cannot make the robot and the balls."""
+        """Raise ValueError if the engine cannot make the robot and the balls."""
         _ = self.physics
 
     def _set_seed(self, seed: int | None) -> None:

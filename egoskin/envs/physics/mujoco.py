@@ -208,7 +208,9 @@ class MujocoPhysics(Physics):
         # The comparison is also False for NaN.
         diverged = errors | (self._failure_count() > warnings) | ~(speed < _MAX_SPEED)
         contact = torch.from_numpy(found)
-        by_link = contact[:, links:].unflatten(-1, (-1, 2)).any(-1)
+        by_link = None
+        if self.scene.link_contacts:
+            by_link = contact[:, links:].unflatten(-1, (-1, 2)).any(-1)
         power, saturation = (
             torch.from_numpy(total / self.config.substeps).float()
             for total in (power, saturation)
@@ -217,7 +219,7 @@ class MujocoPhysics(Physics):
             object_hit=contact[:, : self.num_objects],
             fallen=torch.from_numpy(fallen),
             self_contact=contact[:, self.num_objects],
-            link_contact=by_link if self.scene.link_contacts else None,
+            link_contact=by_link,
             power=power,
             torque_saturation=saturation,
             diverged=torch.from_numpy(diverged),
