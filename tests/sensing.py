@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import mujoco
 import numpy as np
 import torch
 from hypothesis import strategies as st
@@ -32,6 +33,22 @@ def along_axes(angle: float) -> float:
 def measure(sensor, state):
     """(distance, detected) of a state."""
     return sensor.compute(*(state[key] for key in KEYS))
+
+
+def placed_by_mujoco(model, data, skin, state):
+    """Yield (row, sensor, rotation of its link, place) as MuJoCo places the robot.
+
+    The state's objects are the model's mocap bodies; ``data`` is that of the row.
+    """
+    for row, values in enumerate(state.unbind(0)):
+        data.qpos[:7] = values["base_pose"]
+        data.qpos[7:] = values["joint_pos"]
+        data.mocap_pos[:] = values["object_pose"][:, :3]
+        data.mocap_quat[:] = values["object_pose"][:, 3:]
+        mujoco.mj_kinematics(model, data)
+        for s, link in enumerate(skin.links):
+            turn = data.body(link).xmat.reshape(3, 3)
+            yield row, s, turn, data.body(link).xpos + turn @ skin.position[s]
 
 
 def turned(state, seed: int):

@@ -23,6 +23,7 @@ from sensing import (
     SHAPES,
     assert_same_bits_in_any_batch,
     measure,
+    placed_by_mujoco,
     turned,
 )
 
@@ -70,22 +71,14 @@ def mujoco_field(model, skin, state) -> tuple[np.ndarray, ...]:
     data, ends = mujoco.MjData(model), np.zeros(6)
     speck = model.geom("speck").id
     result = np.zeros((2, len(state), len(skin), len(KINDS)))
-    for row, values in enumerate(state.unbind(0)):
-        data.qpos[:7] = values["base_pose"]
-        data.qpos[7:] = values["joint_pos"]
-        data.mocap_pos[:] = values["object_pose"][:, :3]
-        data.mocap_quat[:] = values["object_pose"][:, 3:]
-        mujoco.mj_kinematics(model, data)
-        for s, link in enumerate(skin.links):
-            turn = data.body(link).xmat.reshape(3, 3)
-            place = data.body(link).xpos + turn @ skin.position[s]
-            data.geom_xpos[speck] = place
-            for o, kind in enumerate(KINDS):
-                geom = data.geom(kind)
-                distance = mujoco.mj_geomDistance(model, data, speck, geom.id, 99, ends)
-                way = ends[3:] - place
-                cosine = way @ turn @ skin.normal[s] / max(np.linalg.norm(way), TINY)
-                result[:, row, s, o] = distance + TINY, cosine
+    for row, s, turn, place in placed_by_mujoco(model, data, skin, state):
+        data.geom_xpos[speck] = place
+        for o, kind in enumerate(KINDS):
+            geom = data.geom(kind)
+            distance = mujoco.mj_geomDistance(model, data, speck, geom.id, 99, ends)
+            way = ends[3:] - place
+            cosine = way @ turn @ skin.normal[s] / max(np.linalg.norm(way), TINY)
+            result[:, row, s, o] = distance + TINY, cosine
     return tuple(result)
 
 

@@ -26,6 +26,7 @@ from sensing import (
     assert_same_bits,
     assert_same_bits_in_any_batch,
     measure,
+    placed_by_mujoco,
     turned,
 )
 
@@ -70,23 +71,15 @@ def mujoco_rays(model, skin, state) -> np.ndarray:
     frames = skin.rotation()
     result = np.full((len(state), len(skin), 16, len(KINDS)), np.inf)
     hit, geom = np.zeros(16), np.zeros(16, np.int32)
-    for row, values in enumerate(state.unbind(0)):
-        data.qpos[:7] = values["base_pose"]
-        data.qpos[7:] = values["joint_pos"]
-        data.mocap_pos[:] = values["object_pose"][:, :3]
-        data.mocap_quat[:] = values["object_pose"][:, 3:]
-        mujoco.mj_kinematics(model, data)
-        for s, link in enumerate(skin.links):
-            turn = data.body(link).xmat.reshape(3, 3)
-            place = data.body(link).xpos + turn @ skin.position[s]
-            beams = skin.coverage[s].directions()
-            ways = (beams @ (turn @ frames[s]).T).ravel()
-            for o in range(len(KINDS)):
-                groups = np.arange(6) == o + 1
-                mujoco.mj_multiRay(
-                    model, data, place, ways, groups, 1, -1, geom, hit, None, 16, 1e9
-                )
-                result[row, s, :, o] = np.where(hit < 0, np.inf, hit)
+    for row, s, turn, place in placed_by_mujoco(model, data, skin, state):
+        beams = skin.coverage[s].directions()
+        ways = (beams @ (turn @ frames[s]).T).ravel()
+        for o in range(len(KINDS)):
+            groups = np.arange(6) == o + 1
+            mujoco.mj_multiRay(
+                model, data, place, ways, groups, 1, -1, geom, hit, None, 16, 1e9
+            )
+            result[row, s, :, o] = np.where(hit < 0, np.inf, hit)
     return result
 
 
