@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import select
 import signal
@@ -118,6 +119,21 @@ def _check_names(args: list[str]) -> None:
         name = arg.split("=")[0].replace("_", "-")
         if name in _RENAMED:
             raise ValueError(f"{name} is now {_RENAMED[name]}")
+
+
+def check_packages(what: str, extra: str, *packages: str) -> None:
+    """Raise ValueError if a package is missing that something needs.
+
+    Args:
+        what: What needs it.
+        extra: The extra of egoskin that brings it.
+        packages: Their names.
+    """
+    for package in packages:
+        if importlib.util.find_spec(package) is None:
+            raise ValueError(
+                f"{what} needs {package}: `pip install 'egoskin[{extra}]'`"
+            )
 
 
 def _nobody_reads() -> bool:

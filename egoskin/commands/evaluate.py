@@ -10,7 +10,6 @@ egoskin evaluate runs/NAME --mask
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from egoskin.bounds import COUNT, check_bounds
+from egoskin.commands.errors import check_packages
 from egoskin.evaluation.behaviour import Behaviour, Motion, behave
 from egoskin.evaluation.operating_map import check_map, draw_map, operating_map
 from egoskin.evaluation.throw_set import Estimate, Evaluation, evaluate, standard_task
@@ -72,7 +72,7 @@ class EvaluateConfig:
         check_output(self.json, "--json")
         if self.map is not None:
             check_path(self.map, PICTURE_SUFFIXES)
-            check_matplotlib()
+            check_packages("--map", "plot", "matplotlib")
 
     @property
     def masked(self) -> tuple[str, ...]:
@@ -80,12 +80,6 @@ class EvaluateConfig:
         if self.mask is None:
             return ()
         return self.mask or MASK_ALL
-
-
-def check_matplotlib() -> None:
-    """Raise ValueError if the map's picture cannot be drawn here."""
-    if importlib.util.find_spec("matplotlib") is None:
-        raise ValueError("--map needs matplotlib: `pip install 'egoskin[plot]'`")
 
 
 def share(value: float | None) -> str:

@@ -13,7 +13,6 @@ egoskin.study.manifest.Study.
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import sys
 from dataclasses import dataclass
@@ -23,7 +22,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from egoskin.bounds import COUNT, POSITIVE, check_bounds
-from egoskin.commands.errors import parse_subcommand
+from egoskin.commands.errors import check_packages, parse_subcommand
 from egoskin.evaluation.visibility import analyse
 from egoskin.parallel import available_cores
 from egoskin.progress import counted
@@ -61,15 +60,6 @@ def find_study(name: str) -> Manifest:
     if not Path(name).is_file():
         raise ValueError(f"there is no file {name}")
     return resolve(load_study(Path(name)))
-
-
-def check_packages(what: str, extra: str, *packages: str) -> None:
-    """Raise ValueError if a package is missing that something needs."""
-    for package in packages:
-        if importlib.util.find_spec(package) is None:
-            raise ValueError(
-                f"{what} needs {package}: `pip install 'egoskin[{extra}]'`"
-            )
 
 
 def fastest(speeds: list[Speed]) -> Speed:
