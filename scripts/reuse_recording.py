@@ -8,7 +8,6 @@ may as well come from motion capture or a real robot.
 
 from __future__ import annotations
 
-from egoskin.bounds import COUNT, check_bounds
 from egoskin.interrupts import end_quietly
 
 if __name__ == "__main__":
@@ -19,7 +18,6 @@ if __name__ == "__main__":
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import torch
 import tyro
@@ -44,14 +42,15 @@ class ReplayConfig:
 
     folder: Path | None = None
     """Memory-mapped recording, made there if there is none; None: a throw-away one."""
-    num_envs: Annotated[int, COUNT] = 64
+    num_envs: int = 64
     """Robots ``B`` in a new recording."""
-    num_steps: Annotated[int, COUNT] = 60
+    num_steps: int = 60
     """Control steps ``T`` in a new recording."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for counts that record nothing."""
-        check_bounds(self)
+        if min(self.num_envs, self.num_steps) < 1:
+            raise ValueError("num_envs and num_steps must be at least 1")
 
 
 def record(folder: Path, num_envs: int, num_steps: int) -> None:

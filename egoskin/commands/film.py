@@ -29,7 +29,7 @@ except (AttributeError, ImportError, RuntimeError) as fault:
     )
     raise SystemExit(2) from None
 
-from egoskin.bounds import COUNT, NOT_NEGATIVE, check_bounds
+from egoskin.bounds import COUNT, NOT_NEGATIVE, Interval, check_bounds
 from egoskin.evaluation.throw_set import standard_task
 from egoskin.make import EnvConfig
 from egoskin.policies.policy import load_policy
@@ -75,7 +75,7 @@ class RenderConfig:
     """Stop at this age at the latest [s]; None: the whole episode."""
     fps: float = 30.0
     """Pictures for each second of the episode, at most the control rate."""
-    slowdown: float = 1.0
+    slowdown: Annotated[float, Interval(gt=0, le=100)] = 1.0
     """The film plays this many times slower than real time."""
     size: tuple[int, int] = (960, 540)
     """Width and height of the film [px]."""
@@ -92,8 +92,6 @@ class RenderConfig:
         check_path(self.sheet_path, (".png",))
         check_seed(self.throw_set, "throw_set")
         check_bounds(self)
-        if not 0 < self.slowdown <= 100:
-            raise ValueError(f"slowdown must be in (0, 100], got {self.slowdown}")
         if self.policy is not None and self.env != EnvConfig():
             raise ValueError(
                 "a policy brings its own robot, task, skin and sensors: leave their "
