@@ -16,6 +16,12 @@ def counted(number: int, noun: str) -> str:
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
+def clock(seconds: float) -> str:
+    """Return a time as hours, minutes and seconds: "2:10:05"."""
+    hours, rest = divmod(round(seconds), 3600)
+    return f"{hours:d}:{rest // 60:02d}:{rest % 60:02d}"
+
+
 class StatusLine:
     """One line on stderr that says how far the work is.
 
@@ -54,6 +60,7 @@ class ProgressLine:
 
     Attributes:
         is_unread: Whether nobody reads it any more.
+        metrics: Those shown last; empty before any.
     """
 
     def __init__(self, frames: int, total: int) -> None:
@@ -62,9 +69,11 @@ class ProgressLine:
         self._shown = float("-inf")
         self._live = sys.stdout.isatty()
         self.is_unread = False
+        self.metrics: Mapping[str, float] = {}
 
     def update(self, metrics: Mapping[str, float]) -> None:
         """Show the state after a rollout."""
+        self.metrics = metrics
         now, frames = time.monotonic(), metrics["frames"]
         total = f"{self._total:,}"
         # Before any episode was old enough there is none to tell of.
@@ -102,6 +111,4 @@ class ProgressLine:
 
     def _left(self, now: float, frames: float) -> str:
         done = frames - self._first
-        seconds = (now - self._start) * max(self._total - frames, 0) / max(done, 1)
-        hours, rest = divmod(round(seconds), 3600)
-        return f"{hours:d}:{rest // 60:02d}:{rest % 60:02d}"
+        return clock((now - self._start) * max(self._total - frames, 0) / max(done, 1))

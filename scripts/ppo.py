@@ -6,10 +6,10 @@ python scripts/ppo.py --resume runs/NAME --total-frames 100_000_000
 
 from __future__ import annotations
 
-from egoskin.interrupts import end_quietly
+from egoskin.commands import begin
 
 if __name__ == "__main__":
-    end_quietly()
+    begin("train")
 
 # isort: split
 
@@ -17,7 +17,13 @@ import math
 import sys
 
 from egoskin.commands.errors import clear_errors
-from egoskin.commands.train import Stop, open_run, saying_how_to_go_on
+from egoskin.commands.train import (
+    Stop,
+    announce,
+    open_run,
+    saying_how_to_go_on,
+    what_came_out,
+)
 from egoskin.progress import ProgressLine
 from egoskin.runs.config import parse_config
 from egoskin.runs.trainer import open_trainer, train
@@ -29,6 +35,7 @@ def main(args: list[str]) -> None:
     run = open_run(config)
     rollouts = math.ceil(config.total_frames / config.frames_per_batch)
     with saying_how_to_go_on(run), open_trainer(run) as trainer:
+        announce(trainer)
         stop = Stop()
         line = ProgressLine(trainer.frames, rollouts * config.frames_per_batch)
         train(trainer, lambda: stop.requested or line.is_unread, line.update)
@@ -36,7 +43,7 @@ def main(args: list[str]) -> None:
     if trainer.frames < config.total_frames:
         print(run.how_to_go_on())
     else:
-        print(f"done; evaluate it with: egoskin evaluate {run.path}")
+        print(what_came_out(trainer, line.metrics))
 
 
 if __name__ == "__main__":

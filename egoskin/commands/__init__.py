@@ -1,7 +1,8 @@
 """The command line: what `egoskin NAME`, `python -m egoskin NAME` and the scripts do.
 
 Contract: a command is the module of its name, with a function ``main(args)``, and
-nothing heavy is imported before the name is known to be one: help comes at once.
+nothing heavy is imported before its arguments are known to ask for no help: that comes
+at once.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from collections.abc import Iterable, Mapping
 from importlib import import_module
 
 from egoskin import __version__
+from egoskin.commands import pages
 from egoskin.interrupts import end_quietly
 from egoskin.viewer import draw_without_display
 
@@ -58,11 +60,26 @@ def main() -> None:
         raise SystemExit(2)
 
 
-def run(name: str) -> None:
-    """Run a command on the arguments of this process, with clear errors."""
+def begin(name: str) -> None:
+    """Give the help that is asked for, and end; else prepare to run a command.
+
+    Call this before mujoco and torch are imported. ``--help-all`` is left to the
+    command's own parser, as ``--help``.
+    """
     end_quietly()
+    args = sys.argv[1:]
+    if "--help-all" in args:
+        sys.argv[1:] = ["--help" if arg == "--help-all" else arg for arg in args]
+    elif pages.asked_for(name, args):
+        print(pages.page(name))
+        raise SystemExit(0)
     if name in _PICTURES:
         draw_without_display()
+
+
+def run(name: str) -> None:
+    """Run a command on the arguments of this process, with clear errors."""
+    begin(name)
     command = import_module(f"egoskin.commands.{name.replace('-', '_')}")
     # Only now: it imports torch.
     from egoskin.commands.errors import clear_errors
@@ -83,7 +100,7 @@ def _page() -> str:
             "",
             *lines,
             "",
-            "egoskin COMMAND --help lists the options of a command. For example:",
+            "egoskin COMMAND --help tells more of a command. For example:",
             "",
             "  egoskin evaluate field_proximity --episodes 256",
             "  egoskin film field_proximity --longest-of 16 --out dodge.mp4",

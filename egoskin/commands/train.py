@@ -7,18 +7,20 @@ egoskin train --resume runs/NAME --total-frames 100_000_000
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from types import FrameType
 
 from egoskin.agents.ppo import NonFiniteError
+from egoskin.commands.errors import check_packages
 from egoskin.interrupts import ENDING, end_next_time, say, take
 from egoskin.make import check_num_workers
 from egoskin.parallel import WorkerError
-from egoskin.progress import ProgressLine, counted
+from egoskin.progress import ProgressLine, clock, counted
 from egoskin.runs.config import TrainConfig, parse_config
+from egoskin.runs.estimate import estimate_seconds
 from egoskin.runs.run import Run
-from egoskin.runs.trainer import open_trainer, train
+from egoskin.runs.trainer import Trainer, open_trainer, train
 
 
 class Stop:
@@ -41,14 +43,63 @@ def open_run(config: TrainConfig) -> Run:
         ValueError: If no such run can be trained here.
     """
     config.check_machine()
+    if config.log == "wandb":
+        check_packages("--log wandb", "wandb", "wandb")
     run = Run.create(config) if config.resume is None else Run(config.resume, config)
-    workers = check_num_workers(config.num_envs, config.num_workers)
     print(
-        f"run {run.path}: {counted(config.num_envs, 'agent')} on "
-        f"{counted(workers, 'worker')}, learner on {config.device} with "
-        f"{counted(config.num_learner_threads, 'thread')}"
+        f"run {run.path}: {config.env.robot}, {config.env.sensor.label()}, "
+        f"throws of standard {config.env.standard}, seed {config.seed}",
+        flush=True,
     )
     return run
+
+
+def announce(trainer: Trainer) -> None:
+    """Say how much there is to do, how long it will take here, and what to look at."""
+    config, done = trainer.config, trainer.frames
+    to_do = max(config.total_frames - done, 0)
+    workers = check_num_workers(config.num_envs, config.num_workers)
+    time = _rough_time(estimate_seconds(config, trainer.run.load_skin(), to_do))
+    print(
+        f"{to_do:,} frames{f' after {done:,}' if done else ''}: "
+        f"{counted(config.num_envs, 'agent')} on {counted(workers, 'worker')}, "
+        f"learner on {config.device} with "
+        f"{counted(config.num_learner_threads, 'thread')}; here about {time}\n"
+        f"curves while it trains: tensorboard --logdir {trainer.run.path}",
+        flush=True,
+    )
+
+
+def _rough_time(seconds: float) -> str:
+    """Return a time that is a guess: "2 h 10 min", "7 min", "20 s"."""
+    if seconds < 60:
+        return f"{max(round(seconds, -1), 10):.0f} s"
+    hours, minutes = divmod(round(seconds / 60), 60)
+    if hours:
+        return f"{hours} h {round(minutes, -1)} min"
+    return f"{minutes} min"
+
+
+def what_came_out(trainer: Trainer, metrics: Mapping[str, float]) -> str:
+    """Return how a training ended, and the commands that show it.
+
+    Args:
+        trainer: What was trained, to its end.
+        metrics: Those of its last rollout; empty if there was none to do.
+    """
+    path, task = trainer.run.path, trainer.config.env.task
+    told = f"done: {trainer.frames:,} frames"
+    if metrics:
+        told += f" in {clock(metrics['time/wall_s'])}; while exploring "
+        # No episode may have been old enough.
+        if not math.isnan(success := metrics["episode/success"]):
+            told += f"{success:.1%} untouched for {task.success_s:g} s, "
+        told += f"survival {metrics['episode/survival_s']:.2f} s"
+    return (
+        f"{told}\n"
+        f"evaluate it with: egoskin evaluate {path}\n"
+        f"see it with:      egoskin film {path} --longest-of 16"
+    )
 
 
 @contextmanager
@@ -66,6 +117,7 @@ def main(args: list[str]) -> None:
     run = open_run(config)
     rollouts = math.ceil(config.total_frames / config.frames_per_batch)
     with saying_how_to_go_on(run), open_trainer(run) as trainer:
+        announce(trainer)
         stop = Stop()
         line = ProgressLine(trainer.frames, rollouts * config.frames_per_batch)
         train(trainer, lambda: stop.requested or line.is_unread, line.update)
@@ -73,4 +125,4 @@ def main(args: list[str]) -> None:
     if trainer.frames < config.total_frames:
         print(run.how_to_go_on())
     else:
-        print(f"done; evaluate it with: egoskin evaluate {run.path}")
+        print(what_came_out(trainer, line.metrics))

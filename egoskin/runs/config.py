@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import torch
 import tyro
@@ -52,8 +52,17 @@ class TrainConfig:
     """Folder of the run; None: a new one under runs/, named after time and sensor."""
     snapshot_frames: Annotated[int, COUNT] = 5_000_000
     """Environment steps between the policies kept for learning curves."""
+    film_every: Annotated[int | None, COUNT] = None
+    """Environment steps between small films of the policy, in films/ of the run folder;
+    None: none."""
+    log: Literal["files", "wandb"] = "files"
+    """Where metrics go: metrics.csv and TensorBoard files; wandb: Weights & Biases, too
+    (extra wandb)."""
     checkpoint_interval: Annotated[float, POSITIVE] = 60.0
     """A checkpoint is at most this old [s]."""
+    config: Path | None = None
+    """config.json of a run to repeat: what it holds are the defaults, and the skin must
+    come out the same."""
     resume: Path | None = None
     """Run folder to go on with; changed may be --total-frames, to a later end, and what
     changes no result: workers, threads, when checkpoints and policies are kept."""
@@ -114,7 +123,7 @@ class TrainConfig:
         return device
 
 
-CALL_FIELDS = ("run_dir", "resume", "standard")
+CALL_FIELDS = ("run_dir", "resume", "config", "standard")
 """Fields that say how a run was called: its stored configuration leaves them out."""
 MACHINE_FIELDS = frozenset(
     (
@@ -122,6 +131,8 @@ MACHINE_FIELDS = frozenset(
         "num_workers",
         "learner_threads",
         "snapshot_frames",
+        "film_every",
+        "log",
         "checkpoint_interval",
     )
 )
@@ -135,8 +146,9 @@ SKIN_HASH = "skin_sha256"
 def parse_config(args: list[str]) -> TrainConfig:
     """Return the configuration of a command line.
 
-    With ``--resume RUN`` the stored configuration of the run is the default, and no
-    field but ``total_frames`` and `MACHINE_FIELDS` may differ from it.
+    With ``--config FILE`` a stored configuration is the default. With ``--resume RUN``
+    that of the run is, and no field but ``total_frames`` and `MACHINE_FIELDS` may
+    differ from it.
 
     Args:
         args: Arguments, without the program's name.
@@ -146,21 +158,21 @@ def parse_config(args: list[str]) -> TrainConfig:
             one planned.
     """
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    first.add_argument("--resume", type=Path)
-    first.add_argument("--standard")
-    run, _ = first.parse_known_args(args)
-    if run.resume is None or str(run.resume) == "None":
-        if run.standard not in get_args(Standard):
-            return tyro.cli(TrainConfig, args=args)
-        task = training_task(run.standard, DodgeballConfig())
-        default = TrainConfig(env=EnvConfig(task=task))
-        return tyro.cli(TrainConfig, args=args, default=default)
-    if run.standard is not None:
+    for name in ("--resume", "--config", "--standard"):
+        first.add_argument(name, type=lambda text: None if text == "None" else text)
+    given, _ = first.parse_known_args(args)
+    if given.resume is None:
+        return tyro.cli(TrainConfig, args=args, default=_default_of(given))
+    if given.standard is not None:
         raise ValueError("--standard cannot be changed on resume")
-    stored = load_config(run.resume)
+    if given.config is not None:
+        raise ValueError("--resume goes on with a run, --config repeats one: not both")
+    path = Path(given.resume)
+    stored = load_config(path)
     # What the file lacks was filled with today's defaults.
-    file, before = run.resume / "config.json", to_plain(stored)
-    if lacking := changed_fields(read_config(file)[0], before):
+    file, before = path / "config.json", to_plain(stored)
+    absent = changed_fields(read_config(file)[0], before)
+    if lacking := [name for name in absent if name not in MACHINE_FIELDS]:
         raise ValueError(
             f"{file} lacks {', '.join(lacking)}: another version made it. Go on with "
             "that version (its commit is in versions.json)"
@@ -183,6 +195,28 @@ def parse_config(args: list[str]) -> TrainConfig:
             f"{stored.total_frames}"
         )
     return config
+
+
+def _default_of(given: argparse.Namespace) -> TrainConfig:
+    """Return what a new run is made of where its command line says nothing.
+
+    Args:
+        given: What it says of ``config`` and ``standard``, each a text or None.
+
+    Raises:
+        ValueError: If there is no such configuration, or both are given.
+    """
+    if given.config is not None:
+        if given.standard is not None:
+            raise ValueError("--config brings its own throws: leave out --standard")
+        path = Path(given.config)
+        if not path.is_file():
+            raise ValueError(f"no file {path}: --config takes the config.json of a run")
+        return from_plain(TrainConfig, read_config(path)[0], str(path))
+    if given.standard not in get_args(Standard):
+        return TrainConfig()
+    task = training_task(given.standard, DodgeballConfig())
+    return TrainConfig(env=EnvConfig(task=task))
 
 
 def _option(name: str) -> str:

@@ -6,6 +6,7 @@
     metrics.csv              one line for each rollout; TensorBoard files beside it
     checkpoint.safetensors   everything needed to go on, at most a minute old
     policies/<frames>.safetensors   self-contained policies, from the first on
+    films/<frames>.mp4, .png   films of them, if asked for
     not-finite-<frames>.safetensors   an update that failed, for `egoskin replay`
     lock                     held by the process that trains
 
@@ -24,6 +25,7 @@ import errno
 import fcntl
 import io
 import itertools
+import json
 import os
 import platform
 import subprocess
@@ -53,6 +55,7 @@ from egoskin.runs.config import (
     read_config,
 )
 from egoskin.runs.events import EventFile
+from egoskin.runs.wandb_log import WandbLog
 from egoskin.sensors import Skin
 from egoskin.storage.files import read_regular
 from egoskin.storage.formats import (
@@ -96,6 +99,7 @@ class Run:
     def __init__(self, path: Path, config: TrainConfig) -> None:
         self.path, self.config = path, config
         self._events: EventFile | None = None
+        self._wandb: WandbLog | None = None
         self._skin_hash = ""
         # The logs up to now: a line for each rollout, an entry for each start.
         self._metrics = ""
@@ -106,10 +110,11 @@ class Run:
         """Return a new run folder that holds the configuration and the skin.
 
         Raises:
-            ValueError: If the folder holds anything already, the skin is none, or there
-                is too little memory.
+            ValueError: If the folder holds anything already, the skin is none or not
+                that of the run to repeat, or there is too little memory.
         """
         skin = config.env.skin.build(config.env.robot_config)
+        _check_repeats(config, skin)
         _check_fits(config, skin)
         path = config.run_dir
         if path is None:
@@ -370,6 +375,9 @@ class Run:
         else:
             path.unlink(missing_ok=True)
         self._events = EventFile(self.path, frames)
+        if self.config.log == "wandb":
+            plain = to_plain(self.config)
+            self._wandb = WandbLog(self.path, self._starts[0], plain)
 
     def log(self, metrics: Mapping[str, float]) -> None:
         """Append a line of metrics; the first fixes the columns.
@@ -391,11 +399,32 @@ class Run:
             # The first line, or somebody removed the file.
             write_file(self._metrics_path, self._metrics.encode())
         self._events.log(metrics)
+        if self._wandb is not None:
+            self._wandb.log(metrics)
 
     def close(self) -> None:
         """Close the logs."""
         if self._events is not None:
             self._events.close()
+        if self._wandb is not None:
+            self._wandb.close()
+
+
+def _check_repeats(config: TrainConfig, skin: Skin) -> None:
+    """Raise ValueError if the run to repeat had another skin by the same options."""
+    if config.config is None:
+        return
+    content, before = read_config(config.config)
+    if content["env"]["skin"] != to_plain(config.env.skin):
+        return
+    # As a file holds it.
+    now = json.loads(json.dumps(skin.to_dict(), default=str))
+    if before not in (None, content_hash(now)):
+        raise ValueError(
+            f"the skin is not that of {config.config}: its file was changed, or it is "
+            "placed otherwise here; give that run's own by --skin.path "
+            f"{config.config.parent / 'skin.json'}"
+        )
 
 
 def _check_fits(config: TrainConfig, skin: Skin) -> None:

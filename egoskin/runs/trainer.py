@@ -37,6 +37,7 @@ from egoskin.policies.policy import (
     save_policy,
     sparse_sources,
 )
+from egoskin.runs.films import FilmMaker
 from egoskin.runs.run import Run
 from egoskin.runs.survival import SurvivalCurve
 from egoskin.sensors import Skin
@@ -308,18 +309,27 @@ def train(
     """
     config, run = trainer.config, trainer.run
     saved_at = time.monotonic()
-    while trainer.frames < config.total_frames and not stop():
-        start = time.monotonic()
-        before = trainer.frames
-        metrics = trainer.iterate()
-        run.log(metrics)
-        show(metrics)
-        if before // config.snapshot_frames < trainer.frames // config.snapshot_frames:
-            trainer.keep_policy()
-        now = time.monotonic()
-        # The next rollout must fit in as well.
-        if now - saved_at + 1.5 * (now - start) > config.checkpoint_interval:
-            trainer.save()
-            saved_at = now
-    trainer.save()
-    trainer.keep_policy()
+    with FilmMaker(run.path) as films:
+        while trainer.frames < config.total_frames and not stop():
+            start = time.monotonic()
+            before = trainer.frames
+            metrics = trainer.iterate()
+            run.log(metrics)
+            show(metrics)
+            to_film = _passes(config.film_every, before, trainer.frames)
+            if to_film or _passes(config.snapshot_frames, before, trainer.frames):
+                trainer.keep_policy()
+            if to_film:
+                films.start(run.policy_path(trainer.frames))
+            now = time.monotonic()
+            # The next rollout must fit in as well.
+            if now - saved_at + 1.5 * (now - start) > config.checkpoint_interval:
+                trainer.save()
+                saved_at = now
+        trainer.save()
+        trainer.keep_policy()
+
+
+def _passes(interval: int | None, before: int, now: int) -> bool:
+    """Whether a multiple of an interval lies after one number and not after another."""
+    return interval is not None and before // interval < now // interval

@@ -17,6 +17,7 @@ from setuptools.config.pyprojecttoml import read_configuration
 from calling import SCRIPTS, call, fail
 from egoskin import __version__, commands
 from egoskin.commands import COMMANDS
+from egoskin.commands.pages import PAGES, WITH_SUBCOMMANDS, page
 from egoskin.commands.train import main as train
 
 ROOT = SCRIPTS.parent
@@ -43,10 +44,67 @@ def test_help_comes_at_once_and_lists_the_commands():
     )
     for name, text in COMMANDS.items():
         assert re.search(rf"^  {name} +{text}$", done.stdout, re.MULTILINE)
-    imported = {line.split()[-1].split(".")[0] for line in done.stderr.splitlines()}
-    assert "egoskin" in imported
-    assert not imported & {"torch", "numpy", "mujoco", "torchrl", "tyro"}
+    assert not heavy(done.stderr)
     assert resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before < 1
+
+
+def heavy(import_times: str) -> set[str]:
+    """Return which packages that take long a report of ``-X importtime`` lists."""
+    imported = {line.split()[-1].split(".")[0] for line in import_times.splitlines()}
+    assert "egoskin" in imported
+    return imported & {"torch", "numpy", "mujoco", "torchrl", "tyro"}
+
+
+@pytest.mark.parametrize(
+    "command", [("-m", "egoskin", "train"), (str(SCRIPTS / "ppo.py"),)]
+)
+def test_the_first_page_of_a_command_comes_at_once(command):
+    done = subprocess.run(
+        [sys.executable, "-X", "importtime", *command, "--seed", "3", "--help"],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=ROOT,
+    )
+    assert done.stdout == page("train") + "\n"
+    assert not heavy(done.stderr)
+
+
+def test_every_command_has_a_first_page(monkeypatch, capsys):
+    assert list(PAGES) == list(COMMANDS)
+    for name in COMMANDS:
+        with pytest.raises(SystemExit) as ended:
+            egoskin(monkeypatch, name, "-h")
+        assert ended.value.code == 0
+        assert capsys.readouterr().out == page(name) + "\n"
+
+
+@pytest.mark.parametrize("name", [n for n in COMMANDS if n not in WITH_SUBCOMMANDS])
+def test_the_first_page_says_what_the_options_are(name):
+    """Names, choices and defaults are those of the parser."""
+    _, described = re.split(
+        r"\boptions  *[-─ ]", call(name, "--help").stdout, maxsplit=1
+    )
+    whole = " ".join(described.replace("│", " ").split())
+    options = re.split(r"\n  (?=--)", PAGES[name].split("\n\n  egoskin")[0])[1:]
+    assert len(options) <= 10
+    for text in options:
+        option, choices = re.match(r"(\S+) ?(\{[\w,]+\})?", text).groups()
+        told = re.search(rf" {option}[ ,](.*?)\(default: (.*?)\)", whole)
+        assert told, option
+        assert (choices or "") in told[1].replace("{None}|", "").replace("None,", "")
+        default = re.search(r"\((\S[^:()]*)\)$", text.strip())
+        if default:
+            assert default[1] == told[2]
+        else:
+            assert told[2] in ("None", "False")
+
+
+def test_the_pages_of_commands_with_subcommands_name_them_all():
+    for name in WITH_SUBCOMMANDS:
+        usage = call(name, "--help").stdout.split("{")[1].split("}")[0]
+        named = re.findall(rf"^  egoskin {name} (\S+)", PAGES[name], re.MULTILINE)
+        assert named == usage.split(",")
 
 
 @pytest.mark.parametrize("args", [(), ("-h",), ("--help",)])

@@ -40,7 +40,7 @@ def handlers() -> Iterator[None]:
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
 def test_ctrl_c_twice_while_a_script_imports_is_one_line(script: Path):
     process = subprocess.Popen(
-        [sys.executable, str(script), "--help"],
+        [sys.executable, str(script), "--help-all"],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

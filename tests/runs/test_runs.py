@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import resource
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -25,6 +26,7 @@ from egoskin.envs.standards import training_task
 from egoskin.make import EnvConfig
 from egoskin.runs.config import TrainConfig, parse_config
 from egoskin.runs.events import EventFile
+from egoskin.runs.films import FilmMaker
 from egoskin.runs.run import Run, git_state
 from egoskin.runs.trainer import METRIC_KEYS, Trainer, open_trainer, train
 from egoskin.sensors.config import SensorConfig
@@ -185,6 +187,55 @@ def test_policies_are_kept_at_the_start_in_between_and_at_the_end(config: TrainC
     found = sorted((run.path / "policies").iterdir())
     assert [int(path.stem) for path in found] == [0, 128, 192]
     assert egoskin.load_policy(found[-1]).policy_spec.frames == 192
+
+
+def test_films_are_made_of_policies_on_the_way(config: TrainConfig, capfd):
+    """And a film that cannot be made is told of, while the training goes on."""
+    with open_trainer(Run.create(replace(config, film_every=128))) as trainer:
+        train(trainer)
+    run = trainer.run
+    assert run.policy_path(128).exists()
+    films = {path.name for path in (run.path / "films").iterdir()}
+    told = capfd.readouterr().err
+    assert films == {"000000000128.mp4", "000000000128.png"} or "OpenGL" in told
+    with FilmMaker(run.path) as maker:
+        maker.start(run.path / "config.json")
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line.startswith("note: no film ")
+    assert "config.json" in line
+
+
+def test_metrics_go_to_weights_and_biases(config: TrainConfig, monkeypatch):
+    """By what the package would be given; a resume goes on with the same run there."""
+    given = {}
+
+    class Recorded:
+        Error = RuntimeError
+
+        def init(self, **options: object) -> Recorded:
+            given.update(options, rows=[], finished=False)
+            return self
+
+        def log(self, metrics: dict[str, float], step: int) -> None:
+            given["rows"].append((step, metrics["reward/mean"]))
+
+        def finish(self) -> None:
+            given["finished"] = True
+
+    monkeypatch.setitem(sys.modules, "wandb", Recorded())
+    with open_trainer(Run.create(replace(config, log="wandb"))) as trainer:
+        train(trainer)
+    identity = given["id"]
+    rows = trainer.run.metrics().splitlines()[1:]
+    assert [step for step, _ in given["rows"]] == [64, 128, 192]
+    assert len(rows) == 3
+    assert given["finished"]
+    assert given["config"]["num_envs"] == 4
+    again = parse_config(["--resume", str(trainer.run.path), "--total-frames", "256"])
+    with open_trainer(Run(trainer.run.path, again)) as trainer:
+        train(trainer)
+    assert given["id"] == identity
+    assert [step for step, _ in given["rows"]] == [256]
 
 
 def test_a_commit_is_recorded_only_of_a_repository_that_holds_the_source(tmp_path):

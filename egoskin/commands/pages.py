@@ -1,0 +1,189 @@
+"""The first page of help of each command: what people set, and examples.
+
+They are texts, because the options themselves are known only after seconds of imports;
+the tests hold them against `--help-all`. A value in parentheses is the default.
+"""
+
+from __future__ import annotations
+
+PAGES = {
+    "train": """\
+Train a robot to dodge balls by what its skin observes.
+
+  --sensor.coverage {field,ray,none,oracle}
+                          a sphere around each sensor; an 8x8 grid of beams; no
+                          skin; told where the balls are (field)
+  --sensor.signal {localization,proximity,closeness,binary}
+                          where a ball is; distance / range; 1 - that; whether one
+                          is in range (proximity)
+  --sensor.range FLOAT    to the ball's surface [m] (2.0)
+  --skin.path PATH        skin file, see egoskin skin; else 64 random sensors
+  --robot NAME            the robot (h1_2)
+  --standard {2,1,paper}  version of the throws; see docs/standard-throw.md
+  --seed INT              of everything random (0)
+  --total-frames INT      environment steps of the whole run (65536000)
+  --run-dir PATH          folder of the run; else a new one under runs/
+  --resume PATH           run folder to go on with, exactly
+
+  egoskin train --sensor.signal binary --sensor.range 1 --seed 1
+  egoskin train --resume runs/NAME --total-frames 100e6
+  egoskin train --config runs/NAME/config.json --seed 2
+  egoskin train --film-every 5e6 --log wandb
+""",
+    "evaluate": """\
+Play a policy on a fixed set of throws that no training has seen.
+
+  POLICY                  run folder, checkpoint, policy file, or a policy of the
+                          package: field_proximity, field_binary, localization, blind
+  --episodes INT          throw sequences (1024)
+  --throw-set INT         seed of the throw set (0)
+  --standard {2,1,paper,run}
+                          version of the throws to judge by (2)
+  --mask [LINK ...]       links whose sensors detect nothing; alone: all sensors
+  --behaviour             also hits by kind of throw, displacement, effort
+  --map PATH              picture of success against speed, tempo, height, direction
+  --check-substeps INT    once more with finer physics (8: 480 Hz)
+  --num-workers INT       processes; else one for each core
+  --json PATH             file to write the figures to
+
+  egoskin evaluate field_proximity --episodes 256
+  egoskin evaluate runs/NAME --mask
+  egoskin evaluate runs/NAME --behaviour --map map.png
+""",
+    "film": """\
+Film an episode of a policy, with a contact sheet of its moments.
+
+  POLICY                  run folder, checkpoint, policy file, or a policy of the
+                          package; none: the robot holds its default pose
+  --out PATH              film to write, .mp4 or .gif (episode.mp4)
+  --longest-of INT        of this many episodes the one that lasts longest (1)
+  --episode INT           which episode of the throw set (0)
+  --throw-set INT         seed of the throw set (0)
+  --standard {2,1,paper,run}
+                          version of the throws (2)
+  --seconds FLOAT         stop at this age at the latest [s]
+  --slowdown FLOAT        times slower than real time (1.0)
+  --size INT INT          width and height [px] (960 540)
+  --camera.azimuth-deg FLOAT
+                          bearing of the camera from the robot's heading [deg] (30.0)
+
+  egoskin film field_proximity --longest-of 16 --out dodge.mp4
+  egoskin film runs/NAME --episode 3 --slowdown 4
+""",
+    "skin": """\
+Place, import, export and show skins.
+
+  egoskin skin place --method poisson_disk --num-sensors 48 --out my.json
+                          sensors spread over a robot's surface
+  egoskin skin import shell.csv --out my.json
+                          an export of GenTact's (CSV, xacro, URDF)
+  egoskin skin export my.json --out my.csv
+                          a skin file as GenTact's CSV
+  egoskin skin show my.json --out my.png
+                          what is in a skin file, and its picture
+
+egoskin skin place --help lists the options of place, and so for each.
+""",
+    "visibility": """\
+Show what a skin sees of the throws, before any training.
+
+  --skin.path PATH        skin file; else 64 random sensors
+  --skin.num-sensors INT  number of sensors to place (64)
+  --robot NAME            the robot (h1_2)
+  --coverages {field,ray} ...
+                          coverages compared (field ray)
+  --ranges FLOAT ...      ranges compared [m] (0.2 0.5 1.0 2.0)
+  --occlusion             the robot's own body hides what lies behind it
+  --num-throws INT        throws followed (2000)
+  --seed INT              of the throws and of the points on the surface (0)
+  --out PATH              picture to write (visibility.png)
+  --json PATH             all figures, to write (visibility.json)
+
+  egoskin visibility --skin.path my.json --out my.png
+  egoskin visibility --ranges 0.5 1 --occlusion
+""",
+    "upper-bound": """\
+Search what the body could still do when a ball comes within reach.
+
+  POLICY                  run folder, checkpoint, policy file, or a policy of the
+                          package: it plays until the search takes over
+  --throws INT            episodes of the throw set (32)
+  --throw-set INT         seed of the throw set (0)
+  --ball INT              which ball of each episode (1)
+  --reach FLOAT           distance from a sensor at which the search starts [m] (2.0)
+  --search.samples INT    plans tried in each iteration (128)
+  --search.iterations INT iterations of the search (20)
+  --search.seed INT       seed of the plans drawn (0)
+  --json PATH             file to write the figures to
+
+  egoskin upper-bound field_proximity --ball 2
+""",
+    "replay": """\
+Replay an update that was not finite.
+
+  FILE                    what a training wrote: runs/NAME/not-finite-*.safetensors
+
+  egoskin replay runs/NAME/not-finite-000001048576.safetensors
+""",
+    "study": """\
+Run a study: many trainings that differ in a few fields, and what they tell.
+
+  egoskin study plan findings --dir studies/findings
+                          what it will cost; writes the manifest
+  egoskin study run findings --dir studies/findings
+                          run it, or go on; runners may share a folder
+  egoskin study status studies/findings
+                          how far it is, from the folder alone
+  egoskin study report studies/findings
+                          report.md, index.html, runs.csv and the figures
+  egoskin study slurm studies/findings > study.sh
+                          a job array for Slurm
+  egoskin study adopt studies/findings runs/NAME
+                          take in a run that was made before
+
+A study is paper, paper-1000, findings, smoke, or a JSON file. egoskin study run --help
+lists the options of run, and so for each.
+""",
+    "verify": """\
+Check that training is exact on this machine: a resume, other workers, other threads and
+other kernels give the same bits.
+
+  --iterations INT        rollouts to train; a resume is tried after half (6)
+  --num-envs INT          agents, a multiple of 4 (4096)
+  --seed INT              of the trainings (0)
+
+  egoskin verify --iterations 4
+  egoskin verify --iterations 2 --num-envs 256 --sensor.coverage ray
+""",
+    "bench": """\
+Measure speed and accuracy.
+
+  egoskin bench loop      the training loop, layer by layer [steps/s]
+  egoskin bench physics   what the choices of the robot's model cost
+  egoskin bench sensors   the sensor kernels
+  egoskin bench accuracy  the physics rate against a finer one
+  egoskin bench gradients --run runs/NAME
+                          the actor's gradients of several rollouts, compared
+
+egoskin bench loop --help lists the options of loop, and so for each.
+""",
+}
+"""Text by command."""
+WITH_SUBCOMMANDS = ("skin", "study", "bench")
+"""Commands whose first argument is a command of their own."""
+
+
+def page(name: str) -> str:
+    """Return the first page of help of a command."""
+    if name in WITH_SUBCOMMANDS:
+        return f"usage: egoskin {name} COMMAND [OPTIONS]\n\n{PAGES[name].rstrip()}"
+    return (
+        f"usage: egoskin {name} [OPTIONS]\n\n{PAGES[name]}\n"
+        f"All options: egoskin {name} --help-all"
+    )
+
+
+def asked_for(name: str, args: list[str]) -> bool:
+    """Whether the arguments of a command ask for its first page of help."""
+    help_asked = args[:1] if name in WITH_SUBCOMMANDS else args
+    return not {"-h", "--help"}.isdisjoint(help_asked)

@@ -1,0 +1,73 @@
+"""Small films of a policy while it is trained, each made by a process of its own.
+
+Training goes on meanwhile, and a film that fails costs a line on stderr.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import TracebackType
+
+_SIZE, _FPS = ("480", "270"), "20"
+# The longest of this many episodes tells more than any one; of it the first seconds.
+_EPISODES, _SECONDS = "4", "5"
+
+
+class FilmMaker:
+    """Makes films in the folder ``films`` of a run, one after the other.
+
+    Args:
+        folder: The run folder.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder / "films"
+        self._process: subprocess.Popen[str] | None = None
+        self._film = Path()
+
+    def __enter__(self) -> FilmMaker:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Let the last film be finished, if training ended well; else stop it."""
+        if kind is not None and self._process is not None:
+            self._process.terminate()
+        self._finish()
+
+    def start(self, policy: Path) -> None:
+        """Begin the film of a policy file; one still being made is finished first."""
+        self._finish()
+        self._folder.mkdir(exist_ok=True)
+        self._film = self._folder / f"{policy.stem}.mp4"
+        command = [sys.executable, "-m", "egoskin", "film", str(policy)]
+        command += ["--out", str(self._film), "--standard", "run", "--fps", _FPS]
+        command += ["--size", *_SIZE, "--longest-of", _EPISODES, "--seconds", _SECONDS]
+        # The package may be imported from a clone, from anywhere.
+        path = [str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH")]
+        self._process = subprocess.Popen(
+            command,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, path))},
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            # Ctrl-C is for the training, which then ends this.
+            start_new_session=True,
+        )
+
+    def _finish(self) -> None:
+        if self._process is None:
+            return
+        _, errors = self._process.communicate()
+        if self._process.returncode > 0:
+            last = errors.strip().splitlines()[-1:]
+            print(f"note: no film {self._film}: {' '.join(last)}", file=sys.stderr)
+        self._process = None
