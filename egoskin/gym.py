@@ -72,8 +72,12 @@ class _Rows:
             spec = one.observation_spec[key]
             size = spec.shape[-1]
             bounded = isinstance(spec, Bounded)
-            low += [spec.space.low.flatten() if bounded else torch.full((size,), -torch.inf)]
-            high += [spec.space.high.flatten() if bounded else torch.full((size,), torch.inf)]
+            low += [
+                spec.space.low.flatten() if bounded else torch.full((size,), -torch.inf)
+            ]
+            high += [
+                spec.space.high.flatten() if bounded else torch.full((size,), torch.inf)
+            ]
         self.observation_space = Box(torch.cat(low).numpy(), torch.cat(high).numpy())
         robot, task = config.robot_config, config.task
         kp, _ = robot.joint_gains(task.physics.gains)
@@ -232,7 +236,9 @@ class DodgeballVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         assert self._env is not None, "call reset first"
         shape = (*self._root.batch_size, -1)
         action = torch.as_tensor(actions, dtype=torch.float32).reshape(shape)
-        step, self._root = self._env.step_and_maybe_reset(self._root.set("action", action))
+        step, self._root = self._env.step_and_maybe_reset(
+            self._root.set("action", action)
+        )
         after = step["next"]
         reward, terminated, truncated, done = (
             after[key].flatten().numpy().copy()

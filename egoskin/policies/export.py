@@ -103,6 +103,7 @@ def metadata(policy: Policy, commit: str | None) -> dict[str, Any]:
         # q* = default_joint_pos + action_scale x action
         "action_scale": (config.task.action_scale * robot.torque_limit / kp).tolist(),
         "history": config.history,
+        "previous_action": config.previous_action,
         "observation": observation_parts(policy),
         "sensor": to_plain(config.sensor),
         # Of each sensor in the order of the skin: numbers it has in the signal.
