@@ -17,10 +17,10 @@ class Controller:
     """Runs an exported policy, one call of `step` for each control step.
 
     It stops, and stays stopped, when the body's state or the skin's distances are too
-    old, when state or action are not finite, or when too many distances are missing; a
-    missing one reads as nothing. `stopped` says why (None while it runs); the last target
-    is then given again, and what the motors do (damp, say) is for the driver to decide.
-    `metadata` is what the file says of robot, skin and policy.
+    old, when state or action are not finite, or when too many distances are missing (a
+    missing one reads as nothing). `stopped` then says why, and the last target is given
+    again: what the motors do (damp, say) is for the driver to decide. `metadata` is all
+    that the file says of robot, skin and policy.
 
     Args:
         path: The exported policy.
