@@ -190,10 +190,9 @@ class DodgeballVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         ValueError: If they make no environment.
     """
 
-    metadata = {  # noqa: RUF012 (Gymnasium's)
-        "render_modes": [],
-        "autoreset_mode": AutoresetMode.SAME_STEP,
-    }
+    # TorchRL asks for the attribute, Gymnasium for the metadata.
+    autoreset_mode = AutoresetMode.SAME_STEP
+    metadata = {"render_modes": [], "autoreset_mode": autoreset_mode}  # noqa: RUF012
 
     def __init__(
         self, num_envs: int = 1, num_workers: int | None = None, **settings: Any
