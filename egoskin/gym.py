@@ -15,7 +15,7 @@ exported policy (`egoskin.policies.export`); seeds are those of `egoskin.make_en
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium
 import numpy as np
@@ -25,7 +25,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded
+from torchrl.data import Bounded, TensorSpec
 
 from egoskin.make import EnvConfig, check_num_workers, make_env, make_worker_env
 from egoskin.parallel import WorkerPool
@@ -67,18 +67,12 @@ class _Rows:
         self.config = config = _config(settings)
         self.skin = config.skin.build(config.robot_config)
         one = make_worker_env(config, self.skin, num_envs=1, seed=0)
-        low, high = [], []
-        for key in config.actor_keys:
-            spec = one.observation_spec[key]
-            size = spec.shape[-1]
-            bounded = isinstance(spec, Bounded)
-            low += [
-                spec.space.low.flatten() if bounded else torch.full((size,), -torch.inf)
-            ]
-            high += [
-                spec.space.high.flatten() if bounded else torch.full((size,), torch.inf)
-            ]
-        self.observation_space = Box(torch.cat(low).numpy(), torch.cat(high).numpy())
+        specs = [one.observation_spec[key] for key in config.actor_keys]
+        low, high = (
+            np.concatenate([_bound(spec, side) for spec in specs])
+            for side in ("low", "high")
+        )
+        self.observation_space = Box(low, high)
         robot, task = config.robot_config, config.task
         kp, _ = robot.joint_gains(task.physics.gains)
         # Farther out, a joint in its range gets its full torque all the same.
@@ -94,14 +88,29 @@ class _Rows:
 
     def info(self, td: TensorDictBase) -> dict[str, np.ndarray]:
         """Return what else is told of all rows, ``[B, ...]`` each."""
-        flags = {key: _rows(td[key])[:, 0].numpy().copy() for key in _FLAGS}
+        flags = {key: _column(td, key) for key in _FLAGS}
         told = _rows(td["privileged_observation"])
         return {**flags, "privileged_observation": told.numpy().copy()}
+
+
+def _bound(spec: TensorSpec, side: Literal["low", "high"]) -> np.ndarray:
+    """Return the lower or upper bound of one row of features, ``[F]``."""
+    if isinstance(spec, Bounded):
+        return getattr(spec.space, side).flatten().numpy()
+    infinite = -np.inf if side == "low" else np.inf
+    return np.full(spec.shape[-1], infinite, dtype=np.float32)
 
 
 def _rows(value: Tensor) -> Tensor:
     """Return ``[*B, F]`` as ``[B, F]``."""
     return value.reshape(-1, value.shape[-1])
+
+
+def _column(td: TensorDictBase, key: str) -> np.ndarray:
+    """Return an entry of one number for each row, ``[B]``; nobody else's."""
+    value = td[key]
+    assert isinstance(value, Tensor)
+    return value.flatten().numpy().copy()
 
 
 class DodgeballGym(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -239,10 +248,12 @@ class DodgeballVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             self._root.set("action", action)
         )
         after = step["next"]
-        reward, terminated, truncated, done = (
-            after[key].flatten().numpy().copy()
-            for key in ("reward", "terminated", "truncated", "done")
+        assert isinstance(after, TensorDictBase)
+        terminated, truncated = (
+            _column(after, "terminated"),
+            _column(after, "truncated"),
         )
+        done = terminated | truncated
         infos = self._info(self._root)
         if done.any():
             final = np.full(self.num_envs, None, dtype=object)
@@ -253,7 +264,7 @@ class DodgeballVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             infos["final_info"], infos["_final_info"] = self._info(after, done), done
         return (
             self._rows.observations(self._root),
-            reward.astype(np.float64),
+            _column(after, "reward").astype(np.float64),
             terminated,
             truncated,
             infos,

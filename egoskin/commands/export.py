@@ -44,7 +44,8 @@ def main(args: list[str]) -> None:
     config = tyro.cli(ExportConfig, args=args)
     policy = load_policy(config.policy)
     git = git_state(Path(egoskin.policies.export.__file__))
-    content, difference = export_onnx(policy, git and git["commit"])
+    commit = None if git is None else git["commit"]
+    content, difference = export_onnx(policy, commit)
     write_file(config.out, content)
     parts = observation_parts(policy)
     width = sum(part["width"] for part in parts)

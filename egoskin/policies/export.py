@@ -52,7 +52,7 @@ def observation_parts(policy: Policy) -> list[dict[str, Any]]:
     if config.previous_action:
         body.append(("previous_action", joints, "1"))
     blocks = [body]
-    if "signal" in policy.in_keys:
+    if "signal" in config.actor_keys:
         width = policy.policy_spec.sizes["signal"] // config.history
         metric = config.sensor.signal == "localization"
         unit = "m" if metric else "1"
@@ -125,7 +125,7 @@ def to_onnx(policy: Policy, commit: str | None = None) -> onnx.ModelProto:
 
     body, sizes = policy.head.body, policy.policy_spec.sizes
     shift, scale, limit = [], [], []
-    for key in policy.in_keys:
+    for key in policy.env_config.actor_keys:
         one = torch.ones(sizes[key])
         if key in policy.norms:
             norm = policy.norms[key]
@@ -208,9 +208,9 @@ def largest_difference(
             for row in observations.numpy()
         ]
     )
-    widths = [policy.policy_spec.sizes[key] for key in policy.in_keys]
-    parts = dict(zip(policy.in_keys, observations.split(widths, 1), strict=True))
-    expected = policy(**parts).numpy()
+    keys = policy.env_config.actor_keys
+    widths = [policy.policy_spec.sizes[key] for key in keys]
+    expected = policy(*observations.split(widths, 1)).numpy()
     size = np.abs(expected).max(1, initial=1.0)
     return float((np.abs(found - expected).max(1) / size).max())
 
