@@ -83,14 +83,14 @@ class _Rows:
 
     def observations(self, td: TensorDictBase) -> np.ndarray:
         """Return the observations of all rows, ``[B, N]``; nobody else's."""
-        parts = [_rows(td[key]) for key in self.config.actor_keys]
-        return torch.cat(parts, -1).numpy()
+        parts = [_rows(td, key) for key in self.config.actor_keys]
+        return np.concatenate(parts, -1)
 
     def info(self, td: TensorDictBase) -> dict[str, np.ndarray]:
         """Return what else is told of all rows, ``[B, ...]`` each."""
         flags = {key: _column(td, key) for key in _FLAGS}
-        told = _rows(td["privileged_observation"])
-        return {**flags, "privileged_observation": told.numpy().copy()}
+        told = "privileged_observation"
+        return {**flags, told: _rows(td, told).copy()}
 
 
 def _bound(spec: TensorSpec, side: Literal["low", "high"]) -> np.ndarray:
@@ -101,16 +101,16 @@ def _bound(spec: TensorSpec, side: Literal["low", "high"]) -> np.ndarray:
     return np.full(spec.shape[-1], infinite, dtype=np.float32)
 
 
-def _rows(value: Tensor) -> Tensor:
-    """Return ``[*B, F]`` as ``[B, F]``."""
-    return value.reshape(-1, value.shape[-1])
+def _rows(td: TensorDictBase, key: str) -> np.ndarray:
+    """Return an entry with all batch dimensions made one, ``[B, F]``."""
+    value = td[key]
+    assert isinstance(value, Tensor)
+    return value.reshape(-1, value.shape[-1]).numpy()
 
 
 def _column(td: TensorDictBase, key: str) -> np.ndarray:
     """Return an entry of one number for each row, ``[B]``; nobody else's."""
-    value = td[key]
-    assert isinstance(value, Tensor)
-    return value.flatten().numpy().copy()
+    return _rows(td, key)[:, 0].copy()
 
 
 class DodgeballGym(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -139,6 +139,8 @@ class DodgeballGym(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def __init__(self, **settings: Any) -> None:
         self._rows = _Rows(settings)
+        self.config = self._rows.config
+        """What it is made of."""
         self.observation_space = self._rows.observation_space
         self.action_space = self._rows.action_space
         self._env: Any = None
@@ -155,7 +157,7 @@ class DodgeballGym(gymnasium.Env[np.ndarray, np.ndarray]):
         super().reset(seed=seed)
         if seed is not None or self._env is None:
             seed = _seed(seed, self.np_random)
-            config, skin = self._rows.config, self._rows.skin
+            config, skin = self.config, self._rows.skin
             self._env = make_worker_env(config, skin, num_envs=1, seed=seed)
         self._root = self._env.reset()
         return self._rows.observations(self._root)[0], self._info(self._root)
@@ -209,6 +211,8 @@ class DodgeballVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.num_envs = num_envs
         self._num_workers = check_num_workers(num_envs, num_workers)
         self._rows = _Rows(settings)
+        self.config = self._rows.config
+        """What it is made of."""
         self.single_observation_space = self._rows.observation_space
         self.single_action_space = self._rows.action_space
         self.observation_space = batch_space(self._rows.observation_space, num_envs)
@@ -228,7 +232,7 @@ class DodgeballVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         if seed is not None or self._env is None:
             self.close_extras()
             self._env = make_env(
-                self._rows.config,
+                self.config,
                 self._rows.skin,
                 num_envs=self.num_envs,
                 seed=_seed(seed, self.np_random),
