@@ -35,7 +35,7 @@ def prepare(policy: str, out: Path, episodes: int, throw_set: int) -> None:
     from egoskin.envs.physics.contract import Scene
     from egoskin.envs.physics.mujoco import build_scene
     from egoskin.envs.throws import Thrower
-    from egoskin.evaluation.throw_set import evaluate, standard_task, throw_seed
+    from egoskin.evaluation.throw_set import play_throws, standard_task, throw_seed
     from egoskin.make import make_worker_env
     from egoskin.policies.export import export_onnx
     from egoskin.policies.policy import load_policy
@@ -58,9 +58,9 @@ def prepare(policy: str, out: Path, episodes: int, throw_set: int) -> None:
     row, throw = torch.arange(episodes).repeat_interleave(number), torch.arange(number)
     thrower = Thrower(throws, robot, physics.timestep)
     draw = thrower.draw(seed, row, torch.zeros_like(row), throw.repeat(episodes))
-    success = evaluate(
-        loaded, config, skin, throw_set=throw_set, episodes=episodes
-    ).success.mean
+    played = play_throws(loaded, config, skin, throw_set=throw_set, episodes=episodes)
+    lasting = played.steps > round(task.success_s * physics.control_hz)
+    success = float(lasting.double().mean())
     shape = (episodes, number)
     np.savez(
         out / THROWS,
