@@ -180,9 +180,9 @@ class Robot:
         mujoco.mj_kinematics(self.model, self.data)
 
 
-def run(folder: Path, episodes: int | None) -> None:
+def run(folder: Path, episodes: int | None, margin: float) -> None:
     """Play the throws that `prepare` wrote, and say how many are survived."""
-    controller = Controller(folder / POLICY)
+    controller = Controller(folder / POLICY, margin=margin)
     hz = controller.metadata["control_hz"]
     model = mujoco.MjModel.from_binary_path(str(folder / MODEL))
     robot, throws = Robot(model, controller.metadata), dict(np.load(folder / THROWS))
@@ -228,6 +228,9 @@ def main() -> None:
     second = commands.add_parser("run", help="play the throws, without PyTorch")
     second.add_argument("folder", type=Path, help="what `prepare` wrote")
     second.add_argument("--episodes", type=int, help="how many of them")
+    second.add_argument(
+        "--margin", type=float, default=1.0, help="how far targets may be out of range"
+    )
     args = vars(parser.parse_args())
     {"prepare": prepare, "run": run}[args.pop("command")](**args)
 

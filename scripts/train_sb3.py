@@ -91,10 +91,15 @@ class Until(BaseCallback):
 
     def __init__(self, seconds: float) -> None:
         super().__init__()
-        self._end = time.monotonic() + seconds
+        self._seconds = seconds
+
+    def _on_training_start(self) -> None:
+        # The processes run by now.
+        self._begin = time.monotonic()
 
     def _on_step(self) -> bool:
-        return time.monotonic() < self._end
+        self.spent = time.monotonic() - self._begin
+        return self.spent < self._seconds
 
 
 def main(args: Sequence[str] | None = None) -> PPO:
@@ -114,12 +119,12 @@ def main(args: Sequence[str] | None = None) -> PPO:
         seed=0,
         device="cpu",
     )
-    begin = time.monotonic()
+    until = Until(options.seconds)
     try:
-        model.learn(10**9, callback=Until(options.seconds))
+        model.learn(10**9, callback=until)
     finally:
         envs.close()
-    speed = model.num_timesteps / (time.monotonic() - begin)
+    speed = model.num_timesteps / until.spent
     lengths = [episode["l"] for episode in model.ep_info_buffer or ()]
     print(
         f"{model.num_timesteps:,} environment steps, {speed:,.0f} each second; "
