@@ -245,7 +245,8 @@ class DodgeballVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Return observations, rewards, terminations, truncations and infos."""
-        assert self._env is not None, "call reset first"
+        if self._env is None:
+            raise gymnasium.error.ResetNeeded("call reset before step")
         shape = (*self._root.batch_size, -1)
         action = torch.as_tensor(actions, dtype=torch.float32).reshape(shape)
         step, self._root = self._env.step_and_maybe_reset(
