@@ -238,6 +238,7 @@ print(sorted(name for name in sys.modules if name.startswith("egoskin")))
 DRAWN = ("azimuth", "distance", "height", "speed", "interval", "aim_link", "aim_point")
 
 
+@pytest.mark.slow
 def test_the_examples_robot_moves_and_feels_as_our_environments(tmp_path):
     example = SimpleNamespace(**runpy.run_path(str(SCRIPTS / "deploy_mujoco.py")))
     example.prepare("field_proximity", tmp_path, 4, 0)

@@ -81,7 +81,9 @@ def test_actions_are_bounded_where_more_asks_for_no_more_torque(robot):
         np.testing.assert_allclose(torque, -sign * robot.torque_limit, 1e-5)
 
 
-@pytest.mark.parametrize("form", ["binary, history", "real sensors"])
+@pytest.mark.parametrize(
+    "form", ["binary, history", pytest.param("real sensors", marks=pytest.mark.slow)]
+)
 def test_one_robot_gives_the_bits_of_our_environment(form):
     env = gymnasium.make(ENV_ID, **{**SOON, **FORMS[form]})
     config = env.unwrapped.config
