@@ -37,6 +37,8 @@ ROOMS = {
     "policies": {"storage", "sensors", "agents", "make"},
     "evaluation": {"robots", "transform", "envs", "sensors", "policies", "make"},
     "runs": {"storage", "envs", "sensors", "agents", "make", "policies"},
+    "gym": {"storage", "make"},
+    "deploy": set(),
     "viewer": {"storage", "robots", "sensors", "make", "evaluation"},
 }
 # All but the public face: nothing imports what the command line does.

@@ -36,9 +36,13 @@ class RunningNorm(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Return (x - mean) / std, times the gain and cut off, ``[*B, F]``."""
-        shift = self.mean.to(x.dtype)
-        scale = (self._gain * (self.var + 1e-8).rsqrt()).to(x.dtype)
-        return ((x - shift) * scale).clamp(-self._limit, self._limit)
+        shift, scale, limit = self.constants(x.dtype)
+        return ((x - shift) * scale).clamp(-limit, limit)
+
+    def constants(self, dtype: torch.dtype) -> tuple[Tensor, Tensor, float]:
+        """Return shift and scale, ``[F]`` or ``[1]`` each, and limit of `forward`."""
+        scale = self._gain * (self.var + 1e-8).rsqrt()
+        return self.mean.to(dtype), scale.to(dtype), self._limit
 
     @torch.no_grad()
     def update(self, x: Tensor) -> None:

@@ -26,6 +26,7 @@ COMMANDS = {
     "upper-bound": "search what the body could still do when a ball is in reach",
     "replay": "replay an update that was not finite",
     "study": "plan, run and report many trainings",
+    "export": "write a policy as ONNX, for a robot without PyTorch",
     "verify": "check that training is exact on this machine",
     "bench": "measure speed and accuracy",
 }

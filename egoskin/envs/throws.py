@@ -175,6 +175,18 @@ class Thrower:
         kinematics, link, _ = self._aim_points
         return [kinematics.links[i] for i in link[self._point_index(draw)].tolist()]
 
+    def aim_point(self, draw: Draw) -> Tensor:
+        """Return where on its link each throw is aimed at (unless at a box).
+
+        Args:
+            draw: Draws of ``n`` throws.
+
+        Returns:
+            The points in the frames of their links [m], ``[n, 3]``.
+        """
+        _, _, local = self._aim_points
+        return local[self._point_index(draw)]
+
     def at_standing_robot(self, draw: Draw) -> tuple[Tensor, Tensor]:
         """Return how throws arrive at the robot standing in its default pose.
 

@@ -293,10 +293,12 @@ class Policy(TensorDictModuleBase):
         super().__init__()
         self.policy_spec = policy_spec
         self.in_keys, self.out_keys = agent.actor_keys, ["action"]
-        self._head = agent.head.requires_grad_(False)
-        self._norms = nn.ModuleDict(
+        self.head = agent.head.requires_grad_(False)
+        """Network of the action."""
+        self.norms = nn.ModuleDict(
             {key: agent.norms[key] for key in agent.actor_keys if key in agent.norms}
         )
+        """Normaliser of each of ``in_keys`` that has one."""
 
     @property
     def env_config(self) -> EnvConfig:
@@ -311,7 +313,7 @@ class Policy(TensorDictModuleBase):
     @property
     def spec(self) -> Composite:
         """TorchRL's spec of what it writes."""
-        weight = self._head.log_std
+        weight = self.head.log_std
         return Composite(
             action=Unbounded(weight.shape, device=weight.device, dtype=weight.dtype)
         )
@@ -345,9 +347,9 @@ class Policy(TensorDictModuleBase):
                     f"{list(value.shape)}: is it the environment of "
                     "make_env(policy.env_config, policy.skin)?"
                 )
-            value = value.to(self._head.log_std.dtype)
-            inputs.append(self._norms[key](value) if key in self._norms else value)
-        return self._head(*inputs)[0]
+            value = value.to(self.head.log_std.dtype)
+            inputs.append(self.norms[key](value) if key in self.norms else value)
+        return self.head(*inputs)[0]
 
 
 def shipped_policies() -> list[str]:

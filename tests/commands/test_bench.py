@@ -63,3 +63,17 @@ def test_bench_accuracy_compares_two_rates(tmp_path: Path):
     # Standing shows the same forces; the ball is met within a control step.
     assert by_name["stand_floor_force"]["ratio"] < 0.01
     assert 0 < by_name["impact_time"]["ratio"] < 1
+
+
+@pytest.mark.slow
+def test_bench_gymnasium_compares_its_forms_with_our_own(tmp_path: Path):
+    args = ("--num-envs", "4", "--num-workers", "2", "--steps", "3", "--rounds", "1")
+    succeed("bench", "gymnasium", *args, "--json", tmp_path / "rows.json")
+    rows = json.loads((tmp_path / "rows.json").read_text())["rows"]
+    assert [row["name"] for row in rows] == [
+        "torchrl",
+        "gymnasium_vector",
+        "gymnasium_single",
+    ]
+    assert rows[0]["ratio"] == 1
+    assert all(row["value"] > 0 for row in rows)

@@ -22,7 +22,8 @@ from egoskin.commands.train import main as train
 
 ROOT = SCRIPTS.parent
 # Scripts that do what no installed package needs, and examples to be read.
-OWN = {"fit_shell", "reuse_gymnasium", "reuse_recording", "reuse_urdf_arm"}
+OWN = {"fit_shell", "deploy_mujoco", "reuse_gymnasium", "reuse_recording"}
+OWN |= {"reuse_urdf_arm", "train_sb3"}
 
 
 def egoskin(monkeypatch, *args: str) -> None:

@@ -5,12 +5,14 @@ egoskin bench sensors
 egoskin bench physics
 egoskin bench accuracy
 egoskin bench gradients --run runs/NAME
+egoskin bench gymnasium
 """
 
 from __future__ import annotations
 
 from egoskin.commands.bench.accuracy import AccuracyBench, accuracy_rows
 from egoskin.commands.bench.gradients import GradientBench, gradient_rows
+from egoskin.commands.bench.gymnasium import GymnasiumBench, gymnasium_rows
 from egoskin.commands.bench.loop import LoopConfig, loop
 from egoskin.commands.bench.physics import PhysicsBench, physics_rows
 from egoskin.commands.bench.report import report
@@ -27,6 +29,7 @@ def main(args: list[str]) -> None:
         "sensors": SensorBench,
         "accuracy": AccuracyBench,
         "gradients": GradientBench,
+        "gymnasium": GymnasiumBench,
     }
     config = parse_subcommand(benches, args)
     check_output(config.json, "--json")
@@ -38,6 +41,8 @@ def main(args: list[str]) -> None:
         rows = accuracy_rows(config)
     elif isinstance(config, GradientBench):
         rows = gradient_rows(config)
+    elif isinstance(config, GymnasiumBench):
+        rows = gymnasium_rows(config)
     else:
         rows = sensor_rows(config)
     report(rows, config.json)

@@ -1,0 +1,150 @@
+"""A policy on a robot: from joint states and raw distances to joint targets.
+
+Needs numpy and onnxruntime, and of this package this file alone; see docs/deploy.md.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime
+
+
+class Controller:
+    """Runs an exported policy, one call of `step` for each control step.
+
+    It stops, and stays stopped, when the body's state or the skin's distances are too
+    old, when state or action are not finite, or when too many distances are missing (a
+    missing one reads as nothing). `stopped` then says why, and the last target is given
+    again: what the motors do (damp, say) is for the driver to decide. `metadata` is all
+    that the file says of robot, skin and policy.
+
+    Args:
+        path: The exported policy.
+        max_age: Stop when states or distances are older than this [s].
+        max_missing: Stop when more than this share of the distances is missing.
+        margin: How far targets may lie outside the joints' ranges, in units of torque
+            limit / kp, the error that asks for the full torque: so policies ask for it.
+        max_change: How far targets move in a control step at most, in the same unit.
+
+    Raises:
+        ValueError: If the file is no exported policy, or reads what no skin tells.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        max_age: float = 0.1,
+        max_missing: float = 0.1,
+        margin: float = 1.0,
+        max_change: float = 2.0,
+    ) -> None:
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = 1
+        self._session = onnxruntime.InferenceSession(str(path), options)
+        text = self._session.get_modelmeta().custom_metadata_map.get("egoskin")
+        if text is None:
+            raise ValueError(f"{path} was not written by `egoskin export`")
+        self.metadata: dict[str, Any] = json.loads(text)
+        data, self._sensor = self.metadata, (sensor := self.metadata["sensor"])
+        if "oracle" in sensor.values() or "localization" in sensor.values():
+            raise ValueError(f"{path} reads where balls are, which needs a tracker")
+        self._default = np.array(data["default_joint_pos"])
+        self._scale = np.array(data["action_scale"])
+        self._range = np.repeat(np.array(data["range"], dtype=float), data["readings"])
+        unit = np.array(data["torque_limit"]) / np.array(data["kp"])
+        self._limits = data["joint_range"] + margin * np.outer([-1, 1], unit)
+        self._max_change = max_change * unit
+        self._max_age, self._max_missing = max_age, max_missing
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget what was, a stop as well: the next step begins an episode."""
+        self.stopped: str | None = None
+        self._action = np.zeros(len(self._default))
+        self._target: np.ndarray | None = None
+        self._history: list[list[np.ndarray]] = []
+
+    def stop(self, why: str) -> None:
+        """Stop until the next reset."""
+        self.stopped = self.stopped or why
+
+    def step(
+        self,
+        *,
+        base_quat: np.ndarray,
+        base_ang_vel_b: np.ndarray,
+        joint_pos: np.ndarray,
+        joint_vel: np.ndarray,
+        body_age: float,
+        distance: np.ndarray | None = None,
+        skin_age: float = 0.0,
+    ) -> np.ndarray:
+        """Return position targets of the joints [rad], ``[J]``, for the file's PD law.
+
+        Args:
+            base_quat: Orientation of the base (w, x, y, z); any heading, ``[4]``.
+            base_ang_vel_b: Angular velocity of the base in its frame [rad/s], ``[3]``.
+            joint_pos: Joint positions in the file's order [rad], ``[J]``.
+            joint_vel: Joint velocities [rad/s], ``[J]``.
+            body_age: How old these are [s].
+            distance: What the sensors measure [m], infinite for nothing, NaN where
+                missing: ``[S]``, or ``[S, K]`` for grids. A blind policy needs none.
+            skin_age: How old the distances are [s].
+        """
+        w, x, y, z = base_quat  # of the rotation R; gravity_b = R^T (0, 0, -1)
+        gravity_b = -2 * np.array([x * z - w * y, y * z + w * x, 0.5 - x * x - y * y])
+        deviation = np.asarray(joint_pos) - self._default
+        blocks = [np.concatenate((base_ang_vel_b, deviation, joint_vel, gravity_b))]
+        if not np.isfinite(blocks[0]).all():
+            self.stop("the state of the body is not finite")
+        if not body_age <= self._max_age:
+            self.stop(f"the state of the body is {body_age:.3g} s old")
+        if self.metadata["previous_action"]:
+            blocks[0] = np.concatenate((blocks[0], self._action))
+        if self._sensor["coverage"] != "none":
+            blocks.append(self._signal(distance))
+            if not skin_age <= self._max_age:
+                self.stop(f"the distances of the skin are {skin_age:.3g} s old")
+        last = self._target
+        if last is None:
+            last = self._default + np.nan_to_num(deviation)
+        self._target = last if self.stopped else self._next_target(blocks, last)
+        return self._target.copy()
+
+    def _signal(self, distance: np.ndarray | None) -> np.ndarray:
+        """Return the signal of distances."""
+        found = np.asarray(np.nan * self._range if distance is None else distance)
+        if self._sensor["reduce"] == "min" and found.ndim == 2:
+            found = np.fmin.reduce(found, 1)
+        missing = np.isnan(found).reshape(len(self._range))
+        if missing.mean() > self._max_missing:
+            self.stop(f"{missing.mean():.0%} of the skin is missing")
+        found = np.where(missing, np.inf, found.reshape(len(self._range)))
+        limit = np.minimum(self._range, np.finfo(float).max)
+        if self._sensor["signal"] == "binary":
+            return (found <= limit) * 1.0
+        # An infinite range has no scale: d reads d / (d + 1 m).
+        share = np.where(np.isinf(self._range), 1 - 1 / (1 + found), found / limit)
+        share = np.clip(share, 0, 1)
+        return 1 - share if self._sensor["signal"] == "closeness" else share
+
+    def _next_target(self, blocks: list[np.ndarray], last: np.ndarray) -> np.ndarray:
+        """Return the policy's target, within the limits."""
+        # An episode begins with its first observation throughout.
+        past = self._history or [blocks] * self.metadata["history"]
+        self._history = [*past[1:], blocks]
+        rows = [row for ages in zip(*self._history, strict=True) for row in ages]
+        observation = np.concatenate(rows).astype(np.float32)[None]
+        (output,) = self._session.run(["action"], {"observation": observation})
+        self._action = np.asarray(output)[0].astype(float)
+        if not np.isfinite(self._action).all():
+            self.stop("the policy's action is not finite")
+            return last
+        # q* = q_default + scale x action
+        target = np.clip(self._default + self._scale * self._action, *self._limits)
+        return last + np.clip(target - last, -self._max_change, self._max_change)

@@ -1,0 +1,307 @@
+"""The dodgeball task as Gymnasium environments, registered by importing this module.
+
+    import gymnasium
+    import egoskin.gym
+
+    env = gymnasium.make("egoskin/Dodgeball-v0", sensor={"signal": "binary"})
+    envs = gymnasium.make_vec("egoskin/Dodgeball-v0", num_envs=1024)
+
+Where no line may be added, the name ``egoskin.gym:egoskin/Dodgeball-v0`` imports it.
+
+Contract: an observation is what the actor reads, one part after the other, as in an
+exported policy (`egoskin.policies.export`); seeds are those of `egoskin.make_env`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, Literal
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import Bounded, TensorSpec
+
+from egoskin.make import EnvConfig, check_num_workers, make_env, make_worker_env
+from egoskin.parallel import WorkerPool
+from egoskin.rng import check_seed
+from egoskin.storage.serialization import from_plain, to_plain
+
+ENV_ID = "egoskin/Dodgeball-v0"
+"""Name of the environment."""
+# What an info tells, beside the privileged observation.
+_FLAGS = ("hit", "fallen", "diverged")
+
+
+def _config(settings: dict[str, Any]) -> EnvConfig:
+    """Return the configuration of keyword arguments: dataclasses, or dictionaries.
+
+    Raises:
+        TypeError: If it has no such field.
+        ValueError: If a value is none.
+    """
+    fields = {field.name for field in dataclasses.fields(EnvConfig)}
+    for name in settings.keys() - fields:
+        # Gymnasium's wrappers try arguments, and look for these words.
+        raise TypeError(
+            f"{ENV_ID} got an unexpected keyword argument {name!r}; it takes the "
+            f"fields of EnvConfig: {', '.join(sorted(fields))}"
+        )
+    plain = {name: to_plain(value) for name, value in settings.items()}
+    return from_plain(EnvConfig, plain, ENV_ID)
+
+
+class _Rows:
+    """What both forms share: spaces, and arrays of what the task tells.
+
+    Args:
+        settings: Fields of `EnvConfig`.
+    """
+
+    def __init__(self, settings: dict[str, Any]) -> None:
+        self.config = config = _config(settings)
+        self.skin = config.skin.build(config.robot_config)
+        one = make_worker_env(config, self.skin, num_envs=1, seed=0)
+        specs = [one.observation_spec[key] for key in config.actor_keys]
+        low, high = (
+            np.concatenate([_bound(spec, side) for spec in specs])
+            for side in ("low", "high")
+        )
+        self.observation_space = Box(low, high)
+        robot, task = config.robot_config, config.task
+        kp, _ = robot.joint_gains(task.physics.gains)
+        # Farther out, a joint in its range gets its full torque all the same.
+        reach = robot.torque_limit / kp
+        bounds = robot.joint_range + np.array([[-1], [1]]) * reach
+        bounds = (bounds - robot.default_joint_pos) / (task.action_scale * reach)
+        self.action_space = Box(*bounds.astype(np.float32))
+
+    def observations(self, td: TensorDictBase) -> np.ndarray:
+        """Return the observations of all rows, ``[B, N]``; nobody else's."""
+        parts = [_rows(td, key) for key in self.config.actor_keys]
+        return np.concatenate(parts, -1)
+
+    def info(self, td: TensorDictBase) -> dict[str, np.ndarray]:
+        """Return what else is told of all rows, ``[B, ...]`` each."""
+        flags = {key: _column(td, key) for key in _FLAGS}
+        told = "privileged_observation"
+        return {**flags, told: _rows(td, told).copy()}
+
+
+def _bound(spec: TensorSpec, side: Literal["low", "high"]) -> np.ndarray:
+    """Return the lower or upper bound of one row of features, ``[F]``."""
+    if isinstance(spec, Bounded):
+        return getattr(spec.space, side).flatten().numpy()
+    infinite = -np.inf if side == "low" else np.inf
+    return np.full(spec.shape[-1], infinite, dtype=np.float32)
+
+
+def _rows(td: TensorDictBase, key: str) -> np.ndarray:
+    """Return an entry with all batch dimensions made one, ``[B, F]``."""
+    value = td[key]
+    assert isinstance(value, Tensor)
+    return value.reshape(-1, value.shape[-1]).numpy()
+
+
+def _column(td: TensorDictBase, key: str) -> np.ndarray:
+    """Return an entry of one number for each row, ``[B]``; nobody else's."""
+    return _rows(td, key)[:, 0].copy()
+
+
+class DodgeballGym(gymnasium.Env[np.ndarray, np.ndarray]):
+    """One robot that must not be hit by thrown balls.
+
+    **Action** ``[J]``: position targets q* = q_default + scale x action, as in
+    `egoskin.envs.dodgeball.DodgeballEnv`; bounded where more asks for no more torque.
+
+    **Observation** ``[N]``: what the actor reads, ``observation`` and ``signal``.
+
+    **Info**: ``hit``, ``fallen``, ``diverged``: how the episode ended;
+    ``privileged_observation``: what the critic may be told in training
+    (`egoskin.envs.observations.Privileged`).
+
+    Reward, start and end are `DodgeballEnv`'s.
+
+    Args:
+        settings: Fields of `egoskin.EnvConfig`, as its dataclasses or as dictionaries.
+
+    Raises:
+        TypeError: If it has no such field.
+        ValueError: If they make no environment.
+    """
+
+    metadata = {"render_modes": []}  # noqa: RUF012 (Gymnasium's)
+
+    def __init__(self, **settings: Any) -> None:
+        self._rows = _Rows(settings)
+        self.config = self._rows.config
+        """What it is made of."""
+        self.observation_space = self._rows.observation_space
+        self.action_space = self._rows.action_space
+        self._env: Any = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Return the first observation of the next episode, and its info.
+
+        Args:
+            seed: Begin with the first episode of this seed, in [0, 2**32).
+            options: None are known.
+        """
+        super().reset(seed=seed)
+        if seed is not None or self._env is None:
+            seed = _seed(seed, self.np_random)
+            config, skin = self.config, self._rows.skin
+            self._env = make_worker_env(config, skin, num_envs=1, seed=seed)
+        self._root = self._env.reset()
+        return self._rows.observations(self._root)[0], self._info(self._root)
+
+    def step(
+        self, action: np.ndarray
+    ) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Return observation, reward, terminated, truncated and info."""
+        self._root["action"] = torch.as_tensor(action, dtype=torch.float32)[None]
+        step = self._env.step(self._root)
+        self._root, after = self._env.step_mdp(step), step["next"]
+        return (
+            self._rows.observations(after)[0],
+            float(after["reward"]),
+            bool(after["terminated"]),
+            bool(after["truncated"]),
+            self._info(after),
+        )
+
+    def _info(self, td: TensorDictBase) -> dict[str, Any]:
+        info = {key: value[0] for key, value in self._rows.info(td).items()}
+        return {**info, **{key: bool(info[key]) for key in _FLAGS}}
+
+
+class DodgeballVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+    """Robots that must not be hit by thrown balls, ``num_envs`` of them.
+
+    What each of them acts on and is told is `DodgeballGym`'s. An episode that ends is
+    followed by the next in the same step: its last observation and info are those of
+    ``final_obs`` and ``final_info``. The simulations run in processes, so call it under
+    ``if __name__ == "__main__":``.
+
+    Args:
+        num_envs: Number of robots.
+        num_workers: Processes; by default the largest divisor of ``num_envs`` not
+            above the cores. No result depends on it.
+        settings: Fields of `egoskin.EnvConfig`, as its dataclasses or as dictionaries.
+
+    Raises:
+        TypeError: If it has no such field.
+        ValueError: If they make no environment.
+    """
+
+    # TorchRL asks for the attribute, Gymnasium for the metadata.
+    autoreset_mode = AutoresetMode.SAME_STEP
+    metadata = {"render_modes": [], "autoreset_mode": autoreset_mode}  # noqa: RUF012
+
+    def __init__(
+        self, num_envs: int = 1, num_workers: int | None = None, **settings: Any
+    ) -> None:
+        self.num_envs = num_envs
+        self._num_workers = check_num_workers(num_envs, num_workers)
+        self._rows = _Rows(settings)
+        self.config = self._rows.config
+        """What it is made of."""
+        self.single_observation_space = self._rows.observation_space
+        self.single_action_space = self._rows.action_space
+        self.observation_space = batch_space(self._rows.observation_space, num_envs)
+        self.action_space = batch_space(self._rows.action_space, num_envs)
+        self._env: WorkerPool | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Return the first observations, ``[num_envs, N]``, and their infos.
+
+        Args:
+            seed: Begin with the first episodes of this seed, in [0, 2**32).
+            options: None are known.
+        """
+        super().reset(seed=seed)
+        if seed is not None or self._env is None:
+            self.close_extras()
+            self._env = make_env(
+                self.config,
+                self._rows.skin,
+                num_envs=self.num_envs,
+                seed=_seed(seed, self.np_random),
+                num_workers=self._num_workers,
+            )
+        self._root = self._env.reset()
+        return self._rows.observations(self._root), self._info(self._root)
+
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Return observations, rewards, terminations, truncations and infos."""
+        if self._env is None:
+            raise gymnasium.error.ResetNeeded("call reset before step")
+        shape = (*self._root.batch_size, -1)
+        action = torch.as_tensor(actions, dtype=torch.float32).reshape(shape)
+        step, self._root = self._env.step_and_maybe_reset(
+            self._root.set("action", action)
+        )
+        after = step["next"]
+        assert isinstance(after, TensorDictBase)
+        terminated, truncated = (
+            _column(after, "terminated"),
+            _column(after, "truncated"),
+        )
+        done = terminated | truncated
+        infos = self._info(self._root)
+        if done.any():
+            final = np.full(self.num_envs, None, dtype=object)
+            observations = self._rows.observations(after)
+            for row in done.nonzero()[0]:
+                final[row] = observations[row]
+            infos["final_obs"], infos["_final_obs"] = final, done
+            infos["final_info"], infos["_final_info"] = self._info(after, done), done
+        return (
+            self._rows.observations(self._root),
+            _column(after, "reward").astype(np.float64),
+            terminated,
+            truncated,
+            infos,
+        )
+
+    def _info(
+        self, td: TensorDictBase, which: np.ndarray | None = None
+    ) -> dict[str, Any]:
+        """Return the infos of some robots as Gymnasium has them, by default of all."""
+        which = np.ones(self.num_envs, dtype=bool) if which is None else which
+        infos: dict[str, Any] = {}
+        for key, value in self._rows.info(td).items():
+            value[~which] = 0
+            infos[key], infos[f"_{key}"] = value, which.copy()
+        return infos
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """End the processes."""
+        if self._env is not None:
+            self._env.close()
+
+
+def _seed(seed: int | None, generator: np.random.Generator) -> int:
+    """Return a seed of the task's draws, from Gymnasium's."""
+    if seed is None:
+        return int(generator.integers(2**32))
+    check_seed(seed)
+    return seed
+
+
+gymnasium.register(
+    id=ENV_ID,
+    entry_point="egoskin.gym:DodgeballGym",
+    vector_entry_point="egoskin.gym:DodgeballVector",
+)

@@ -1,0 +1,37 @@
+"""Policies that nobody trained, for tests of what every policy can do."""
+
+from __future__ import annotations
+
+import torch
+
+from egoskin.agents.networks import Agent, NetworkConfig
+from egoskin.make import EnvConfig, make_worker_env
+from egoskin.policies.policy import Policy, PolicySpec, sparse_sources
+
+
+def make_agent(
+    config: EnvConfig, network: NetworkConfig, seed: int = 0
+) -> tuple[Agent, PolicySpec]:
+    """Return an agent for an environment, its weights and statistics at random."""
+    skin = config.skin.build(config.robot_config)
+    env = make_worker_env(config, skin, num_envs=1, seed=0)
+    sources = sparse_sources(config, skin)
+    spec = PolicySpec.of(config, skin, network, env, sources)
+    agent = spec.build_agent(sources)
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for weight in agent.parameters():
+            noise = torch.randn(weight.shape, generator=generator)
+            # As many inputs as there are, the sum is as large.
+            weight += noise / max(weight.shape[-1], 1) ** 0.5
+    for norm in agent.norms.values():
+        norm.mean += torch.randn(norm.mean.shape, generator=generator)
+        norm.var *= 0.1 + torch.rand(norm.var.shape, generator=generator)
+    return agent, spec
+
+
+def make_policy(
+    config: EnvConfig, network: NetworkConfig | None = None, seed: int = 0
+) -> Policy:
+    """Return a policy for an environment, its weights and statistics at random."""
+    return Policy(*make_agent(config, network or NetworkConfig(), seed))

@@ -1,0 +1,213 @@
+"""Exported policies against PyTorch, and what they say of the robot against MuJoCo."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+
+import egoskin
+from calling import fail, succeed
+from egoskin.agents.networks import NetworkConfig, input_keys
+from egoskin.envs.physics.contract import Scene
+from egoskin.envs.physics.mujoco import build_scene
+from egoskin.make import EnvConfig, make_worker_env
+from egoskin.policies.export import (
+    METADATA,
+    export_onnx,
+    largest_difference,
+    observation_parts,
+    sample_observations,
+    to_onnx,
+)
+from egoskin.policies.policy import Policy, shipped_policies
+from egoskin.sensors.config import SensorConfig, SkinConfig
+from making import make_agent, make_policy
+
+FEW = SkinConfig(num_sensors=5)
+MADE = {
+    "history": EnvConfig(history=4, previous_action=True),
+    "grid": EnvConfig(sensor=SensorConfig(coverage="ray")),
+    "closest beams": EnvConfig(sensor=SensorConfig(coverage="ray", reduce="min")),
+    "history of a grid": EnvConfig(
+        skin=FEW, sensor=SensorConfig(coverage="ray"), history=2
+    ),
+    "closeness": EnvConfig(sensor=SensorConfig(signal="closeness", range=torch.inf)),
+    "oracle": EnvConfig(sensor=SensorConfig(coverage="oracle")),
+}
+
+
+def run(content: bytes, observations: np.ndarray) -> np.ndarray:
+    """Actions of an exported policy, ``[n, J]``."""
+    session = onnxruntime.InferenceSession(content)
+    return np.concatenate(
+        [
+            session.run(["action"], {"observation": row[None]})[0]
+            for row in observations.astype(np.float32)
+        ]
+    )
+
+
+def act(policy: Policy, observations: np.ndarray) -> np.ndarray:
+    """The policy's own actions, ``[n, J]``."""
+    widths = [policy.policy_spec.sizes[key] for key in policy.in_keys]
+    parts = torch.from_numpy(observations).float().split(widths, 1)
+    return policy(*parts).numpy()
+
+
+def assert_alike(policy: Policy) -> None:
+    content, difference = export_onnx(policy)
+    assert difference < 1e-5
+    size = sum(policy.policy_spec.sizes[key] for key in policy.in_keys)
+    rng = np.random.default_rng(0)
+    # Ordinary ones, and every input at once as far out as the normalisation lets it.
+    for scale in (0.1, 1.0, 10.0, 1e6):
+        given = scale * rng.choice([-1.0, 1.0], (20, size))
+        given *= rng.random((20, size)) if scale < 1e6 else 1.0
+        if "signal" in policy.in_keys:
+            width = policy.policy_spec.sizes["signal"]
+            given[:, -width:] = rng.integers(0, 2, (20, width))
+        found, expected = run(content, given), act(policy, given)
+        size_of = np.maximum(1.0, np.abs(expected).max(1, keepdims=True))
+        assert (np.abs(found - expected) <= 1e-5 * size_of).all()
+
+
+@pytest.mark.parametrize("name", shipped_policies())
+def test_a_trained_policy_acts_in_onnxruntime_as_in_pytorch(name):
+    assert_alike(egoskin.load_policy(name))
+
+
+@pytest.mark.parametrize("normalize", ["all", "body"])
+@pytest.mark.parametrize("kind", MADE)
+def test_any_policy_acts_in_onnxruntime_as_in_pytorch(kind, normalize):
+    network = NetworkConfig(hidden=(16, 24, 8), normalize=normalize)
+    assert_alike(make_policy(MADE[kind], network))
+
+
+def test_a_sparse_first_layer_is_exported_dense():
+    # What the agent computes from a dozen of 4,096 beams, in training.
+    config = MADE["grid"]
+    agent, spec = make_agent(config, NetworkConfig())
+    content, _ = export_onnx(Policy(agent, spec))
+    shared: dict[str, Any] = {"num_envs": 8, "seed": 0}
+    dense, sparse = (
+        make_worker_env(config, spec.skin, sparse=sparse, **shared)
+        for sparse in (False, True)
+    )
+    zero = torch.zeros(8, spec.num_actions)
+    one, other = (
+        env.rollout(90, lambda td: td.set("action", zero), break_when_any_done=False)
+        for env in (dense, sparse)
+    )
+    seen = (one["signal"] < 1).any(-1)
+    assert seen.any()
+    one, other = one[seen], other[seen]
+    with torch.no_grad():
+        inputs = agent.encode(agent.sense(other))
+        keys = input_keys(agent.actor_keys)
+        mean, _ = agent.head(*(inputs[key] for key in keys))
+    given = torch.cat((one["observation"], one["signal"]), -1).numpy()
+    np.testing.assert_allclose(run(content, given), mean, 1e-5, 1e-5)
+
+
+def test_an_export_that_is_not_exact_is_refused(monkeypatch):
+    policy = egoskin.load_policy("blind")
+    content = to_onnx(policy).SerializeToString()
+    observations = sample_observations(policy, 10)
+    assert largest_difference(content, policy, observations) < 1e-5
+    policy.head.body.tail[-1].bias.data += 1e-3
+    assert largest_difference(content, policy, observations) > 1e-5
+    monkeypatch.setattr("egoskin.policies.export.largest_difference", lambda *_: 2e-5)
+    with pytest.raises(ValueError, match=r"differs from PyTorch by 2\.0e-05"):
+        export_onnx(policy)
+
+
+def test_an_old_runtime_on_a_robot_reads_the_file():
+    model = to_onnx(egoskin.load_policy("field_binary"))
+    # https://onnxruntime.ai/docs/reference/compatibility.html: from version 1.6 on.
+    assert [x.version for x in model.opset_import] == [13]
+    assert model.ir_version == 7
+    (given,), (action,) = model.graph.input, model.graph.output
+    for value, shape in ((given, [1, 112]), (action, [1, 21])):
+        dims = value.type.tensor_type.shape.dim
+        assert [d.dim_value for d in dims] == shape
+        assert value.type.tensor_type.elem_type == onnx.TensorProto.FLOAT
+
+
+def told(policy: Policy, **kwargs: Any) -> dict[str, Any]:
+    """The metadata as a robot reads them."""
+    session = onnxruntime.InferenceSession(export_onnx(policy, **kwargs)[0])
+    return json.loads(session.get_modelmeta().custom_metadata_map[METADATA])
+
+
+def test_the_metadata_say_what_the_simulated_robot_is():
+    policy = egoskin.load_policy("field_proximity")
+    data = told(policy, commit="abc123")
+    physics = policy.env_config.task.physics
+    robot = policy.env_config.robot_config
+    model = build_scene(Scene(robot=robot, objects=(), config=physics))
+    # Actuators carry the PD law: force = kp (q* - q) - kd qdot, cut off.
+    actuators = [model.actuator(name) for name in data["joints"]]
+    assert [a.id for a in actuators] == list(range(model.nu))
+    kp, kd = model.actuator_gainprm[:, 0], -model.actuator_biasprm[:, 2]
+    np.testing.assert_allclose(data["kp"], kp)
+    np.testing.assert_allclose(data["kd"], kd)
+    np.testing.assert_allclose(data["torque_limit"], model.actuator_forcerange[:, 1])
+    np.testing.assert_allclose(data["joint_range"], model.jnt_range[1:].T)
+    np.testing.assert_allclose(data["default_joint_pos"], robot.default_joint_pos)
+    # q* moves by 0.3 x the error that asks for the full torque.
+    limit = model.actuator_forcerange[:, 1]
+    np.testing.assert_allclose(data["action_scale"], 0.3 * limit / kp)
+    assert data["control_hz"] == 60
+    assert (data["standard"], data["commit"]) == ("1", "abc123")
+    assert data["egoskin"] is not None
+    assert data["sensor"]["signal"] == "proximity"
+    sensors = data["skin"]["sensors"]
+    assert [s["link"] for s in sensors] == list(policy.skin.links)
+    np.testing.assert_allclose(
+        [s["position"] for s in sensors], policy.skin.position, atol=1e-6
+    )
+    np.testing.assert_allclose(
+        [s["normal"] for s in sensors], policy.skin.normal, atol=1e-6
+    )
+    assert data["range"] == [2.0] * 64
+    assert data["readings"] == [1] * 64
+
+
+@pytest.mark.parametrize("kind", MADE)
+def test_the_parts_of_the_observation_are_as_wide_as_the_whole(kind):
+    policy = make_policy(MADE[kind])
+    parts = observation_parts(policy)
+    sizes = [policy.policy_spec.sizes[key] for key in policy.in_keys]
+    assert sum(part["width"] for part in parts) == sum(sizes)
+    ages = [part["age"] for part in parts if part["name"] == "gravity_b"]
+    assert ages == list(reversed(range(policy.env_config.history)))
+
+
+def test_an_infinite_range_is_told_as_text():
+    assert told(make_policy(MADE["closeness"]))["range"] == ["inf"] * 64
+
+
+def test_the_command_writes_the_file_and_lists_its_input(tmp_path):
+    out = tmp_path / "policy.onnx"
+    said = succeed("export", "localization", "--to", "onnx", "--out", out)
+    assert f"{out}: observation [1, 51] -> action" in said
+    assert "joint_vel           21 rad/s" in said
+    assert "as PyTorch's to" in said
+    assert run(out.read_bytes(), np.zeros((1, 51))).shape == (1, 21)
+
+
+def test_without_onnx_the_command_names_the_extra(tmp_path, monkeypatch):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name: None if name == "onnx" else find(name)
+    )
+    error = fail("export", "blind", "--out", tmp_path / "policy.onnx")
+    assert "export needs onnx: `pip install 'egoskin[export]'`" in error
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,285 @@
+"""A policy without PyTorch: the targets of our environment, and its watchdogs."""
+
+from __future__ import annotations
+
+import re
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import mujoco
+import numpy as np
+import onnx
+import pytest
+import torch
+
+import egoskin
+from calling import SCRIPTS
+from egoskin.deploy import Controller
+from egoskin.envs.dodgeball import DodgeballConfig
+from egoskin.envs.throws import ThrowConfig
+from egoskin.evaluation.throw_set import standard_task, throw_seed
+from egoskin.make import EnvConfig, make_worker_env
+from egoskin.policies.export import export_onnx
+from egoskin.policies.policy import Policy
+from egoskin.sensors.config import SensorConfig
+from making import make_policy
+
+# A ball that comes slowly, and near.
+TASK = DodgeballConfig(
+    throws=ThrowConfig(
+        first_delay=(0.0, 0.0), height=(1.0, 1.2), distance=(1.5, 1.6), speed=(2.0, 2.1)
+    )
+)
+KINDS = {
+    "proximity": EnvConfig(task=TASK),
+    "closeness": EnvConfig(task=TASK, sensor=SensorConfig(signal="closeness", range=5)),
+    "no limit": EnvConfig(task=TASK, sensor=SensorConfig(range=torch.inf)),
+    "binary": EnvConfig(task=TASK, sensor=SensorConfig(signal="binary", range=4)),
+    "history": EnvConfig(task=TASK, history=3, previous_action=True),
+    "grid": EnvConfig(task=TASK, sensor=SensorConfig(coverage="ray")),
+    "closest beams": EnvConfig(
+        task=TASK,
+        sensor=SensorConfig(coverage="ray", reduce="min", signal="binary", range=5),
+    ),
+    "blind": EnvConfig(task=TASK, sensor=SensorConfig(coverage="none")),
+}
+
+
+def deploy(policy: Policy, folder: Path, **kwargs: Any) -> Controller:
+    path = folder / "policy.onnx"
+    path.write_bytes(export_onnx(policy)[0])
+    return Controller(path, **kwargs)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_from_raw_states_and_distances_come_our_environments_targets(kind, tmp_path):
+    policy = make_policy(KINDS[kind])
+    # Whatever it asks for, for the comparison.
+    free = {"margin": np.inf, "max_change": np.inf}
+    controller = deploy(policy, tmp_path, **free)
+    env = make_worker_env(
+        policy.env_config, policy.skin, num_envs=1, seed=1, keep_raw=True
+    )
+    with torch.no_grad():
+        # The robot falls, so it is turned in every way.
+        rollout = env.rollout(40, policy)[0]
+    scale = np.array(controller.metadata["action_scale"])
+    default = np.array(controller.metadata["default_joint_pos"])
+    for td in rollout.unbind(0):
+        reading = {}
+        if kind != "blind":
+            reading = {"distance": td["distance"].numpy(), "skin_age": 0.01}
+        target = controller.step(
+            base_quat=td["base_pose"][3:].numpy(),
+            base_ang_vel_b=td["base_ang_vel_b"].numpy(),
+            joint_pos=td["joint_pos"].numpy(),
+            joint_vel=td["joint_vel"].numpy(),
+            body_age=0.01,
+            **reading,
+        )
+        assert controller.stopped is None
+        # q* = q_default + scale x action
+        expected = default + scale * td["action"].numpy()
+        np.testing.assert_allclose(target, expected, 1e-4, 1e-4)
+    if kind != "blind":
+        assert rollout["distance"].isfinite().any()
+
+
+@pytest.fixture(scope="module")
+def controller(tmp_path_factory) -> Controller:
+    return deploy(
+        egoskin.load_policy("field_proximity"), tmp_path_factory.mktemp("policy")
+    )
+
+
+@pytest.fixture
+def state(controller) -> dict[str, Any]:
+    """A robot that stands in its default pose, nothing in sight."""
+    controller.reset()
+    return {
+        "base_quat": np.array([1.0, 0, 0, 0]),
+        "base_ang_vel_b": np.zeros(3),
+        "joint_pos": np.array(controller.metadata["default_joint_pos"]),
+        "joint_vel": np.zeros(21),
+        "body_age": 0.0,
+        "distance": np.full(64, np.inf),
+        "skin_age": 0.0,
+    }
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"body_age": 0.2}, "the state of the body is 0.2 s old"),
+        ({"body_age": np.nan}, "the state of the body is nan s old"),
+        ({"skin_age": 1.5}, "the distances of the skin are 1.5 s old"),
+        ({"joint_vel": np.full(21, np.nan)}, "the state of the body is not finite"),
+        ({"base_quat": np.full(4, np.inf)}, "the state of the body is not finite"),
+        ({"distance": None}, "100% of the skin is missing"),
+        ({"distance": np.full(64, np.nan)}, "100% of the skin is missing"),
+        ({"distance": np.repeat([np.nan, 1], [7, 57])}, "11% of the skin is missing"),
+    ],
+    ids=str,
+)
+@pytest.mark.filterwarnings("ignore:invalid value encountered:RuntimeWarning")
+def test_a_watchdog_stops_it_for_good(controller, state, change, why):
+    last = controller.step(**state)
+    target = controller.step(**{**state, **change})
+    assert controller.stopped == why
+    np.testing.assert_array_equal(target, last)
+    # A sensor that comes back starts nothing.
+    moved = {**state, "distance": np.full(64, 0.3)}
+    np.testing.assert_array_equal(controller.step(**moved), last)
+    assert controller.stopped == why
+    controller.reset()
+    assert (controller.step(**moved) != last).any()
+    assert controller.stopped is None
+
+
+def test_a_stop_from_the_first_step_on_leaves_the_robot_as_it_is(controller, state):
+    state["joint_pos"] = state["joint_pos"] + 0.1
+    controller.stop("the operator let go of the button")
+    np.testing.assert_allclose(controller.step(**state), state["joint_pos"])
+    assert controller.stopped == "the operator let go of the button"
+
+
+def test_a_sensor_that_is_missing_reads_as_one_of_nothing(controller, state):
+    expected = controller.step(**state)
+    controller.reset()
+    distance = state["distance"].copy()
+    distance[[3, 60]] = np.nan
+    target = controller.step(**{**state, "distance": distance})
+    assert controller.stopped is None
+    np.testing.assert_array_equal(target, expected)
+
+
+def test_of_grids_of_beams_the_closest_count_where_a_policy_reads_those(tmp_path):
+    controller = deploy(make_policy(KINDS["closest beams"]), tmp_path)
+    distance = np.random.default_rng(0).uniform(0, 50, (64, 64))
+    targets = []
+    for given in (distance, distance.min(1)):
+        controller.reset()
+        state = {"joint_pos": np.zeros(21), "joint_vel": np.zeros(21)}
+        state |= {"base_quat": [0.6, 0, 0.8, 0], "base_ang_vel_b": np.ones(3)}
+        targets.append(controller.step(**state, body_age=0, distance=given))
+    np.testing.assert_array_equal(*targets)
+
+
+def test_targets_stay_within_limits_of_place_and_change(tmp_path):
+    policy = make_policy(EnvConfig())
+    # A policy gone wild.
+    for weight in policy.head.body.tail[-1].parameters():
+        weight.data *= 1e3
+    controller = deploy(policy, tmp_path, margin=0.5, max_change=0.2)
+    data = {k: np.array(controller.metadata[k]) for k in ("torque_limit", "kp")}
+    # The error of position that asks for the full torque.
+    unit = data["torque_limit"] / data["kp"]
+    low, high = np.array(controller.metadata["joint_range"])
+    rng = np.random.default_rng(0)
+    last = np.array(controller.metadata["default_joint_pos"])
+    reached = np.zeros(21, dtype=bool)
+    for _ in range(200):
+        target = controller.step(
+            base_quat=np.array([1.0, 0, 0, 0]),
+            base_ang_vel_b=rng.normal(size=3),
+            joint_pos=last,
+            joint_vel=rng.normal(size=21),
+            body_age=0.0,
+            distance=rng.uniform(0, 2, 64),
+        )
+        assert (np.abs(target - last) <= 0.2 * unit + 1e-9).all()
+        assert (target >= low - 0.5 * unit - 1e-9).all()
+        assert (target <= high + 0.5 * unit + 1e-9).all()
+        reached |= np.isclose(np.abs(target - last), 0.2 * unit)
+        last = target
+    assert reached.all()
+
+
+@pytest.mark.parametrize("name", ["localization", "oracle"])
+def test_what_needs_a_tracker_is_refused_in_one_line(name, tmp_path):
+    if name == "oracle":
+        policy = make_policy(EnvConfig(sensor=SensorConfig(coverage="oracle")))
+    else:
+        policy = egoskin.load_policy(name)
+    with pytest.raises(ValueError, match=r"reads where balls are, which needs a track"):
+        deploy(policy, tmp_path)
+
+
+def test_a_file_of_others_is_refused(tmp_path):
+    model = onnx.load_from_string(export_onnx(egoskin.load_policy("blind"))[0])
+    del model.metadata_props[:]
+    onnx.save(model, tmp_path / "other.onnx")
+    with pytest.raises(ValueError, match=r"other\.onnx was not written by `egoskin"):
+        Controller(tmp_path / "other.onnx")
+
+
+def test_it_needs_numpy_and_onnxruntime_alone():
+    # As if nothing else that the package depends on were installed.
+    missing = ("torch", "tensordict", "torchrl", "mujoco", "gymnasium", "tyro")
+    code = f"""
+import sys
+sys.modules |= dict.fromkeys({missing!r})
+import egoskin.deploy
+print(sorted(name for name in sys.modules if name.startswith("egoskin")))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "['egoskin', 'egoskin.deploy']\n"
+
+
+# --- the example ------------------------------------------------------------------
+
+
+DRAWN = ("azimuth", "distance", "height", "speed", "interval", "aim_link", "aim_point")
+
+
+@pytest.mark.slow
+def test_the_examples_robot_moves_and_feels_as_our_environments(tmp_path):
+    example = SimpleNamespace(**runpy.run_path(str(SCRIPTS / "deploy_mujoco.py")))
+    example.prepare("field_proximity", tmp_path, 4, 0)
+    policy = egoskin.load_policy("field_proximity")
+    config = standard_task(policy.env_config, "2")
+    env = make_worker_env(
+        config, policy.skin, num_envs=4, seed=throw_seed(config, 0), keep_raw=True
+    )
+    with torch.no_grad():
+        rollout = env.rollout(35, policy, break_when_any_done=False)
+    controller = Controller(tmp_path / "policy.onnx")
+    model = mujoco.MjModel.from_binary_path(str(tmp_path / "scene.mjb"))
+    robot = example.Robot(model, controller.metadata)
+    throws = dict(np.load(tmp_path / "throws.npz"))
+    for row in range(4):
+        controller.reset()
+        robot.reset(throws["base_pose"][row], throws["joint_pos"][row])
+        robot.throw(0, {key: throws[key][row, 0] for key in DRAWN})
+        for td in rollout[row].unbind(0):
+            body, distance = robot.body(), robot.distance()
+            # Up to rounding, which contacts with the floor enlarge.
+            for name in ("joint_pos", "base_ang_vel_b"):
+                np.testing.assert_allclose(body[name], td[name], 0, 0.02)
+            expected = td["distance"].numpy()
+            near = np.minimum(distance, expected) < 1.99
+            np.testing.assert_allclose(distance[near], expected[near], 0, 0.02)
+            assert robot.step(controller.step(**body, body_age=0.0, distance=distance))
+    assert rollout["distance"].isfinite().any()
+
+
+@pytest.mark.slow
+def test_the_example_succeeds_without_pytorch_as_often_as_with_it(tmp_path):
+    script = [sys.executable, str(SCRIPTS / "deploy_mujoco.py")]
+    for args in (["prepare", "field_proximity", "--out", "made"], ["run", "made"]):
+        done = subprocess.run(
+            [*script, *args], cwd=tmp_path, capture_output=True, text=True, check=True
+        )
+    without, number, with_it = re.fullmatch(
+        r"without PyTorch: success in ([\d.]+)% of (\d+) episodes "
+        r"\(with it: ([\d.]+)% of 512\)\n",
+        done.stdout,
+    ).groups()
+    assert number == "512"
+    assert abs(float(without) - float(with_it)) <= 2
