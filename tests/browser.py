@@ -55,7 +55,8 @@ def main(address: str, path: str, width: int = 1440, seconds: float = 8.0) -> No
         page.goto(address)
         page.wait_for_selector("canvas", timeout=30_000)
         page.wait_for_timeout(1000 * seconds)
-        page.screenshot(path=Path(path), type="jpeg" if path.endswith("jpg") else "png")
+        kind = "jpeg" if path.endswith("jpg") else "png"
+        page.screenshot(path=Path(path), type=kind, timeout=180_000)
 
 
 if __name__ == "__main__":

@@ -37,7 +37,9 @@ ROOMS = {
     "policies": {"storage", "sensors", "agents", "make"},
     "evaluation": {"robots", "transform", "envs", "sensors", "policies", "make"},
     "runs": {"storage", "envs", "sensors", "agents", "make", "policies"},
-    "viewer": {"storage", "robots", "sensors", "make", "evaluation"},
+    "viewer": {
+        *("storage", "robots", "envs", "sensors", "make", "policies", "evaluation")
+    },
 }
 # All but the public face: nothing imports what the command line does.
 TOP = "commands"
@@ -49,6 +51,7 @@ MUJOCO = {
     "envs.physics.mujoco",
     "sensors.skin.mesh_surface",
     "viewer.offscreen",
+    "viewer.web.body",
     # Pictures are refused where it cannot be imported; benchmarks measure it alone.
     "commands.film",
     "commands.bench.accuracy",

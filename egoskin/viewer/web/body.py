@@ -75,17 +75,20 @@ class Body:
 
     def sensor_points(self, skin: Skin) -> np.ndarray:
         """Return where sensors are in the world [m], ``[S, 3]``."""
-        return self._turned(skin, skin.position) + self.data.xpos[self._links(skin)]
+        return (
+            self._turned(skin, skin.position) + self.data.xpos[self.link_indices(skin)]
+        )
 
     def sensor_normals(self, skin: Skin) -> np.ndarray:
         """Return the normals of sensors in the world, ``[S, 3]``."""
         return self._turned(skin, skin.normal)
 
-    def _links(self, skin: Skin) -> list[int]:
+    def link_indices(self, skin: Skin) -> list[int]:
+        """Return the body of the model that each sensor is on, ``S`` of them."""
         return [self._bodies[name] for name in skin.links]
 
     def _turned(self, skin: Skin, vectors: np.ndarray) -> np.ndarray:
-        rotation = self.data.xmat[self._links(skin)].reshape(-1, 3, 3)
+        rotation = self.data.xmat[self.link_indices(skin)].reshape(-1, 3, 3)
         return (rotation @ vectors[:, :, None])[..., 0]
 
     def hit(self, origin: np.ndarray, direction: np.ndarray) -> np.ndarray | None:

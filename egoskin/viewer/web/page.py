@@ -7,10 +7,12 @@ it as functions in a queue. While nobody watches it waits for that queue.
 from __future__ import annotations
 
 import queue
+import socket
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
+from functools import partial
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -32,7 +34,7 @@ MEMORY = 5.0
 """What is remembered, replayed and saved [s]."""
 _PAUSE_AFTER_END = 1.2
 """How long the end of an episode is seen before the next begins [s]."""
-_PICTURE_HZ, _PANEL_HZ = 30.0, 6.0
+_PICTURE_HZ, _LEAST_PICTURE_HZ, _PANEL_HZ = 30.0, 10.0, 6.0
 _FOLLOW_PERIOD = 2.0
 """How often it is looked whether a run has a newer policy [s]."""
 _TOO_LATE = 0.25
@@ -90,8 +92,9 @@ class Page:
         self.server.on_client_disconnect(lambda _: self._ask(lambda: None))
         half = _SPACING * (len(sources) - 1) / 2
         camera = self.server.initial_camera
-        camera.position = (4.4 + 1.6 * half, -1.6, 1.9)
-        camera.look_at, camera.fov = (0.0, 0.0, 0.9), 0.75
+        # The robot stands left of the middle: the panel is at the right.
+        camera.position = (4.0 + 1.6 * half, -1.4, 1.8)
+        camera.look_at, camera.fov = (0.0, 0.45, 0.92), 0.75
         self.is_paused = False
         self.error = ""
         """What went wrong; "" while all is well."""
@@ -100,7 +103,8 @@ class Page:
         self._random = np.random.default_rng(seed)
         self._versions = [_version(source) for source in sources]
         self._notes = [""] * len(sources)
-        self._looked = self._panel_shown = 0.0
+        self._looked = self._panel_shown = self._pictured = 0.0
+        self._steps_shown, self._speed = 0, ""
         self._replayed: deque[list[Frame]] = deque()
         self._forget()
 
@@ -144,14 +148,13 @@ class Page:
         while True:
             if not self.server.get_clients():
                 self._do(self._commands.get())
-                due = time.monotonic()
+                due = self._panel_shown = time.monotonic()
                 continue
-            self._do(self.advance)
-            period = self.panel.slowdown.value / self.hz
-            due += period
-            now = time.monotonic()
-            if now - due > _TOO_LATE:
-                due = now
+            late = time.monotonic() - due
+            self._do(partial(self.advance, late > 1 / self.hz))
+            due += self.panel.slowdown.value / self.hz
+            if late > _TOO_LATE:
+                due = time.monotonic()
             # At least what has been asked for so far is done.
             while True:
                 try:
@@ -174,18 +177,29 @@ class Page:
             self.error = f"{type(error).__name__}: {error}"
             self.panel.show_error(self.error)
 
-    def advance(self) -> None:
-        """Go one control step on, if time goes on, and draw if a picture is due."""
+    def advance(self, is_late: bool = False) -> None:
+        """Go one control step on, if time goes on, and draw if a picture is due.
+
+        Args:
+            is_late: Whether it is behind the clock: pictures are then left out.
+        """
         if self._replayed:
             frames = self._replayed.popleft()
-            self._picture(frames)
         elif not self.is_paused and not self.error:
             self.play()
-            self._picture(self._memory[-1])
-        if time.monotonic() - self._panel_shown > 1 / _PANEL_HZ:
+            frames = self._memory[-1]
+        else:
+            frames = None
+        now = time.monotonic()
+        wait = 1 / (_LEAST_PICTURE_HZ if is_late else _PICTURE_HZ)
+        # A control step sooner is nearer than one later.
+        if frames is not None and now - self._pictured > wait - 0.5 / self.hz:
+            self._pictured = now
+            self._draw(frames)
+        if now - self._panel_shown > 1 / _PANEL_HZ:
             self._show()
-        if time.monotonic() - self._looked > _FOLLOW_PERIOD:
-            self._looked = time.monotonic()
+        if now - self._looked > _FOLLOW_PERIOD:
+            self._looked = now
             self._follow()
 
     def play(self) -> None:
@@ -217,12 +231,6 @@ class Page:
         self._came[i] += came
         self._survival[i].append(session.frame.survived)
         self._ended_for[i] = 0
-
-    def _picture(self, frames: Sequence[Frame]) -> None:
-        """Draw frames, every so many of them."""
-        slowly = self.panel.slowdown.value >= self.hz / _PICTURE_HZ
-        if slowly or self.steps % round(self.hz / _PICTURE_HZ) == 0 or self.is_paused:
-            self._draw(frames)
 
     def _draw(self, frames: Sequence[Frame]) -> None:
         with self.server.atomic():
@@ -387,7 +395,14 @@ class Page:
 
     def _show(self) -> None:
         """Bring the panel up to date."""
-        self._panel_shown = time.monotonic()
+        now = time.monotonic()
+        passed, done = now - self._panel_shown, self.steps - self._steps_shown
+        self._panel_shown, self._steps_shown = now, self.steps
+        wanted = self.hz / self.panel.slowdown.value
+        is_slow = 0 < done < 0.9 * wanted * passed - 1
+        self._speed = f"Slow: {done / passed:.0f} of {wanted:.0f} steps a second."
+        if not is_slow:
+            self._speed = ""
         frames = list(self._memory)
         self.panel.show_status(self._status())
         self.panel.show_policies(self.sessions, self._notes)
@@ -411,7 +426,7 @@ class Page:
 
     def _status(self) -> list[str]:
         """Return how it stands, in Markdown."""
-        state = "**Paused.** " if self.is_paused else ""
+        state = "**Paused.** " if self.is_paused else self._speed
         state = "**Replay.** " if self._replayed else state
         lines = ["| | avoided | untouched | best |", "|---|---|---|---|"]
         for i, session in enumerate(self.sessions):
@@ -468,14 +483,14 @@ def open_server(port: int) -> viser.ViserServer:
         OSError: If the port is taken.
     """
     # viser would take another.
-    import socket
-
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind(("127.0.0.1", port))
         except OSError as error:
-            raise OSError(f"port {port} of 127.0.0.1 is taken: choose another --port") from error
+            raise OSError(
+                f"port {port} of 127.0.0.1 is taken: choose another --port"
+            ) from error
     with redirect_stdout(StringIO()):
         return viser.ViserServer(host="127.0.0.1", port=port, verbose=False)
 

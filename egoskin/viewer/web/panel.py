@@ -15,7 +15,6 @@ import numpy as np
 import viser
 from viser import uplot
 
-from egoskin.sensors.config import SensorConfig
 from egoskin.viewer.web.scene import colour_of
 from egoskin.viewer.web.session import HEIGHTS, SPEEDS, Session
 
@@ -118,18 +117,22 @@ class Panel:
             "Pause": wishes.pause,
             "Step": wishes.step,
             "Reset": wishes.reset,
-            "Replay": wishes.replay,
         }
-        times = gui.add_button_group(
-            "Time", list(actions), hint="Replay: the last five seconds"
-        )
+        times = gui.add_button_group("Time", list(actions))
         times.on_click(lambda event: actions[event.target.value]())
-        save = gui.add_button(
-            "Save the last five seconds",
-            icon=viser.Icon.DOWNLOAD,
-            hint="A page that plays them without a server",
+        last = gui.add_button_group(
+            "Last 5 s",
+            ["Replay", "Save"],
+            hint="Save: as a page that plays them without a server",
         )
-        save.on_click(lambda event: wishes.save(event.client))
+
+        def again(event: viser.GuiEvent) -> None:
+            if event.target.value == "Save":
+                wishes.save(event.client)
+            else:
+                wishes.replay()
+
+        last.on_click(again)
         self._map = gui.add_image(_EMPTY, label="Readings, last five seconds")
         gui.add_markdown(_HELP)
 
@@ -217,9 +220,7 @@ class Panel:
     def show_policies(self, sessions: Sequence[Session], notes: Sequence[str]) -> None:
         """Show which policies play, and what is known of them."""
         texts = []
-        for session, handle, note in zip(
-            sessions, self._policies, notes, strict=True
-        ):
+        for session, handle, note in zip(sessions, self._policies, notes, strict=True):
             if handle.value != session.source:
                 handle.value = session.source
             sensor, trained = session.config.sensor, session.frames_trained

@@ -18,11 +18,11 @@ from egoskin.viewer.web.body import Body
 from egoskin.viewer.web.session import Frame
 
 # Colours (r, g, b).
-_IDLE, _MASKED = np.array([38, 48, 74]), np.array([214, 216, 221])
+_IDLE, _MASKED = np.array([22, 28, 48]), np.array([214, 216, 221])
 _FAR, _NEAR = np.array([0, 170, 255]), np.array([255, 30, 90])
 _FIELD_LINE, _RAY_LINE = (26, 89, 255), (255, 196, 0)
 _BALL, _TRAIL_END = np.array([242, 100, 25]), np.array([236, 238, 242])
-_FLOOR, _TILES = (226, 229, 234), (204, 208, 215)
+_FLOOR, _TILES = (214, 218, 225), (178, 184, 194)
 # Radii [m]: a sensor at rest, and how much larger it is that reads most.
 _SENSOR_RADIUS, _LARGEST = 0.014, 2.0
 # Balls farther from the robot than this are not drawn [m].
@@ -91,20 +91,24 @@ class RobotScene:
     ) -> None:
         self._server, self._body, self._skin, self._title = server, body, skin, title
         self.place = np.array([*place, 0.0])
-        self._root = server.scene.add_frame(
-            name, show_axes=False, position=self.place
-        )
-        self._parts = []
+        self._root = server.scene.add_frame(name, show_axes=False, position=self.place)
+        # What moves are the links: poses reach the browser sooner than anything else.
+        links = {part.body for part in body.parts()}
+        if skin is not None:
+            links |= set(body.link_indices(skin))
+        self._links = {
+            i: server.scene.add_frame(f"{name}/link_{i}", show_axes=False)
+            for i in sorted(links)
+        }
         for i, part in enumerate(body.parts()):
             *rgb, opacity = part.rgba
-            mesh = server.scene.add_mesh_simple(
-                f"{name}/part_{i}",
+            server.scene.add_mesh_simple(
+                f"{name}/link_{part.body}/part_{i}",
                 part.vertices,
                 part.faces,
                 color=_lit(rgb),
                 opacity=None if opacity == 1 else opacity,
             )
-            self._parts.append((part.body, mesh))
         self._balls = [
             server.scene.add_icosphere(
                 f"{name}/ball_{i}", radius=ball.radius, color=_BALL, visible=False
@@ -117,25 +121,34 @@ class RobotScene:
         self._word = server.scene.add_label(
             f"{name}/word", title, anchor="bottom-center", visible=bool(title)
         )
-        self._sensors = None
-        if skin is not None:
-            ball = trimesh.creation.icosphere(subdivisions=2, radius=_SENSOR_RADIUS)
-            self._sensors = server.scene.add_batched_meshes_simple(
-                f"{name}/sensors",
+        self._sensors = [] if skin is None else self._add_sensors(name, skin)
+
+    def _add_sensors(
+        self, name: str, skin: Skin
+    ) -> list[tuple[np.ndarray, viser.BatchedMeshHandle]]:
+        """Add the sensors of each link; return which they are, and what shows them."""
+        kinds = np.array([isinstance(own, Ray) for own in skin.coverage])
+        self._line_colour = np.where(kinds[:, None], _RAY_LINE, _FIELD_LINE)
+        ball = trimesh.creation.icosphere(subdivisions=2, radius=_SENSOR_RADIUS)
+        owner = np.array(self._body.link_indices(skin))
+        added = []
+        for link in np.unique(owner):
+            which = np.flatnonzero(owner == link)
+            mesh = self._server.scene.add_batched_meshes_simple(
+                f"{name}/link_{link}/sensors",
                 ball.vertices,
                 ball.faces,
-                batched_positions=np.zeros((len(skin), 3)),
-                batched_wxyzs=np.tile([1.0, 0, 0, 0], (len(skin), 1)),
-                batched_scales=np.ones(len(skin)),
-                batched_colors=np.tile(_IDLE, (len(skin), 1)).astype(np.uint8),
+                batched_positions=skin.position[which],
+                batched_wxyzs=np.tile([1.0, 0, 0, 0], (len(which), 1)),
+                batched_scales=np.ones(len(which)),
+                batched_colors=np.tile(_IDLE, (len(which), 1)).astype(np.uint8),
+                material="toon5",
                 lod="off",
                 cast_shadow=False,
                 receive_shadow=False,
             )
-            kinds = [isinstance(own, Ray) for own in skin.coverage]
-            self._line_colour = np.where(
-                np.array(kinds)[:, None], _RAY_LINE, _FIELD_LINE
-            )
+            added.append((which, mesh))
+        return added
 
     def draw(self, frame: Frame, masked: Collection[int] = ()) -> None:
         """Draw a frame.
@@ -146,24 +159,24 @@ class RobotScene:
         """
         body = self._body
         body.place(frame.qpos)
-        for index, mesh in self._parts:
-            mesh.position = body.data.xpos[index]
-            mesh.wxyz = body.data.xquat[index]
-        if self._sensors is not None:
+        for index, link in self._links.items():
+            link.position = body.data.xpos[index]
+            link.wxyz = body.data.xquat[index]
+        if self._sensors:
             self._draw_sensors(frame, masked)
         self._draw_balls(frame)
         self._draw_word(frame)
 
     def _draw_sensors(self, frame: Frame, masked: Collection[int]) -> None:
-        assert self._skin is not None and self._sensors is not None
+        assert self._skin is not None
         points = self._body.sensor_points(self._skin)
         colours = colour_of(frame.reading)
         colours[list(masked)] = _MASKED
-        self._sensors.batched_positions = points.astype(np.float32)
-        if not np.array_equal(colours, self._sensors.batched_colors):
-            scales = 1 + (_LARGEST - 1) * np.sqrt(frame.reading)
-            self._sensors.batched_colors = colours
-            self._sensors.batched_scales = scales.astype(np.float32)
+        scales = 1 + (_LARGEST - 1) * np.sqrt(frame.reading)
+        for which, mesh in self._sensors:
+            if not np.array_equal(colours[which], mesh.batched_colors):
+                mesh.batched_colors = colours[which]
+                mesh.batched_scales = scales[which].astype(np.float32)
         seeing = np.isfinite(frame.line[:, 0])
         ends = np.stack((points[seeing], frame.line[seeing]), 1)
         colour = np.repeat(self._line_colour[seeing][:, None], 2, axis=1)

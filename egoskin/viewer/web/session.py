@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.envs import Compose
 
 from egoskin.envs.dodgeball import DodgeballEnv
 from egoskin.envs.throws import Draw, Thrower
@@ -181,11 +182,9 @@ class Session:
             task.throws, config.robot_config, task.physics.timestep
         )
         base.balls.thrower = self._thrower
-        self._sensors = [
-            t
-            for t in self.env.transform
-            if isinstance(t, (FieldSensor, RaySensor))
-        ]
+        chain = self.env.transform
+        assert isinstance(chain, Compose)
+        self._sensors = [t for t in chain if isinstance(t, (FieldSensor, RaySensor))]
         # All, the masked ones of before too: `mask` lets the others see again.
         self.mask(self.masked)
         self.reset()
@@ -332,8 +331,10 @@ class Session:
     def _look(self, state: TensorDictBase, ending: str | None) -> Frame:
         """Return what there is to see of a state, ``[1]``, after all transforms."""
         row = state[0]
-        qpos = torch.cat((row["base_pose"], row["joint_pos"])).double().numpy()
-        balls, active = row["object_pose"].double().numpy(), row["object_active"].numpy()
+        assert isinstance(row, TensorDictBase)
+        qpos = np.concatenate((row["base_pose"], row["joint_pos"])).astype(float)
+        balls = np.asarray(row["object_pose"], float)
+        active = np.asarray(row["object_active"])
         number = len(self.skin) if self.skin else 0
         reading, line = np.zeros(number), np.full((number, 3), np.nan)
         for group in self.pipeline.groups:
@@ -342,10 +343,14 @@ class Session:
             seeing = self.pipeline.detecting(row)
             self.body.place(qpos)
             points = self.body.sensor_points(self.skin)[seeing]
-            shapes = [s for s, on in zip(self.task.scene.objects, active) if on]
-            ends = np.stack(
-                [closest_point(s, p, points) for s, p in zip(shapes, balls[active])]
-            )
+            flying = [
+                closest_point(shape, pose, points)
+                for shape, pose, on in zip(
+                    self.task.scene.objects, balls, active, strict=True
+                )
+                if on
+            ]
+            ends = np.stack(flying)
             nearest = np.linalg.norm(ends - points, axis=-1).argmin(0)
             line[seeing] = ends[nearest, np.arange(len(points))]
         step = int(row["episode_step"])
@@ -369,7 +374,7 @@ class Session:
         """Return what the sensors of a group read, as in `Frame.reading`."""
         corrupted = f"reading{group.suffix}"
         key = corrupted if corrupted in row.keys() else f"distance{group.suffix}"
-        distance = row[key].reshape(len(group.index), -1).amin(-1).double().numpy()
+        distance = np.asarray(row[key], float).reshape(len(group.index), -1).min(-1)
         ranges = group.skin.range
         if self.config.sensor.signal == "binary":
             return (distance <= ranges).astype(float)
