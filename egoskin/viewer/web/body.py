@@ -91,6 +91,17 @@ class Body:
         rotation = self.data.xmat[self.link_indices(skin)].reshape(-1, 3, 3)
         return (rotation @ vectors[:, :, None])[..., 0]
 
+    def bounds(self) -> np.ndarray:
+        """Return the corners of a box in the world around all its shapes [m].
+
+        Returns:
+            Lower and upper corner, ``[2, 3]``; they may lie a little outside.
+        """
+        shown = self.model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE
+        centre = self.data.geom_xpos[shown]
+        reach = self.model.geom_rbound[shown, None]
+        return np.stack(((centre - reach).min(0), (centre + reach).max(0)))
+
     def hit(self, origin: np.ndarray, direction: np.ndarray) -> np.ndarray | None:
         """Return where a ray first hits the robot in the world [m]; None if not."""
         geom = np.zeros(1, np.int32)

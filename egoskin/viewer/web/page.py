@@ -7,13 +7,10 @@ it as functions in a queue. While nobody watches it waits for that queue.
 from __future__ import annotations
 
 import queue
-import socket
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from contextlib import redirect_stdout
 from functools import partial
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +25,7 @@ from egoskin.policies.policy import (
 )
 from egoskin.viewer.web.panel import Panel, Wishes
 from egoskin.viewer.web.scene import RobotScene, set_stage
+from egoskin.viewer.web.server import open_server, stop_server
 from egoskin.viewer.web.session import Frame, Session, Throw
 
 MEMORY = 5.0
@@ -165,8 +163,7 @@ class Page:
 
     def close(self) -> None:
         """Close the page."""
-        with redirect_stdout(StringIO()):
-            self.server.stop()
+        stop_server(self.server)
 
     def _do(self, wish: Callable[[], object]) -> None:
         """Do something; what goes wrong is shown on the page, which lives on."""
@@ -471,28 +468,6 @@ class Page:
                 self._draw(each)
                 recorder.insert_sleep(1 / _PICTURE_HZ)
         return recorder.as_html()
-
-
-def open_server(port: int) -> viser.ViserServer:
-    """Return a server of a page for this machine alone.
-
-    Args:
-        port: Port of 127.0.0.1; 0 for any that is free.
-
-    Raises:
-        OSError: If the port is taken.
-    """
-    # viser would take another.
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind(("127.0.0.1", port))
-        except OSError as error:
-            raise OSError(
-                f"port {port} of 127.0.0.1 is taken: choose another --port"
-            ) from error
-    with redirect_stdout(StringIO()):
-        return viser.ViserServer(host="127.0.0.1", port=port, verbose=False)
 
 
 def offered_policies(sources: Sequence[str]) -> list[str]:
