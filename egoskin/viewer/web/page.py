@@ -184,7 +184,7 @@ class Page:
             frames = self._replayed.popleft()
         elif not self.is_paused and not self.error:
             self.play()
-            frames = self._memory[-1]
+            frames = [session.frame for session in self.sessions]
         else:
             frames = None
         now = time.monotonic()
@@ -205,6 +205,8 @@ class Page:
         tempo = self.panel.tempo.value
         if tempo and self._since_throw >= 60 * self.hz / tempo:
             self.throw_from(None)
+        # The wait after an end is nothing to remember.
+        goes_on = any(session.frame.ending is None for session in self.sessions)
         frames = []
         for i, session in enumerate(self.sessions):
             if session.frame.ending is None:
@@ -218,7 +220,8 @@ class Page:
                     frame = session.reset()
             frames.append(frame)
         self.steps += 1
-        self._memory.append(frames)
+        if goes_on or not self._memory:
+            self._memory.append(frames)
 
     def _end(self, i: int) -> None:
         """Count what an episode that ended has brought."""
@@ -341,7 +344,7 @@ class Page:
         """Stop time, and go one control step on."""
         self.is_paused = True
         self.play()
-        self._draw(self._memory[-1])
+        self._draw([session.frame for session in self.sessions])
 
     def reset(self) -> None:
         """Begin anew, with all counts at 0."""

@@ -154,26 +154,28 @@ class Panel:
     def _add_plots(self, sessions: Sequence[Session]) -> None:
         gui = self._gui
         nothing = tuple(np.zeros(1) for _ in range(1 + len(sessions)))
-        series = [uplot.Series(label="time [s]")]
+        series = [uplot.Series()]
         for i in range(len(sessions)):
             name = ("left", "right")[i] if len(sessions) > 1 else "robot"
             series.append(uplot.Series(label=name, stroke=_COLOURS[i], width=2))
         axis = uplot.Axis(stroke="#495057", grid={"stroke": "#e9ecef", "width": 1})
 
-        def plot(title: str, x: str) -> viser.GuiUplotHandle:
+        def plot(x: str) -> viser.GuiUplotHandle:
             return gui.add_uplot(
                 nothing,
                 (uplot.Series(label=x), *series[1:]),
-                title=title,
                 scales={"x": uplot.Scale(time=False, auto=True)},
                 axes=(axis, axis),
-                height=170,
+                legend=uplot.Legend(show=len(sessions) > 1),
+                height=150 if len(sessions) == 1 else 115,
             )
 
-        self._nearest = plot("Strongest reading (1: touching)", "time [s]")
-        self._value = plot("Value of the state, by the critic", "time [s]")
-        self._no_critic = gui.add_markdown("")
-        self._survival = plot("Untouched [s], episode by episode", "episode")
+        gui.add_markdown("**Strongest reading**, 1: touching; last five seconds [s]")
+        self._nearest = plot("time [s]")
+        self._value_title = gui.add_markdown("**Value of the state**, by the critic")
+        self._value = plot("time [s]")
+        gui.add_markdown("**Untouched** [s], episode by episode")
+        self._survival = plot("episode")
 
     def _add_policies(self, sessions: Sequence[Session], names: Sequence[str]) -> None:
         gui, wishes = self._gui, self._wishes
@@ -310,12 +312,11 @@ class Panel:
         self._nearest.data = (time, *strongest)
         self._value.visible = any(has_critic.values())
         lacking = [name for name, has in has_critic.items() if not has]
-        self._no_critic.content = (
-            f"No value of {', '.join(lacking)}: a policy file holds no critic, a run "
-            "does."
-            if lacking
-            else ""
-        )
+        title = "**Value of the state**, by the critic"
+        if lacking:
+            names = ", ".join(lacking)
+            title += f": not of {names}. A policy file holds no critic, a run does."
+        self._value_title.content = title
         if self._value.visible:
             self._value.data = (time, *value)
         longest = max(1, *(len(s) for s in survival))
