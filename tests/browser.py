@@ -55,8 +55,13 @@ def main(address: str, path: str, width: int = 1440, seconds: float = 8.0) -> No
         page.goto(address)
         page.wait_for_selector("canvas", timeout=30_000)
         page.wait_for_timeout(1000 * seconds)
+        # What the browser says of drawing without a graphics card.
+        for notice in page.locator(".mantine-Notification-closeButton").all():
+            notice.click()
+        page.wait_for_timeout(1000)
         kind = "jpeg" if path.endswith("jpg") else "png"
-        page.screenshot(path=Path(path), type=kind, timeout=180_000)
+        quality = 80 if kind == "jpeg" else None
+        page.screenshot(path=Path(path), type=kind, quality=quality, timeout=180_000)
 
 
 if __name__ == "__main__":

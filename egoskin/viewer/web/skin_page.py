@@ -28,8 +28,8 @@ from egoskin.viewer.web.scene import RobotScene, set_stage
 from egoskin.viewer.web.server import open_server, stop_server
 from egoskin.viewer.web.session import Frame
 
-# Points of the sphere [m]; a joint without limits can be turned so far [rad].
-_POINT_SIZE, _ANY_TURN = 0.05, math.pi
+# Size of the sphere's points, over its radius; a joint without limits turns so far [rad].
+_POINT_SIZE, _ANY_TURN = 0.013, math.pi
 # Clearance when first seen over range, from late to early, and never.
 _LATE, _EARLY, _NEVER = np.array([88, 60, 140]), np.array([70, 205, 120]), (200, 30, 40)
 _MOST_IN_FOLDER = 12
@@ -130,7 +130,7 @@ class SkinPage:
             return
         with tabs.add_tab("Visibility"):
             self._kind = gui.add_dropdown("Sensors", ("field", "ray"))
-            self._range = gui.add_slider("Range [m]", 0.1, 3.0, 0.1, 1.0)
+            self._range = gui.add_slider("Range [m]", 0.1, 3.0, 0.1, 0.5)
             self._button = gui.add_button("Show what is seen in this pose")
             self._button.on_click(lambda _: self._commands.put(self.look))
             self._result = gui.add_markdown(_LEGEND)
