@@ -46,19 +46,22 @@ def browsing(width: int = 1440, height: int = 900) -> Iterator:
             context.close()
 
 
-def main(address: str, path: str, width: int = 1440, seconds: float = 8.0) -> None:
-    """Take a picture of a page some seconds after it has opened."""
+def main(address: str, path: str, width: int = 1440) -> None:
+    """Take a picture of `egoskin view` while a ball comes from the front."""
     with browsing(width) as context:
         page = context.pages[0]
         page.on("console", lambda m: print(m.type, m.text[:300], file=sys.stderr))
         page.on("pageerror", lambda e: print("pageerror", e, file=sys.stderr))
         page.goto(address)
         page.wait_for_selector("canvas", timeout=30_000)
-        page.wait_for_timeout(1000 * seconds)
+        page.wait_for_timeout(8000)
         # What the browser says of drawing without a graphics card.
         for notice in page.locator(".mantine-Notification-closeButton").all():
             notice.click()
-        page.wait_for_timeout(1000)
+        page.get_by_role("button", name="Front", exact=True).click()
+        page.wait_for_timeout(800)
+        page.get_by_role("button", name="Pause", exact=True).click()
+        page.wait_for_timeout(4000)
         kind = "jpeg" if path.endswith("jpg") else "png"
         quality = 80 if kind == "jpeg" else None
         page.screenshot(path=Path(path), type=kind, quality=quality, timeout=180_000)

@@ -28,7 +28,7 @@ from egoskin.viewer.web.scene import RobotScene, set_stage
 from egoskin.viewer.web.server import open_server, stop_server
 from egoskin.viewer.web.session import Frame
 
-# Size of the sphere's points, over its radius; a joint without limits turns so far [rad].
+# Size of the sphere's points over its radius; how far an unlimited joint turns [rad].
 _POINT_SIZE, _ANY_TURN = 0.013, math.pi
 # Clearance when first seen over range, from late to early, and never.
 _LATE, _EARLY, _NEVER = np.array([88, 60, 140]), np.array([70, 205, 120]), (200, 30, 40)
