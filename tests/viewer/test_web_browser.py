@@ -160,20 +160,19 @@ def test_a_recording_is_a_page_that_plays_alone(
         visit.press("Save")
     path = tmp_path / "saved.html"
     download.value.save_as(path)
-    with browsing(*SIZE) as context:
-        alone = Visit(context, path.as_uri())
-        wait_for(lambda: is_drawn(alone.canvas()))
-        assert alone.faults == []
+    alone = Visit(visit.tab.context, path.as_uri())
+    wait_for(lambda: is_drawn(alone.canvas()))
+    assert alone.faults == []
 
 
 def test_other_visitors_and_lost_connections_disturb_nobody(page: Page, visit: Visit):
     process = psutil.Process()
     threads, memory = [], []
     for _ in range(4):
-        with browsing(400, 300) as context:
-            other = Visit(context, page.address)
-            wait_for(lambda: len(page.server.get_clients()) == 2)
-            assert other.faults == []
+        other = Visit(visit.tab.context, page.address)
+        wait_for(lambda: len(page.server.get_clients()) == 2)
+        assert other.faults == []
+        other.tab.close()
         wait_for(lambda: len(page.server.get_clients()) == 1)
         threads.append(process.num_threads())
         memory.append(process.memory_info().rss)
