@@ -1,6 +1,6 @@
-"""A real browser without a display, as a visitor of the page; and its screenshot.
+"""A real browser without a display, as a visitor of the page; and its picture.
 
-python tests/browser.py ADDRESS docs/view.jpg
+python tests/browser.py docs/view.jpg
 """
 
 from __future__ import annotations
@@ -8,11 +8,14 @@ from __future__ import annotations
 import shutil
 import sys
 import tempfile
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+# Reading of the moment that is taken.
+_NEAR = 0.7
 _OPTIONS = (
     "--no-sandbox",
     "--use-angle=swiftshader",
@@ -46,26 +49,33 @@ def browsing(width: int = 1440, height: int = 900) -> Iterator:
             context.close()
 
 
-def main(address: str, path: str, width: int = 1440) -> None:
-    """Take a picture of `egoskin view` while a ball comes from the front."""
+def main(path: str, width: int = 1440) -> None:
+    """Take a picture of `egoskin view` at the moment when a ball is near the robot."""
+    from egoskin.viewer.web.page import Page
+
+    page = Page(["field_proximity"])
+    page.panel.tempo.value = 0
+    page.throw_from(-60.0)
+    while page.sessions[0].frame.reading.max() < _NEAR:
+        page.play()
+        page._draw(page._memory[-1])
+    page.pause()
+    threading.Thread(target=page.run, daemon=True).start()
     with browsing(width) as context:
-        page = context.pages[0]
-        page.on("console", lambda m: print(m.type, m.text[:300], file=sys.stderr))
-        page.on("pageerror", lambda e: print("pageerror", e, file=sys.stderr))
-        page.goto(address)
-        page.wait_for_selector("canvas", timeout=30_000)
-        page.wait_for_timeout(8000)
+        tab = context.pages[0]
+        tab.set_default_timeout(120_000)
+        tab.goto(page.address)
+        tab.wait_for_selector("canvas")
+        tab.wait_for_timeout(15_000)
         # What the browser says of drawing without a graphics card.
-        for notice in page.locator(".mantine-Notification-closeButton").all():
+        for notice in tab.locator(".mantine-Notification-closeButton").all():
             notice.click()
-        page.get_by_role("button", name="Front", exact=True).click()
-        page.wait_for_timeout(800)
-        page.get_by_role("button", name="Pause", exact=True).click()
-        page.wait_for_timeout(4000)
+        tab.wait_for_timeout(2000)
         kind = "jpeg" if path.endswith("jpg") else "png"
         quality = 80 if kind == "jpeg" else None
-        page.screenshot(path=Path(path), type=kind, quality=quality, timeout=180_000)
+        tab.screenshot(path=Path(path), type=kind, quality=quality)
+    page.close()
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], sys.argv[2], *map(int, sys.argv[3:]))
+    main(sys.argv[1], *map(int, sys.argv[2:]))
