@@ -39,7 +39,9 @@ ROOMS = {
     "runs": {"storage", "envs", "sensors", "agents", "make", "policies"},
     "gym": {"storage", "make"},
     "deploy": set(),
-    "viewer": {"storage", "robots", "sensors", "make", "evaluation"},
+    "viewer": {
+        *("storage", "robots", "envs", "sensors", "make", "policies", "evaluation")
+    },
 }
 # All but the public face: nothing imports what the command line does.
 TOP = "commands"
@@ -51,6 +53,7 @@ MUJOCO = {
     "envs.physics.mujoco",
     "sensors.skin.mesh_surface",
     "viewer.offscreen",
+    "viewer.web.body",
     # Pictures are refused where it cannot be imported; benchmarks measure it alone.
     "commands.film",
     "commands.bench.accuracy",

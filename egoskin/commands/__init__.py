@@ -20,6 +20,7 @@ from egoskin.viewer import draw_without_display
 COMMANDS = {
     "train": "train a robot to dodge, or go on with a run",
     "evaluate": "play a policy on a fixed set of throws",
+    "view": "see a policy in the browser, and throw balls at it",
     "film": "film an episode, with a contact sheet of its moments",
     "skin": "place, import, export and show skins",
     "visibility": "show what a skin sees, before any training",

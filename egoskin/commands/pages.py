@@ -50,6 +50,19 @@ Play a policy on a fixed set of throws that no training has seen.
   egoskin evaluate runs/NAME --mask
   egoskin evaluate runs/NAME --behaviour --map map.png
 """,
+    "view": """\
+See a policy in the browser, and throw balls at it; or a skin, or a robot.
+
+  POLICY ...              run folder (followed while it trains), checkpoint, policy
+                          file, or a policy of the package; two stand side by side
+  --skin PATH             a skin file on its robot, without a policy
+  --robot NAME            a robot without a policy: its name, or an MJCF or URDF
+  --port INT              port of this machine, 127.0.0.1; 0: any that is free (8080)
+
+  egoskin view field_proximity
+  egoskin view runs/NAME runs/OTHER
+  egoskin view --skin my.json
+""",
     "film": """\
 Film an episode of a policy, with a contact sheet of its moments.
 
@@ -144,6 +157,16 @@ Run a study: many trainings that differ in a few fields, and what they tell.
 A study is paper, paper-1000, findings, smoke, or a JSON file. egoskin study run --help
 lists the options of run, and so for each.
 """,
+    "export": """\
+Write a policy as ONNX, for a robot without PyTorch; docs/deploy.md says how to run it.
+
+  POLICY                  run folder, checkpoint, policy file, or a policy of the
+                          package
+  --out PATH              file to write
+  --to {onnx}             format (onnx)
+
+  egoskin export field_proximity --out policy.onnx
+""",
     "verify": """\
 Check that training is exact on this machine: a resume, other workers, other threads and
 other kernels give the same bits.
@@ -164,6 +187,7 @@ Measure speed and accuracy.
   egoskin bench accuracy  the physics rate against a finer one
   egoskin bench gradients --run runs/NAME
                           the actor's gradients of several rollouts, compared
+  egoskin bench gymnasium Gymnasium's forms of the environment
 
 egoskin bench loop --help lists the options of loop, and so for each.
 """,

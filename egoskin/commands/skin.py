@@ -143,7 +143,7 @@ class Import:
     def run(self) -> None:
         """Write the skin."""
         check_path(self.out, (".json",))
-        robot = _robot(self.robot)
+        robot = find_robot(self.robot)
         skin = load_gentact(
             self.files,
             robot_name=robot.name,
@@ -171,8 +171,12 @@ class Import:
             )
 
 
-def _robot(name: str) -> RobotConfig:
-    """Return the robot of a name or of a file."""
+def find_robot(name: str) -> RobotConfig:
+    """Return the robot of a name or of a file.
+
+    Raises:
+        ValueError: If there is neither, or the file is no robot.
+    """
     if name in ROBOTS:
         return ROBOTS[name]
     try:

@@ -97,9 +97,7 @@ class Analysis:
 
         0 where never, NaN where no ball can come from.
         """
-        clearance, comes = self.directions.clearance[cell], self.comes(cell)
-        values = torch.where(comes, clearance, torch.nan)
-        return values.reshape(direction_grid()[0].shape).numpy()
+        return _on_grid(self.directions.clearance[cell], self.comes(cell))
 
     @property
     def reached(self) -> Tensor:
@@ -231,6 +229,45 @@ class Analysis:
             return {"median": None, "one": None}
         one = (count == 1).double().mean()
         return {"median": float(count.median()), "one": float(one)}
+
+
+def _on_grid(clearance: Tensor, comes: Tensor) -> np.ndarray:
+    """Return clearances by direction, NaN where no ball comes from, ``[E, A]``."""
+    values = torch.where(comes, clearance, torch.nan)
+    return values.reshape(direction_grid()[0].shape).numpy()
+
+
+def see_directions(
+    robot: RobotConfig,
+    skin: Skin,
+    sensor: SensorConfig,
+    ball: Sphere,
+    *,
+    progress: Progress = lambda what, share: None,
+) -> np.ndarray:
+    """Return the clearance at which a ball from each direction is first seen [m].
+
+    As `Analysis.clearance_map`, of one cell, in the default pose.
+
+    Args:
+        robot: The robot.
+        skin: The sensors.
+        sensor: What they measure: coverage, range and occlusion count.
+        ball: The ball.
+        progress: Called with what is in work, and how much of it is done.
+
+    Returns:
+        In the order of `direction_grid`, ``[E, A]``; 0 where never, NaN where no ball
+        can come from.
+
+    Raises:
+        ValueError: If the body has shapes to which no distance is known.
+    """
+    body = StandingRobot(robot)
+    cells = pipelines(robot, skin, {sensor.coverage: sensor}, sensor.range)
+    paths = direction_paths(body, ball, farthest(cells))
+    seen = trace(body, paths, skin, cells, [sensor.range], ball, progress=progress)
+    return _on_grid(seen.clearance[0], seen.runway >= sensor.range)
 
 
 def _share(flags: Tensor, among: Tensor) -> float | None:

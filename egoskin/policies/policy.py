@@ -352,6 +352,25 @@ class Policy(TensorDictModuleBase):
         return self.head(*inputs)[0]
 
 
+class Critic(TensorDictModuleBase):
+    """A trained critic that writes the value of the state, ``state_value [*B, 1]``.
+
+    Args:
+        agent: Agent whose critic is used; its parameters no longer require gradients.
+    """
+
+    def __init__(self, agent: Agent) -> None:
+        super().__init__()
+        self.in_keys, self.out_keys = agent.critic_keys, ["state_value"]
+        self._agent = agent.requires_grad_(False)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``state_value [B, 1]`` from ``in_keys``, ``[B, F]`` each."""
+        inputs = self._agent.encode(self._agent.sense(tensordict))
+        value = self._agent.critic(inputs)["state_value"]
+        return tensordict.set("state_value", value)
+
+
 def shipped_policies() -> list[str]:
     """Return the names of the policies that come with the package."""
     return sorted(path.stem for path in _SHIPPED.glob("*.safetensors"))
@@ -371,6 +390,31 @@ def load_policy(path: str | Path) -> Policy:
     Raises:
         ValueError: If there is no policy; the text says why.
     """
+    agent, spec, _ = _load_agent(policy_file(path))
+    return Policy(agent, spec)
+
+
+def load_critic(path: str | Path) -> Critic | None:
+    """Return the critic that was trained with a policy; None if the file holds none.
+
+    Checkpoints of runs hold one, policy files do not.
+
+    Args:
+        path: As in `load_policy`.
+
+    Raises:
+        ValueError: If there is no policy; the text says why.
+    """
+    agent, _, has_critic = _load_agent(policy_file(path))
+    return Critic(agent) if has_critic else None
+
+
+def policy_file(path: str | Path) -> Path:
+    """Return the file that `load_policy` reads.
+
+    Raises:
+        ValueError: If there is none; the text says why.
+    """
     path = Path(path)
     if not path.exists():
         names = shipped_policies()
@@ -384,6 +428,11 @@ def load_policy(path: str | Path) -> Policy:
         if not (path / CHECKPOINT_NAME).is_file():
             raise ValueError(f"{path} is no run folder: it has no {CHECKPOINT_NAME}")
         path = path / CHECKPOINT_NAME
+    return path
+
+
+def _load_agent(path: Path) -> tuple[Agent, PolicySpec, bool]:
+    """Return the agent of a file, what it was made for, and if its critic is there."""
     tensors, header = load_tensors(path)
     spec = PolicySpec.from_header(header.get("policy", {}), str(path))
     own = part("agent", tensors)
@@ -391,4 +440,4 @@ def load_policy(path: str | Path) -> Policy:
     agent = spec.build_agent()
     load_agent_tensors(agent, own, str(path))
     check_finite(agent, str(path))
-    return Policy(agent, spec)
+    return agent, spec, any(name.startswith(_CRITIC) for name in own)

@@ -91,14 +91,14 @@ def test_the_first_page_says_what_the_options_are(name):
     assert len(options) <= 10
     for text in options:
         option, choices = re.match(r"(\S+) ?(\{[\w,]+\})?", text).groups()
-        told = re.search(rf" {option}[ ,](.*?)\(default: (.*?)\)", whole)
+        told = re.search(rf" {option}[ ,](.*?)\((?:default: (.*?)|required)\)", whole)
         assert told, option
         assert (choices or "") in told[1].replace("{None}|", "").replace("None,", "")
         default = re.search(r"\((\S[^:()]*)\)$", text.strip())
         if default:
             assert default[1] == told[2]
         else:
-            assert told[2] in ("None", "False")
+            assert told[2] in ("None", "False", None)
 
 
 def test_the_pages_of_commands_with_subcommands_name_them_all():

@@ -1,0 +1,92 @@
+"""See a policy in the browser, and throw balls at it; or a skin, or a robot.
+
+egoskin view field_proximity
+egoskin view runs/NAME
+egoskin view field_proximity blind
+egoskin view --skin skin.json
+egoskin view --robot arm.urdf
+"""
+
+from __future__ import annotations
+
+import gc
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import torch
+import tyro
+
+from egoskin.bounds import Interval, check_bounds
+from egoskin.commands.errors import check_packages
+
+if TYPE_CHECKING:
+    from egoskin.viewer.web.skin_page import SkinPage
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewConfig:
+    """See a policy in the browser, and throw balls at it; or a skin, or a robot."""
+
+    policies: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    """Run folder (its newest policy is taken up while it trains), checkpoint, policy
+    file, or the name of a policy that comes with the package; two stand side by side
+    and meet the same throws. Without any, field_proximity."""
+    skin: Path | None = None
+    """A skin file, shown on its robot without a policy."""
+    robot: str | None = None
+    """A robot without a policy: its name, or an MJCF or URDF."""
+    port: Annotated[int, Interval(ge=0, le=65535)] = 8080
+    """Port of 127.0.0.1; 0: any that is free."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for what cannot be shown."""
+        check_bounds(self)
+        if len(self.policies) > 2:
+            raise ValueError(f"at most two policies, got {len(self.policies)}")
+        if self.policies and (self.skin or self.robot):
+            raise ValueError(
+                "a policy brings its own robot and skin: leave out --skin and --robot, "
+                "or the policy"
+            )
+
+
+def main(args: list[str]) -> None:
+    """Run the command."""
+    config = tyro.cli(ViewConfig, args=args, description=__doc__)
+    check_packages("egoskin view", "view", "viser")
+    # One robot keeps one core busy at most; threads would only get in each other's way.
+    torch.set_num_threads(1)
+    if config.skin is None and config.robot is None:
+        from egoskin.viewer.web.page import Page
+
+        page = Page(config.policies or ("field_proximity",), config.port)
+    else:
+        page = _skin_page(config)
+    try:
+        print(f"{page.address}   (Ctrl-C ends it)", flush=True)
+        page.run()
+    finally:
+        page.close()
+        # The process ends: to look through all objects once more takes seconds.
+        gc.freeze()
+
+
+def _skin_page(config: ViewConfig) -> SkinPage:
+    """Return the page of a robot, of a skin, or of a skin on a robot."""
+    from egoskin.commands.skin import find_robot
+    from egoskin.robots.config import ROBOTS
+    from egoskin.sensors import Skin
+    from egoskin.viewer.web.skin_page import SkinPage
+
+    skin = None if config.skin is None else Skin.load(config.skin)
+    name = config.robot
+    if name is None:
+        assert skin is not None
+        name = skin.robot
+        if name not in ROBOTS:
+            raise ValueError(
+                f"{config.skin} is for the robot {name!r}: say where it is, --robot "
+                "PATH of its MJCF or URDF"
+            )
+    return SkinPage(find_robot(name), skin, config.port)

@@ -1,0 +1,1 @@
+"""A page in the browser: a robot, its skin, and balls to throw at it."""

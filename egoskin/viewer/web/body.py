@@ -1,0 +1,182 @@
+"""The body of a robot, to be drawn and to be hit by a click: its shapes and poses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+import trimesh
+
+from egoskin.robots.chains import body_name, joint_name
+from egoskin.robots.config import RobotConfig
+from egoskin.sensors import Skin
+
+# As MuJoCo's own viewer shows at first: groups 3 and above are what collides.
+_SHOWN_GROUPS = 3
+_SEGMENTS = 24
+_GREY = (0.5, 0.5, 0.5, 1.0)
+"""MuJoCo's colour of a shape without one."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Part:
+    """Shapes of one colour on one link."""
+
+    body: int
+    """Body of the model."""
+    vertices: np.ndarray
+    """In the frame of the body [m], ``[V, 3]``."""
+    faces: np.ndarray
+    """Indices of vertices, ``[F, 3]``."""
+    rgba: tuple[float, float, float, float]
+    """Colour and opacity."""
+
+
+class Body:
+    """A robot that can be put into poses.
+
+    Args:
+        robot: The robot; it need not float.
+    """
+
+    def __init__(self, robot: RobotConfig) -> None:
+        self.robot, self.model = robot, robot.model
+        self.data = mujoco.MjData(self.model)
+        model = self.model
+        self._bodies = {body_name(model, i): i for i in range(1, model.nbody)}
+        joints = {joint_name(model, i): i for i in range(model.njnt)}
+        self._joint = model.jnt_qposadr[[joints[name] for name in robot.joints]]
+        free = mujoco.mjtJoint.mjJNT_FREE
+        self.floats = bool(model.njnt and model.jnt_type[0] == free)
+        """Whether its base is free to move."""
+        self.place(self.default_qpos)
+
+    @property
+    def default_qpos(self) -> np.ndarray:
+        """Base pose, on the floor, and joint positions of the default pose."""
+        base = np.array([0.0, 0, 0, 1, 0, 0, 0])
+        if self.floats:
+            base[2] = self.robot.default_base_height
+        return np.concatenate((base, self.robot.default_joint_pos))
+
+    def place(self, qpos: np.ndarray) -> None:
+        """Put the robot into a pose.
+
+        Args:
+            qpos: Base pose (which a robot that stands fixed ignores) and joint
+                positions, ``[7 + J]``.
+        """
+        if self.floats:
+            self.data.qpos[:7] = qpos[:7]
+        self.data.qpos[self._joint] = qpos[7:]
+        mujoco.mj_kinematics(self.model, self.data)
+
+    def sensor_points(self, skin: Skin) -> np.ndarray:
+        """Return where sensors are in the world [m], ``[S, 3]``."""
+        return (
+            self._turned(skin, skin.position) + self.data.xpos[self.link_indices(skin)]
+        )
+
+    def sensor_normals(self, skin: Skin) -> np.ndarray:
+        """Return the normals of sensors in the world, ``[S, 3]``."""
+        return self._turned(skin, skin.normal)
+
+    def link_indices(self, skin: Skin) -> list[int]:
+        """Return the body of the model that each sensor is on, ``S`` of them."""
+        return [self._bodies[name] for name in skin.links]
+
+    def _turned(self, skin: Skin, vectors: np.ndarray) -> np.ndarray:
+        rotation = self.data.xmat[self.link_indices(skin)].reshape(-1, 3, 3)
+        return (rotation @ vectors[:, :, None])[..., 0]
+
+    def bounds(self) -> np.ndarray:
+        """Return the corners of a box in the world around all its shapes [m].
+
+        Returns:
+            Lower and upper corner, ``[2, 3]``; they may lie a little outside.
+        """
+        shown = self.model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE
+        centre = self.data.geom_xpos[shown]
+        reach = self.model.geom_rbound[shown, None]
+        return np.stack(((centre - reach).min(0), (centre + reach).max(0)))
+
+    def hit(self, origin: np.ndarray, direction: np.ndarray) -> np.ndarray | None:
+        """Return where a ray first hits the robot in the world [m]; None if not."""
+        geom = np.zeros(1, np.int32)
+        pnt, vec = np.asarray(origin, float), np.asarray(direction, float)
+        vec = vec / np.linalg.norm(vec)
+        away = mujoco.mj_ray(self.model, self.data, pnt, vec, None, 1, -1, geom)
+        return None if away < 0 else pnt + away * vec
+
+    def parts(self) -> list[Part]:
+        """Return its shapes, those of one link and colour as one."""
+        merged: dict[tuple[int, tuple], list[trimesh.Trimesh]] = {}
+        for body, rgba, mesh in self._shapes():
+            merged.setdefault((body, rgba), []).append(mesh)
+        found = []
+        for (body, rgba), meshes in merged.items():
+            whole = trimesh.util.concatenate(meshes)
+            found.append(
+                Part(
+                    body=body,
+                    vertices=np.asarray(whole.vertices),
+                    faces=np.asarray(whole.faces),
+                    rgba=rgba,
+                )
+            )
+        return found
+
+    def _shapes(self) -> Iterator[tuple[int, tuple, trimesh.Trimesh]]:
+        """Yield body, colour and mesh, in the frame of the body, of what is shown."""
+        model = self.model
+        groups = model.geom_group
+        shown = groups < _SHOWN_GROUPS
+        if not shown.any():
+            shown = ~shown
+        for geom in np.flatnonzero(shown):
+            mesh = _mesh(model, int(geom))
+            rgba, material = model.geom_rgba[geom], model.geom_matid[geom]
+            if material >= 0 and tuple(rgba) == _GREY:
+                rgba = model.mat_rgba[material]
+            if mesh is None or rgba[3] == 0:
+                continue
+            place = np.eye(4)
+            rotation = np.zeros(9)
+            mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
+            place[:3, :3], place[:3, 3] = rotation.reshape(3, 3), model.geom_pos[geom]
+            mesh.apply_transform(place)
+            yield int(model.geom_bodyid[geom]), tuple(map(float, rgba)), mesh
+
+
+def _mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh | None:
+    """Return a geom's surface in its own frame; None for a plane, and the like."""
+    kinds, make = mujoco.mjtGeom, trimesh.creation
+    kind, size = model.geom_type[geom], model.geom_size[geom]
+    if kind == kinds.mjGEOM_SPHERE:
+        return make.icosphere(subdivisions=3, radius=size[0])
+    if kind == kinds.mjGEOM_CAPSULE:
+        mesh = make.capsule(2 * size[1], size[0], count=[_SEGMENTS, _SEGMENTS])
+        mesh.apply_translation(-mesh.bounds.mean(0))
+        return mesh
+    if kind == kinds.mjGEOM_ELLIPSOID:
+        mesh = make.icosphere(subdivisions=3)
+        mesh.apply_scale(size)
+        return mesh
+    if kind == kinds.mjGEOM_CYLINDER:
+        mesh = make.cylinder(size[0], 2 * size[1], sections=_SEGMENTS)
+    elif kind == kinds.mjGEOM_BOX:
+        mesh = make.box(2 * size)
+    elif kind == kinds.mjGEOM_MESH:
+        which = model.geom_dataid[geom]
+        first, number = model.mesh_vertadr[which], model.mesh_vertnum[which]
+        vertices = model.mesh_vert[first : first + number]
+        first, number = model.mesh_faceadr[which], model.mesh_facenum[which]
+        faces = model.mesh_face[first : first + number]
+        mesh = trimesh.Trimesh(vertices, faces, process=False)
+    else:
+        return None
+    # Edges stay sharp where no two faces share a vertex.
+    mesh.unmerge_vertices()
+    return mesh

@@ -1,0 +1,495 @@
+"""The page that `egoskin view` opens: robots in motion, thrown at by its visitors.
+
+Contract: one thread, that of `Page.run`, computes and draws; what visitors do comes to
+it as functions in a queue. While nobody watches it waits for that queue.
+"""
+
+from __future__ import annotations
+
+import queue
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import viser
+
+from egoskin.policies.policy import (
+    load_critic,
+    load_policy,
+    policy_file,
+    shipped_policies,
+)
+from egoskin.viewer.web.panel import Panel, Wishes
+from egoskin.viewer.web.scene import RobotScene, set_stage
+from egoskin.viewer.web.server import open_server, stop_server
+from egoskin.viewer.web.session import Frame, Session, Throw
+
+MEMORY = 5.0
+"""What is remembered, replayed and saved [s]."""
+_PAUSE_AFTER_END = 1.2
+"""How long the end of an episode is seen before the next begins [s]."""
+_PICTURE_HZ, _LEAST_PICTURE_HZ, _PANEL_HZ = 30.0, 10.0, 6.0
+_FOLLOW_PERIOD = 2.0
+"""How often it is looked whether a run has a newer policy [s]."""
+_TOO_LATE = 0.25
+"""So far behind the clock, lost time is not made up for [s]."""
+_SPACING = 2.6
+"""Between two robots [m]."""
+_PICK_RADIUS = 0.035
+"""A click so near to a sensor is meant for it [m]."""
+
+
+class Page:
+    """A local page with one robot, or several that meet the same throws.
+
+    Args:
+        sources: Policy of each robot: name, file, checkpoint or run folder.
+        port: Port of 127.0.0.1; 0 for any that is free.
+        seed: Seed of what is left to chance.
+
+    Raises:
+        ValueError: If there is no such policy.
+        OSError: If the port is taken.
+    """
+
+    def __init__(self, sources: Sequence[str], port: int = 0, seed: int = 0) -> None:
+        self.sessions = [Session(source, seed) for source in sources]
+        self.hz = self.sessions[0].hz
+        self.server = open_server(port)
+        set_stage(self.server)
+        self._commands: queue.Queue[Callable[[], object]] = queue.Queue()
+        self._scenes = [self._scene_of(i) for i in range(len(sources))]
+        self.panel = Panel(
+            self.server,
+            self.sessions,
+            offered_policies(sources),
+            Wishes(
+                throw=lambda bearing: self._ask(self.throw_from, bearing),
+                pause=lambda: self._ask(self.pause),
+                step=lambda: self._ask(self.step_once),
+                reset=lambda: self._ask(self.reset),
+                replay=lambda: self._ask(self.replay),
+                save=lambda client: self._ask(self.save, client),
+                mask=lambda every: self._ask(self.mask_all, every),
+                sense=lambda: self._ask(self.sense),
+                load=lambda i, source: self._ask(self.load, i, source),
+            ),
+        )
+        self.server.scene.on_click()(
+            lambda event: self._ask(
+                self.click,
+                np.array(event.ray_origin),
+                np.array(event.ray_direction),
+            )
+        )
+        self.server.on_client_connect(lambda _: self._ask(self._greet))
+        self.server.on_client_disconnect(lambda _: self._ask(lambda: None))
+        half = _SPACING * (len(sources) - 1) / 2
+        camera = self.server.initial_camera
+        # The robot stands left of the middle: the panel is at the right.
+        camera.position = (4.0 + 1.6 * half, -1.4, 1.8)
+        camera.look_at, camera.fov = (0.0, 0.45, 0.92), 0.75
+        self.is_paused = False
+        self.error = ""
+        """What went wrong; "" while all is well."""
+        self.steps = 0
+        """Control steps computed so far."""
+        self._random = np.random.default_rng(seed)
+        self._versions = [_version(source) for source in sources]
+        self._notes = [""] * len(sources)
+        self._looked = self._panel_shown = self._pictured = 0.0
+        self._steps_shown, self._speed = 0, ""
+        self._replayed: deque[list[Frame]] = deque()
+        self._forget()
+
+    def _scene_of(self, i: int) -> RobotScene:
+        session = self.sessions[i]
+        several = len(self.sessions) > 1
+        return RobotScene(
+            self.server,
+            f"/robot_{i}",
+            session.body,
+            session.skin,
+            session.config.task.throws.balls,
+            (0.0, _SPACING * ((len(self.sessions) - 1) / 2 - i) * several),
+            _short(session.source) if several else "",
+        )
+
+    def _forget(self) -> None:
+        """Begin all counts and memories anew."""
+        number = len(self.sessions)
+        self._memory: deque[list[Frame]] = deque(maxlen=round(MEMORY * self.hz))
+        self._avoided, self._came = [0] * number, [0] * number
+        self._survival: list[list[float]] = [[] for _ in range(number)]
+        self._ended_for = [0] * number
+        self._since_throw = 0
+        self._replayed.clear()
+
+    @property
+    def address(self) -> str:
+        """Where the page is."""
+        return f"http://127.0.0.1:{self.server.get_port()}"
+
+    # --- the loop ---------------------------------------------------------------
+
+    def _ask(self, wish: Callable[..., object], *args: Any) -> None:
+        """Let the loop do something; called by any thread."""
+        self._commands.put(lambda: wish(*args))
+
+    def run(self) -> None:
+        """Play in real time for as long as the process lives."""
+        due = time.monotonic()
+        while True:
+            if not self.server.get_clients():
+                self._do(self._commands.get())
+                due = self._panel_shown = time.monotonic()
+                continue
+            late = time.monotonic() - due
+            self._do(partial(self.advance, late > 1 / self.hz))
+            due += self.panel.slowdown.value / self.hz
+            if late > _TOO_LATE:
+                due = time.monotonic()
+            # At least what has been asked for so far is done.
+            while True:
+                try:
+                    wish = self._commands.get(timeout=max(due - time.monotonic(), 0))
+                except queue.Empty:
+                    break
+                self._do(wish)
+
+    def close(self) -> None:
+        """Close the page."""
+        stop_server(self.server)
+
+    def _do(self, wish: Callable[[], object]) -> None:
+        """Do something; what goes wrong is shown on the page, which lives on."""
+        try:
+            wish()
+        # A policy may be any code, and fail in any way.
+        except Exception as error:
+            self.error = f"{type(error).__name__}: {error}"
+            self.panel.show_error(self.error)
+
+    def advance(self, is_late: bool = False) -> None:
+        """Go one control step on, if time goes on, and draw if a picture is due.
+
+        Args:
+            is_late: Whether it is behind the clock: pictures are then left out.
+        """
+        if self._replayed:
+            frames = self._replayed.popleft()
+        elif not self.is_paused and not self.error:
+            self.play()
+            frames = [session.frame for session in self.sessions]
+        else:
+            frames = None
+        now = time.monotonic()
+        wait = 1 / (_LEAST_PICTURE_HZ if is_late else _PICTURE_HZ)
+        # A control step sooner is nearer than one later.
+        if frames is not None and now - self._pictured > wait - 0.5 / self.hz:
+            self._pictured = now
+            self._draw(frames)
+        if now - self._panel_shown > 1 / _PANEL_HZ:
+            self._show()
+        if now - self._looked > _FOLLOW_PERIOD:
+            self._looked = now
+            self._follow()
+
+    def play(self) -> None:
+        """Compute one control step of all robots."""
+        self._since_throw += 1
+        tempo = self.panel.tempo.value
+        if tempo and self._since_throw >= 60 * self.hz / tempo:
+            self.throw_from(None)
+        # The wait after an end is nothing to remember.
+        goes_on = any(session.frame.ending is None for session in self.sessions)
+        frames = []
+        for i, session in enumerate(self.sessions):
+            if session.frame.ending is None:
+                frame = session.step()
+                if frame.ending is not None:
+                    self._end(i)
+            else:
+                frame = session.frame
+                self._ended_for[i] += 1
+                if self._ended_for[i] > _PAUSE_AFTER_END * self.hz:
+                    frame = session.reset()
+            frames.append(frame)
+        self.steps += 1
+        if goes_on or not self._memory:
+            self._memory.append(frames)
+
+    def _end(self, i: int) -> None:
+        """Count what an episode that ended has brought."""
+        session = self.sessions[i]
+        avoided, came = session.avoided
+        self._avoided[i] += avoided
+        self._came[i] += came
+        self._survival[i].append(session.frame.survived)
+        self._ended_for[i] = 0
+
+    def _draw(self, frames: Sequence[Frame]) -> None:
+        with self.server.atomic():
+            for session, scene, frame in zip(
+                self.sessions, self._scenes, frames, strict=True
+            ):
+                scene.draw(frame, session.masked)
+
+    # --- what visitors ask for --------------------------------------------------
+
+    def _greet(self) -> None:
+        """Show a new visitor how it stands."""
+        self._draw([session.frame for session in self.sessions])
+        self._show()
+
+    def throw(self, throw: Throw) -> None:
+        """Throw one ball at each robot."""
+        self._since_throw = 0
+        self._replayed.clear()
+        for session in self.sessions:
+            session.throw(throw)
+
+    def throw_from(self, bearing: float | None) -> None:
+        """Throw a ball as the sliders say.
+
+        Args:
+            bearing: Where it comes from, from the robot's heading [deg]; None: from
+                anywhere.
+        """
+        if bearing is None:
+            bearing = self._random.uniform(-180, 180)
+        # All robots meet the same one.
+        self.throw(
+            Throw(
+                azimuth=np.radians(bearing),
+                distance=self._random.uniform(*self.sessions[0].distances),
+                target=self._random.uniform(),
+                speed=self.panel.speed.value,
+                height=self.panel.height.value,
+            )
+        )
+
+    def click(self, origin: np.ndarray, direction: np.ndarray) -> None:
+        """Mask the sensor that is clicked on, or throw a ball.
+
+        A click on a robot throws one at that place, from where the visitor looks; on
+        the floor, from there.
+
+        Args:
+            origin: Where the visitor looks from [m], ``[3]``.
+            direction: In which direction, ``[3]``.
+        """
+        for i, (session, scene) in enumerate(
+            zip(self.sessions, self._scenes, strict=True)
+        ):
+            local = origin - scene.place
+            sensor = session.sensor_at(local, direction, _PICK_RADIUS)
+            if sensor is not None:
+                self.mask(i, session.masked ^ {sensor})
+                return
+            session.body.place(session.frame.qpos)
+            place = session.body.hit(local, direction)
+            if place is not None:
+                self._throw_at(session, session.azimuth_of(local), place)
+                return
+        if direction[2] < 0:
+            floor = origin - origin[2] / direction[2] * direction
+            away = [np.linalg.norm(floor - s.place) for s in self._scenes]
+            i = int(np.argmin(away))
+            session, floor = self.sessions[i], floor - self._scenes[i].place
+            azimuth, distance = session.azimuth_of(floor), session.distance_of(floor)
+            self.throw(
+                Throw(
+                    azimuth=azimuth,
+                    distance=distance,
+                    speed=self.panel.speed.value,
+                    height=self.panel.height.value,
+                )
+            )
+
+    def _throw_at(self, session: Session, azimuth: float, place: np.ndarray) -> None:
+        self.throw(
+            Throw(
+                azimuth=azimuth,
+                distance=float(np.mean(session.distances)),
+                target=session.target_near(place),
+                speed=self.panel.speed.value,
+                height=self.panel.height.value,
+            )
+        )
+
+    def mask(self, i: int, sensors: set[int]) -> None:
+        """Mask sensors of a robot, and no others."""
+        session = self.sessions[i]
+        session.mask(sensors)
+        if session.skin is not None:
+            self.panel.show_masked(len(sensors), len(session.skin))
+        self._draw([session.frame for session in self.sessions])
+
+    def mask_all(self, every: bool) -> None:
+        """Mask all sensors of all robots, or none."""
+        for i, session in enumerate(self.sessions):
+            if session.skin is not None:
+                self.mask(i, set(range(len(session.skin))) if every else set())
+
+    def pause(self) -> None:
+        """Stop time, or let it go on."""
+        self.is_paused = not self.is_paused
+
+    def step_once(self) -> None:
+        """Stop time, and go one control step on."""
+        self.is_paused = True
+        self.play()
+        self._draw([session.frame for session in self.sessions])
+
+    def reset(self) -> None:
+        """Begin anew, with all counts at 0."""
+        self._clear_error()
+        for session in self.sessions:
+            session.reset()
+        self._forget()
+        self._greet()
+
+    def replay(self) -> None:
+        """Show what was last once more."""
+        self._replayed = deque(self._memory)
+
+    def sense(self) -> None:
+        """Take the sensors that the panel says, for all robots with a skin."""
+        for i, session in enumerate(self.sessions):
+            if session.skin is not None:
+                sensor = session.readable(**self.panel.sensor_changes)
+                if sensor is None:
+                    self.panel.show_sensors(self.sessions)
+                    raise ValueError("the policy cannot read these sensors")
+                session.configure(sensor)
+                self._exchange_scene(i)
+        self.reset()
+        self.panel.show_sensors(self.sessions)
+
+    def load(self, i: int, source: str) -> None:
+        """Let a robot take another policy.
+
+        Raises:
+            ValueError: If there is none, or it acts at another rate than the others.
+        """
+        self.sessions[i].load(source)
+        self._versions[i], self._notes[i] = _version(source), ""
+        self._exchange_scene(i)
+        self.reset()
+        self.panel.show_sensors(self.sessions)
+
+    def _exchange_scene(self, i: int) -> None:
+        self._scenes[i].remove()
+        self._scenes[i] = self._scene_of(i)
+
+    def _clear_error(self) -> None:
+        self.error = ""
+        self.panel.show_error("")
+
+    # --- what is told -----------------------------------------------------------
+
+    def _show(self) -> None:
+        """Bring the panel up to date."""
+        now = time.monotonic()
+        passed, done = now - self._panel_shown, self.steps - self._steps_shown
+        self._panel_shown, self._steps_shown = now, self.steps
+        wanted = self.hz / self.panel.slowdown.value
+        is_slow = 0 < done < 0.9 * wanted * passed - 1
+        self._speed = f"Slow: {done / passed:.0f} of {wanted:.0f} steps a second."
+        if not is_slow:
+            self._speed = ""
+        frames = list(self._memory)
+        self.panel.show_status(self._status())
+        self.panel.show_policies(self.sessions, self._notes)
+        if not frames:
+            return
+        maps = [
+            np.stack([f[i].reading for f in frames if len(f[i].reading)])
+            for i, session in enumerate(self.sessions)
+            if session.skin is not None
+        ]
+        self.panel.show_map(maps, round(MEMORY * self.hz))
+        clock = (np.arange(len(frames)) - len(frames) + 1) / self.hz
+        robots = range(len(self.sessions))
+        self.panel.show_plots(
+            clock,
+            [np.array([f[i].reading.max(initial=0) for f in frames]) for i in robots],
+            [np.array([_or_nan(f[i].value) for f in frames]) for i in robots],
+            self._survival,
+            {s.source: s.critic is not None for s in self.sessions},
+        )
+
+    def _status(self) -> list[str]:
+        """Return how it stands, in Markdown."""
+        state = "**Paused.** " if self.is_paused else self._speed
+        state = "**Replay.** " if self._replayed else state
+        lines = ["| | avoided | untouched | best |", "|---|---|---|---|"]
+        for i, session in enumerate(self.sessions):
+            avoided, came = session.avoided
+            if session.frame.ending is not None:
+                # Counted already.
+                avoided = came = 0
+            now = session.frame.survived
+            best = max([now, *self._survival[i]])
+            lines.append(
+                f"| {_short(session.source)} | **{self._avoided[i] + avoided}** of "
+                f"{self._came[i] + came} | {now:.1f} s | {best:.1f} s |"
+            )
+        return [*lines, "", state] if state else lines
+
+    def _follow(self) -> None:
+        """Take up newer policies of runs that are still trained."""
+        for i, session in enumerate(self.sessions):
+            if not Path(session.source).is_dir():
+                continue
+            version = _version(session.source)
+            if version != self._versions[i]:
+                self._versions[i] = version
+                session.follow(load_policy(session.source), load_critic(session.source))
+                clock = time.strftime("%H:%M:%S")
+                self._notes[i] = f"Newest of the run, taken up at {clock}."
+
+    def save(self, client: viser.ClientHandle | None) -> None:
+        """Give a visitor a page that plays what was last without a server."""
+        if client is not None:
+            client.send_file_download(
+                "egoskin.html", self.recording().encode(), save_immediately=True
+            )
+
+    def recording(self) -> str:
+        """Return a page that plays what was last without a server, as HTML."""
+        frames = list(self._memory)[:: round(self.hz / _PICTURE_HZ)]
+        recorder = self.server.get_scene_serializer()
+        # Visitors see the last of these pictures alone.
+        with self.server.atomic():
+            for each in frames:
+                self._draw(each)
+                recorder.insert_sleep(1 / _PICTURE_HZ)
+        return recorder.as_html()
+
+
+def offered_policies(sources: Sequence[str]) -> list[str]:
+    """Return what policies can be chosen: those given, those shipped, runs here."""
+    runs = sorted(
+        str(path.parent) for path in Path("runs").glob("*/checkpoint.safetensors")
+    )
+    return list(dict.fromkeys([*sources, *shipped_policies(), *runs]))
+
+
+def _version(source: str) -> int:
+    """Return what changes when a policy is written anew."""
+    return policy_file(source).stat().st_mtime_ns
+
+
+def _short(source: str) -> str:
+    """Return the name of a policy without its folder."""
+    return Path(source).stem if "/" in source else source
+
+
+def _or_nan(value: float | None) -> float:
+    return np.nan if value is None else value

@@ -1,0 +1,327 @@
+"""The panel of the page: what can be pressed and moved, and what is told.
+
+Contract: the panel computes nothing and changes nothing; it shows what it is given and
+hands what is asked for to the page, by a function for each wish.
+"""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import viser
+from viser import uplot
+
+from egoskin.viewer.web.scene import colour_of
+from egoskin.viewer.web.session import HEIGHTS, SPEEDS, Session
+
+SIDES = {"Front": 0.0, "Left": 90.0, "Behind": 180.0, "Right": -90.0}
+"""Where a ball can be thrown from: its bearing from the robot's heading [deg]."""
+_KINDS = {
+    "spheres": {"coverage": "field", "reduce": "none"},
+    "beams, closest of each sensor": {"coverage": "ray", "reduce": "min"},
+    "beams, all": {"coverage": "ray", "reduce": "none"},
+}
+_SIGNALS = ("proximity", "closeness", "binary", "localization")
+_CORRUPTIONS = ("none", "time_of_flight", "capacitive", "acoustic")
+_COLOURS = ("#e8590c", "#1c7ed6")
+_MASK_HELP = "Click a sensor on the robot to mask it, click again to bring it back."
+_HELP = (
+    "**Click** the robot: a ball flies at that place from your side. "
+    "**Click** the floor: a ball comes from there."
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wishes:
+    """What the panel asks of the page."""
+
+    throw: Callable[[float | None], None]
+    """Throw a ball from a bearing [deg]; None: from anywhere."""
+    pause: Callable[[], None]
+    """Stop time, or let it go on."""
+    step: Callable[[], None]
+    """Stop time, and go one control step on."""
+    reset: Callable[[], None]
+    """Begin anew."""
+    replay: Callable[[], None]
+    """Show what was last once more."""
+    save: Callable[[viser.ClientHandle | None], None]
+    """Give a visitor a recording of what was last."""
+    mask: Callable[[bool], None]
+    """Mask all sensors, or none."""
+    sense: Callable[[], None]
+    """Take the sensors that the panel says."""
+    load: Callable[[int, str], None]
+    """Let a robot take another policy."""
+
+
+class Panel:
+    """Buttons, sliders, figures and plots of the page.
+
+    Args:
+        server: The page.
+        sessions: The robots.
+        policies: What policies can be chosen.
+        wishes: What is done when something is asked for.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        sessions: Sequence[Session],
+        policies: Sequence[str],
+        wishes: Wishes,
+    ) -> None:
+        self._gui, self._wishes = server.gui, wishes
+        gui = server.gui
+        gui.configure_theme(
+            show_logo=False,
+            show_share_button=False,
+            control_width="medium",
+            brand_color=(28, 126, 214),
+        )
+        gui.set_panel_label("egoskin")
+        self._error = gui.add_markdown("", visible=False)
+        self._status = gui.add_markdown("")
+        tabs = gui.add_tab_group()
+        with tabs.add_tab("Play"):
+            self._add_play()
+        with tabs.add_tab("Sensors"):
+            self._add_sensors()
+        with tabs.add_tab("Plots"):
+            self._add_plots(sessions)
+        with tabs.add_tab("Policy"):
+            self._add_policies(sessions, policies)
+        self.show_sensors(sessions)
+
+    # --- what can be pressed ----------------------------------------------------
+
+    def _add_play(self) -> None:
+        gui, wishes = self._gui, self._wishes
+        throw = gui.add_button("Throw a ball", icon=viser.Icon.BALL_BASEBALL)
+        throw.on_click(lambda _: wishes.throw(None))
+        sides = gui.add_button_group("From", list(SIDES))
+        sides.on_click(lambda event: wishes.throw(SIDES[event.target.value]))
+        self.speed = gui.add_slider("Speed [m/s]", *SPEEDS, 0.5, 6.0)
+        self.height = gui.add_slider("Height [m]", *HEIGHTS, 0.1, 2.5)
+        self.tempo = gui.add_slider(
+            "Balls a minute", 0, 60, 1, 15, hint="Thrown by themselves; 0: none"
+        )
+        gui.add_divider()
+        self.slowdown = gui.add_slider("Times slower", 1, 20, 1, 1)
+        actions = {
+            "Pause": wishes.pause,
+            "Step": wishes.step,
+            "Reset": wishes.reset,
+        }
+        times = gui.add_button_group("Time", list(actions))
+        times.on_click(lambda event: actions[event.target.value]())
+        last = gui.add_button_group(
+            "Last 5 s",
+            ["Replay", "Save"],
+            hint="Save: as a page that plays them without a server",
+        )
+
+        def again(event: viser.GuiEvent) -> None:
+            if event.target.value == "Save":
+                wishes.save(event.client)
+            else:
+                wishes.replay()
+
+        last.on_click(again)
+        self._map = gui.add_image(_EMPTY, label="Readings, last five seconds")
+        gui.add_markdown(_HELP)
+
+    def _add_sensors(self) -> None:
+        gui, wishes = self._gui, self._wishes
+        self._masked = gui.add_markdown("")
+        masks = gui.add_button_group("Mask", ["All", "None"])
+        masks.on_click(lambda event: wishes.mask(event.target.value == "All"))
+        gui.add_divider()
+        self._kind = gui.add_dropdown("Kind", list(_KINDS))
+        self._signal = gui.add_dropdown("Signal", _SIGNALS)
+        self._range = gui.add_slider("Range [m]", 0.1, 5.0, 0.1, 2.0)
+        self._corruption = gui.add_dropdown("Imperfection", _CORRUPTIONS)
+        for handle in (self._kind, self._signal, self._range, self._corruption):
+            # What the page itself sets has no client.
+            handle.on_update(lambda event: event.client and wishes.sense())
+        self._readable = gui.add_markdown("")
+
+    def _add_plots(self, sessions: Sequence[Session]) -> None:
+        gui = self._gui
+        nothing = tuple(np.zeros(1) for _ in range(1 + len(sessions)))
+        series = [uplot.Series()]
+        for i in range(len(sessions)):
+            name = ("left", "right")[i] if len(sessions) > 1 else "robot"
+            series.append(uplot.Series(label=name, stroke=_COLOURS[i], width=2))
+        axis = uplot.Axis(stroke="#495057", grid={"stroke": "#e9ecef", "width": 1})
+
+        def plot(x: str) -> viser.GuiUplotHandle:
+            return gui.add_uplot(
+                nothing,
+                (uplot.Series(label=x), *series[1:]),
+                scales={"x": uplot.Scale(time=False, auto=True)},
+                axes=(axis, axis),
+                legend=uplot.Legend(show=len(sessions) > 1),
+                height=150 if len(sessions) == 1 else 115,
+            )
+
+        gui.add_markdown("**Strongest reading**, 1: touching; last five seconds [s]")
+        self._nearest = plot("time [s]")
+        self._value_title = gui.add_markdown("**Value of the state**, by the critic")
+        self._value = plot("time [s]")
+        gui.add_markdown("**Untouched** [s], episode by episode")
+        self._survival = plot("episode")
+
+    def _add_policies(self, sessions: Sequence[Session], names: Sequence[str]) -> None:
+        gui, wishes = self._gui, self._wishes
+        self._policies = []
+        for i, session in enumerate(sessions):
+            label = ("Left", "Right")[i] if len(sessions) > 1 else "Policy"
+            given = [session.source, *(n for n in names if n != session.source)]
+            handle = gui.add_dropdown(label, given, initial_value=session.source)
+
+            def choose(i: int, event: viser.GuiEvent) -> None:
+                if event.client:
+                    wishes.load(i, event.target.value)
+
+            handle.on_update(partial(choose, i))
+            self._policies.append(handle)
+        self._about = gui.add_markdown("")
+
+    # --- what is asked for ------------------------------------------------------
+
+    @property
+    def sensor_changes(self) -> dict:
+        """The sensors that are asked for: fields of their configuration."""
+        return {
+            **_KINDS[self._kind.value],
+            "signal": self._signal.value,
+            "range": self._range.value,
+            "corruption": self._corruption.value,
+        }
+
+    # --- what is told -----------------------------------------------------------
+
+    def show_error(self, text: str) -> None:
+        """Show what went wrong; "" takes it away."""
+        self._error.visible = bool(text)
+        if text:
+            self._error.content = f"**Error.** {html.escape(text)}"
+
+    def show_status(self, lines: Sequence[str]) -> None:
+        """Show how it stands, in lines of Markdown."""
+        text = "\n".join(lines)
+        if text != self._status.content:
+            self._status.content = text
+
+    def show_policies(self, sessions: Sequence[Session], notes: Sequence[str]) -> None:
+        """Show which policies play, and what is known of them."""
+        texts = []
+        for session, handle, note in zip(sessions, self._policies, notes, strict=True):
+            if handle.value != session.source:
+                handle.value = session.source
+            sensor, trained = session.config.sensor, session.frames_trained
+            texts.append(
+                f"**{session.source}**: {sensor.label()}, trained for "
+                f"{trained / 1e6:.1f} M steps. {note}"
+            )
+        self._about.content = "\n\n".join(texts)
+
+    def show_sensors(self, sessions: Sequence[Session]) -> None:
+        """Show the sensors of the first robot that has any."""
+        for session in sessions:
+            if session.skin is not None:
+                break
+        else:
+            self._masked.content = "No robot here has a skin."
+            self._readable.content = ""
+            for handle in (self._kind, self._signal, self._range, self._corruption):
+                handle.disabled = True
+            return
+        assert session.skin is not None
+        own, sensor = session.policy.env_config.sensor, session.config.sensor
+        kinds = [k for k, v in _KINDS.items() if session.readable(**v) is not None]
+        signals = [s for s in _SIGNALS if session.readable(signal=s) is not None]
+        flaws = [c for c in _CORRUPTIONS if session.readable(corruption=c) is not None]
+        chosen = {"coverage": sensor.coverage, "reduce": sensor.reduce}
+        kind = next(k for k, v in _KINDS.items() if v == chosen)
+        for handle, options, value in (
+            (self._kind, kinds, kind),
+            (self._signal, signals, sensor.signal),
+            (self._corruption, flaws, sensor.corruption),
+        ):
+            if tuple(handle.options) != tuple(options):
+                handle.options = options
+            handle.value, handle.disabled = value, len(options) < 2
+        self._range.disabled = False
+        self._range.value = min(max(sensor.range, 0.1), 5.0)
+        size = session.pipeline.signal_size
+        self._readable.content = (
+            f"The policy reads {size} numbers from its skin, and was trained with "
+            f"{own.label()}. What is offered here gives as many, so it can be read; "
+            "that it is understood is another matter. The number of sensors and their "
+            "places cannot change."
+        )
+        self.show_masked(len(session.masked), len(session.skin))
+
+    def show_masked(self, masked: int, total: int) -> None:
+        """Show how many sensors are masked."""
+        self._masked.content = f"**{masked} of {total}** sensors masked. {_MASK_HELP}"
+
+    def show_map(self, readings: Sequence[np.ndarray], steps: int) -> None:
+        """Show readings over time.
+
+        Args:
+            readings: Of each robot with sensors, ``[T, S]``, the newest last.
+            steps: Longest ``T``.
+        """
+        rows = []
+        for reading in readings:
+            padded = np.zeros((steps, reading.shape[1]))
+            padded[steps - len(reading) :] = reading
+            colours = colour_of(padded.T.ravel()).reshape(-1, steps, 3)
+            rows += [np.full((1, steps, 3), 255, np.uint8)] * bool(rows)
+            rows.append(colours)
+        image = np.concatenate(rows) if rows else _EMPTY
+        self._map.visible = bool(rows)
+        if rows:
+            self._map.image = np.repeat(np.repeat(image, 2, axis=0), 2, axis=1)
+
+    def show_plots(
+        self,
+        time: np.ndarray,
+        strongest: Sequence[np.ndarray],
+        value: Sequence[np.ndarray],
+        survival: Sequence[Sequence[float]],
+        has_critic: Mapping[str, bool],
+    ) -> None:
+        """Show curves.
+
+        Args:
+            time: Of each step [s], ``[T]``.
+            strongest: The strongest reading of each robot, ``[T]`` each.
+            value: The critic's value, ``[T]`` each, NaN without one.
+            survival: How long each robot was untouched, by episode [s].
+            has_critic: Whether each policy has a critic.
+        """
+        self._nearest.data = (time, *strongest)
+        self._value.visible = any(has_critic.values())
+        lacking = [name for name, has in has_critic.items() if not has]
+        title = "**Value of the state**, by the critic"
+        if lacking:
+            names = ", ".join(lacking)
+            title += f": not of {names}. A policy file holds no critic, a run does."
+        self._value_title.content = title
+        if self._value.visible:
+            self._value.data = (time, *value)
+        longest = max(1, *(len(s) for s in survival))
+        padded = [np.array([*s, *[np.nan] * (longest - len(s))]) for s in survival]
+        self._survival.data = (np.arange(1.0, longest + 1), *padded)
+
+
+_EMPTY = np.zeros((2, 2, 3), np.uint8)

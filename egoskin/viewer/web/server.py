@@ -1,0 +1,37 @@
+"""The server of a page: for this machine alone, and quiet."""
+
+from __future__ import annotations
+
+import socket
+from contextlib import redirect_stdout
+from io import StringIO
+
+import viser
+
+
+def open_server(port: int) -> viser.ViserServer:
+    """Return a server of a page that this machine alone can reach.
+
+    Args:
+        port: Port of 127.0.0.1; 0 for any that is free.
+
+    Raises:
+        OSError: If the port is taken.
+    """
+    # viser would take another.
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1", port))
+        except OSError as error:
+            raise OSError(
+                f"port {port} of 127.0.0.1 is taken: choose another --port"
+            ) from error
+    with redirect_stdout(StringIO()):
+        return viser.ViserServer(host="127.0.0.1", port=port, verbose=False)
+
+
+def stop_server(server: viser.ViserServer) -> None:
+    """Close a page for all who have it open."""
+    with redirect_stdout(StringIO()):
+        server.stop()

@@ -1,0 +1,386 @@
+"""One robot that is played with: its policy, its sensors, balls thrown on demand.
+
+Contract: all is computed by the environment of the task, one row of it; only what is
+thrown, and when, comes from outside, by a `Thrower` that draws what it is given.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import Compose
+
+from egoskin.envs.dodgeball import DodgeballEnv
+from egoskin.envs.throws import Draw, Thrower
+from egoskin.make import EnvConfig, make_worker_env
+from egoskin.policies.policy import Critic, Policy, load_critic, load_policy
+from egoskin.robots.kinematics import rotate
+from egoskin.sensors import FieldSensor, RaySensor, SensorPipeline, Skin
+from egoskin.sensors.config import SensorConfig
+from egoskin.sensors.pipeline import SensorGroup
+from egoskin.viewer.offscreen import closest_point, ending_of
+from egoskin.viewer.web.body import Body
+
+# Nothing is thrown by itself: the next throw is this far off [s].
+_NEVER = 1e6
+_MIN_DISTANCE, _MAX_DISTANCE = 1.5, 8.0
+"""Balls clicked nearer or farther than this are released at this distance [m]."""
+SPEEDS, HEIGHTS = (1.0, 12.0), (0.3, 4.0)
+"""Speeds [m/s] and heights of release [m] that can be thrown with."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Throw:
+    """What is wanted of a throw; None leaves it to chance, as the task draws it."""
+
+    speed: float | None = None
+    """Initial speed [m/s]."""
+    height: float | None = None
+    """Height of release [m]."""
+    azimuth: float | None = None
+    """Direction the ball comes from, relative to the heading [rad]."""
+    distance: float | None = None
+    """Horizontal distance of release from the base [m]."""
+    target: float | None = None
+    """The point aimed at: a number in [0, 1), see `Session.target_near`."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Frame:
+    """What there is to see after a control step, of one robot."""
+
+    qpos: np.ndarray
+    """Base pose and joint positions, ``[7 + J]``."""
+    balls: np.ndarray
+    """Centres of the balls [m], ``[O, 3]``."""
+    active: np.ndarray
+    """Which of them are in play, ``[O]`` bool."""
+    reading: np.ndarray
+    """What each sensor reads, from 1, touching, to 0, nothing, ``[S]``."""
+    line: np.ndarray
+    """Where the line of each sensor ends, on what it sees [m], ``[S, 3]``; NaN: it
+    sees nothing."""
+    step: int
+    """Control steps since the start of the episode."""
+    survived: float
+    """Time since the first throw of the episode [s]."""
+    value: float | None
+    """Value of the state by the critic; None without one."""
+    ending: str | None
+    """Why the episode ends here ("hit", "fall", ...); None while it goes on."""
+
+
+class ThrownOnDemand(Thrower):
+    """Throws what it is told to; what is left open is drawn as the task draws it."""
+
+    wanted = Throw()
+
+    def first_delay(self, seed: int, row: Tensor, episode: Tensor) -> Tensor:
+        """Return never [s], ``[n]``."""
+        return torch.full(row.shape, _NEVER)
+
+    def draw(self, seed: int, row: Tensor, episode: Tensor, throw: Tensor) -> Draw:
+        """Return the wanted throw, the next of which is never due."""
+        draw = super().draw(seed, row, episode, throw)
+        given: dict[str, Tensor] = {"interval": torch.full(row.shape, _NEVER)}
+        for name in ("speed", "height", "azimuth", "distance"):
+            value = getattr(self.wanted, name)
+            if value is not None:
+                given[name] = torch.full(row.shape, float(value))
+        if self.wanted.target is not None:
+            given["target"] = torch.full((len(row), 2), self.wanted.target)
+        return dataclasses.replace(draw, **given)
+
+    def points_w(self, base_pose: Tensor, joint_pos: Tensor) -> Tensor | None:
+        """Return all points that are aimed at, in the world [m], ``[n, 3]``.
+
+        None where the task aims at a box. The i-th is aimed at by a target of
+        (i + 0.5) / n.
+
+        Args:
+            base_pose: Base pose in the world, ``[7]``.
+            joint_pos: Joint positions [rad], ``[J]``.
+        """
+        if self.config.aim == "box":
+            return None
+        kinematics, link, local = self._aim_points
+        position, rotation = kinematics.poses_b(joint_pos[None])
+        turn, shift = rotation[0, link], position[0, link]
+        point_b = (turn * local[:, None, :]).sum(-1) + shift
+        return base_pose[:3] + rotate(base_pose[3:].expand(len(link), 4), point_b)
+
+
+class Session:
+    """A robot with a policy in its task, played step by step.
+
+    Args:
+        policy: Name, file, checkpoint or run folder of its policy.
+        seed: Seed of what is left to chance; robots of one seed start alike, and meet
+            the same throws.
+
+    Raises:
+        ValueError: If there is no such policy.
+    """
+
+    def __init__(self, policy: str, seed: int = 0) -> None:
+        self.seed = seed
+        self.masked: set[int] = set()
+        """Indices of the sensors that detect nothing."""
+        self.load(policy)
+
+    # --- policy and sensors -----------------------------------------------------
+
+    def load(self, source: str) -> None:
+        """Take another policy, with its own robot, task and skin; begin anew.
+
+        Raises:
+            ValueError: If there is no such policy; all is as it was then.
+        """
+        policy, critic = load_policy(source), load_critic(source)
+        self.source = source
+        self._take(policy, critic)
+        self.masked.clear()
+        self.configure(policy.env_config.sensor)
+
+    def follow(self, policy: Policy, critic: Critic | None) -> None:
+        """Go on with a newer state of the policy, in the midst of the episode."""
+        self._take(policy, critic)
+
+    def _take(self, policy: Policy, critic: Critic | None) -> None:
+        self.policy, self.critic = policy, critic
+
+    @property
+    def frames_trained(self) -> int:
+        """Environment steps that the policy was trained for."""
+        return self.policy.policy_spec.frames
+
+    def configure(self, sensor: SensorConfig) -> None:
+        """Measure with other sensors, and begin anew.
+
+        Raises:
+            ValueError: If the policy cannot read what they signal.
+        """
+        config, pipeline = self._check(sensor)
+        self.config, self.pipeline = config, pipeline
+        self.env = make_worker_env(
+            config, self.policy.skin, num_envs=1, seed=self.seed, keep_raw=True
+        )
+        base = self.env.base_env
+        assert isinstance(base, DodgeballEnv)
+        self.task, self.body = base, Body(config.robot_config)
+        task = config.task
+        self.hz = task.physics.control_hz
+        self._thrower = ThrownOnDemand(
+            task.throws, config.robot_config, task.physics.timestep
+        )
+        base.balls.thrower = self._thrower
+        chain = self.env.transform
+        assert isinstance(chain, Compose)
+        self._sensors = [t for t in chain if isinstance(t, (FieldSensor, RaySensor))]
+        # All, the masked ones of before too: `mask` lets the others see again.
+        self.mask(self.masked)
+        self.reset()
+
+    def readable(self, **changes: Any) -> SensorConfig | None:
+        """Return the policy's own sensors with changes; None if it cannot read them.
+
+        Args:
+            changes: Fields of the configuration of the sensors.
+        """
+        own = self.policy.env_config
+        try:
+            sensor = dataclasses.replace(own.sensor, **changes)
+            self._check(sensor)
+        except ValueError:
+            return None
+        return sensor
+
+    def _check(self, sensor: SensorConfig) -> tuple[EnvConfig, SensorPipeline]:
+        """Return what is measured with; raise ValueError if it cannot be read."""
+        own, skin = self.policy.env_config, self.policy.skin
+        config = dataclasses.replace(own, sensor=sensor)
+        pipeline, expected = config.pipeline(skin), own.pipeline(skin).signal_size
+        if pipeline.signal_size != expected or config.actor_keys != own.actor_keys:
+            raise ValueError(
+                f"the policy reads {expected} numbers of its skin, and these sensors "
+                f"give {pipeline.signal_size}"
+            )
+        return config, pipeline
+
+    @property
+    def skin(self) -> Skin | None:
+        """The sensors, resolved; None without any (blind, or told by an oracle)."""
+        return self.pipeline.skin if self.pipeline.groups else None
+
+    def mask(self, sensors: Collection[int]) -> None:
+        """Let some sensors, and no others, detect nothing from now on."""
+        self.masked = set(sensors)
+        for group, sensor in zip(self.pipeline.groups, self._sensors, strict=True):
+            sensor.mask([i for i, own in enumerate(group.index) if own in self.masked])
+
+    # --- time -------------------------------------------------------------------
+
+    def reset(self) -> Frame:
+        """Begin an episode: the same start each time, and nothing in the air."""
+        self.env.set_seed(self.seed, static_seed=True)
+        self._root = self.env.reset()
+        self.first_throw: int | None = None
+        self.frame = self._look(self._root, None)
+        return self.frame
+
+    @torch.no_grad()
+    def step(self) -> Frame:
+        """Return what there is to see one control step later.
+
+        Raises:
+            ValueError: If the policy's action is not finite.
+        """
+        root = self.policy(self._root)
+        if not root["action"].isfinite().all():
+            raise ValueError(
+                "the policy's action is not finite: its weights, or what it was given, "
+                "are not those of training"
+            )
+        after = self.env.step(root)["next"]
+        self.frame = self._look(after, ending_of(after[0]))
+        self._root = after.exclude("reward")
+        return self.frame
+
+    def throw(self, throw: Throw) -> None:
+        """Throw a ball in the next step."""
+        self._thrower.wanted = throw
+        # It is due at once.
+        self.task.balls.state["next_throw_step"].zero_()
+        if self.first_throw is None:
+            self.first_throw = self.frame.step
+
+    @property
+    def avoided(self) -> tuple[int, int]:
+        """Balls avoided and balls that came, in this episode."""
+        counted = self.task.balls.state
+        return int(counted["avoided"].sum()), int(counted["arrived"].sum())
+
+    # --- what a click means -----------------------------------------------------
+
+    def azimuth_of(self, point: np.ndarray) -> float:
+        """Return the direction of a point from the base, relative to the heading [rad].
+
+        Args:
+            point: In the world [m], ``[3]`` or ``[2]``.
+        """
+        x, y = point[:2] - self.frame.qpos[:2]
+        w, qx, qy, qz = self.frame.qpos[3:7]
+        heading = math.atan2(2 * (w * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
+        angle = math.atan2(y, x) - heading
+        return math.remainder(angle, 2 * math.pi)
+
+    def distance_of(self, point: np.ndarray) -> float:
+        """Return the distance of a point from the base, as far as one throws [m]."""
+        away = float(np.hypot(*(point[:2] - self.frame.qpos[:2])))
+        return min(max(away, _MIN_DISTANCE), _MAX_DISTANCE)
+
+    @property
+    def distances(self) -> tuple[float, float]:
+        """Range of distances that the task throws from [m]."""
+        return self.config.task.throws.distance
+
+    def sensor_at(
+        self, origin: np.ndarray, direction: np.ndarray, within: float
+    ) -> int | None:
+        """Return the sensor that a ray meets first, on the side turned to it.
+
+        Args:
+            origin: Where the ray starts in the world [m], ``[3]``.
+            direction: Its direction, ``[3]``.
+            within: How far off the ray it may be [m].
+        """
+        if self.skin is None:
+            return None
+        self.body.place(self.frame.qpos)
+        along = direction / np.linalg.norm(direction)
+        way = self.body.sensor_points(self.skin) - origin
+        ahead = way @ along
+        beside = np.linalg.norm(way - ahead[:, None] * along, axis=-1)
+        faces = self.body.sensor_normals(self.skin) @ along < 0
+        met = (beside < within) & (ahead > 0) & faces
+        return int(np.where(met, ahead, np.inf).argmin()) if met.any() else None
+
+    def target_near(self, point: np.ndarray) -> float | None:
+        """Return what `Throw.target` is for the point aimed at nearest to a place.
+
+        Args:
+            point: In the world [m], ``[3]``.
+        """
+        pose = torch.from_numpy(self.frame.qpos).float()
+        points = self._thrower.points_w(pose[:7], pose[7:])
+        if points is None:
+            return None
+        away = (points - torch.from_numpy(point).float()).square().sum(-1)
+        return (int(away.argmin()) + 0.5) / len(points)
+
+    # --- what is seen -----------------------------------------------------------
+
+    def _look(self, state: TensorDictBase, ending: str | None) -> Frame:
+        """Return what there is to see of a state, ``[1]``, after all transforms."""
+        row = state[0]
+        assert isinstance(row, TensorDictBase)
+        qpos = np.concatenate((row["base_pose"], row["joint_pos"])).astype(float)
+        balls = np.asarray(row["object_pose"], float)
+        active = np.asarray(row["object_active"])
+        number = len(self.skin) if self.skin else 0
+        reading, line = np.zeros(number), np.full((number, 3), np.nan)
+        for group in self.pipeline.groups:
+            reading[group.index] = self._readings(row, group)
+        if self.skin is not None and active.any():
+            seeing = self.pipeline.detecting(row)
+            self.body.place(qpos)
+            points = self.body.sensor_points(self.skin)[seeing]
+            flying = [
+                closest_point(shape, pose, points)
+                for shape, pose, on in zip(
+                    self.task.scene.objects, balls, active, strict=True
+                )
+                if on
+            ]
+            ends = np.stack(flying)
+            nearest = np.linalg.norm(ends - points, axis=-1).argmin(0)
+            line[seeing] = ends[nearest, np.arange(len(points))]
+        step = int(row["episode_step"])
+        since = 0 if self.first_throw is None else step - self.first_throw
+        value = None
+        if self.critic is not None:
+            value = float(self.critic(state)["state_value"])
+        return Frame(
+            qpos=qpos,
+            balls=balls[:, :3],
+            active=active,
+            reading=reading,
+            line=line,
+            step=step,
+            survived=since / self.hz,
+            value=value,
+            ending=ending,
+        )
+
+    def _readings(self, row: TensorDictBase, group: SensorGroup) -> np.ndarray:
+        """Return what the sensors of a group read, as in `Frame.reading`."""
+        corrupted = f"reading{group.suffix}"
+        key = corrupted if corrupted in row.keys() else f"distance{group.suffix}"
+        distance = np.asarray(row[key], float).reshape(len(group.index), -1).min(-1)
+        ranges = group.skin.range
+        if self.config.sensor.signal == "binary":
+            return (distance <= ranges).astype(float)
+        # As the signal of proximity has it, 1 m being the scale of no range.
+        with np.errstate(invalid="ignore"):
+            share = np.where(
+                np.isinf(ranges), 1 - 1 / (1 + distance), distance / ranges
+            )
+        return 1 - np.clip(share, 0, 1)

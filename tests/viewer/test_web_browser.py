@@ -1,0 +1,190 @@
+"""The page in a real browser: what is drawn moves, what is pressed has an effect."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+from PIL import Image
+
+pytest.importorskip("viser")
+pytest.importorskip("playwright")
+
+from browser import CHROMIUM, browsing
+from egoskin.viewer.web.page import Page
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium here"),
+]
+# Drawn without a graphics card, a picture may take seconds.
+_WAIT = 90.0
+SIZE = (800, 600)
+
+
+@pytest.fixture(scope="module")
+def page() -> Iterator[Page]:
+    page = Page(["field_proximity"])
+    page.panel.tempo.value = 0
+    threading.Thread(target=page.run, daemon=True).start()
+    yield page
+    page.close()
+
+
+class Visit:
+    """A page as a visitor sees it."""
+
+    def __init__(self, context, address: str) -> None:
+        self.tab = context.new_page()
+        self.tab.set_default_timeout(1000 * _WAIT)
+        self.faults: list[str] = []
+        self.tab.on(
+            "console",
+            lambda m: m.type == "error" and self.faults.append(m.text),
+        )
+        self.tab.on("pageerror", lambda error: self.faults.append(str(error)))
+        self.tab.goto(address)
+        self.tab.wait_for_selector("canvas")
+
+    def press(self, name: str) -> None:
+        self.tab.get_by_role("button", name=name, exact=True).click()
+
+    def canvas(self) -> np.ndarray:
+        """Return what is drawn left of the panel, ``[H, W, 3]``."""
+        clip = {"x": 0, "y": 200, "width": 440, "height": 400}
+        picture = self.tab.screenshot(clip=clip, timeout=1000 * _WAIT)
+        return np.asarray(Image.open(io.BytesIO(picture)).convert("RGB")).astype(int)
+
+
+@pytest.fixture
+def visit(page: Page) -> Iterator[Visit]:
+    with browsing(*SIZE) as context:
+        visit = Visit(context, page.address)
+        wait_for(lambda: is_drawn(visit.canvas()))
+        yield visit
+        assert visit.faults == []
+    wait_for(lambda: not page.server.get_clients())
+
+
+def wait_for(what: Callable[[], object]) -> None:
+    end = time.monotonic() + _WAIT
+    while not what():
+        assert time.monotonic() < end
+        time.sleep(0.2)
+
+
+def is_drawn(picture: np.ndarray) -> bool:
+    """Whether there is a robot: dark joints and light shells before a grey floor."""
+    level = picture.sum(-1) / 3
+    return (level < 90).mean() > 0.002 and np.ptp(level) > 120
+
+
+def differs(one: np.ndarray, other: np.ndarray) -> bool:
+    return bool((np.abs(one - other).max(-1) > 40).mean() > 0.002)
+
+
+def test_the_robot_is_drawn_and_what_is_drawn_moves_with_it(page: Page, visit: Visit):
+    visit.press("Pause")
+    wait_for(lambda: page.is_paused)
+    time.sleep(3)
+    still = visit.canvas()
+    assert not differs(still, visit.canvas())
+    # Somewhere else, as nobody's policy has it.
+    page._ask(lambda: page.sessions[0].frame.qpos.__setitem__(2, 1.4))
+    page._ask(lambda: page._draw([page.sessions[0].frame]))
+    wait_for(lambda: differs(still, visit.canvas()))
+    visit.press("Reset")
+    visit.press("Pause")
+    wait_for(lambda: not page.is_paused)
+
+
+def test_a_throw_is_seen_by_the_sensors(page: Page, visit: Visit):
+    page._ask(page.reset)
+    visit.press("Front")
+    wait_for(lambda: page.sessions[0].frame.reading.max(initial=0) > 0.3)
+    visit.press("Pause")
+    wait_for(lambda: page.is_paused)
+    # The moment of the strongest reading, and the same if nothing were sensed.
+    (seen,) = max(page._memory, key=lambda frames: frames[0].reading.max())
+    numb = dataclasses.replace(
+        seen, reading=0 * seen.reading, line=np.full_like(seen.line, np.nan)
+    )
+    page._ask(lambda: page._draw([numb]))
+    time.sleep(5)
+    dark = visit.canvas()
+    page._ask(lambda: page._draw([seen]))
+    wait_for(lambda: differs(dark, visit.canvas()))
+    visit.press("Pause")
+    wait_for(lambda: not page.is_paused)
+
+
+def test_a_click_on_the_floor_throws_a_ball(page: Page, visit: Visit):
+    page._ask(page.reset)
+    wait_for(lambda: page.sessions[0].frame.step > 0)
+    visit.tab.mouse.click(60, 540)
+    wait_for(lambda: page.sessions[0].frame.active.any())
+
+
+def test_another_policy_is_chosen(page: Page, visit: Visit):
+    visit.tab.get_by_role("tab", name="Policy").click()
+    # The one field of that tab.
+    visit.tab.locator("input:visible").last.click()
+    visit.tab.get_by_role("option", name="localization").click()
+    wait_for(lambda: page.sessions[0].source == "localization")
+    assert page.error == ""
+    page._ask(page.load, 0, "field_proximity")
+    wait_for(lambda: page.sessions[0].source == "field_proximity")
+    wait_for(lambda: is_drawn(visit.canvas()))
+
+
+def test_an_error_is_shown_and_the_page_lives_on(page: Page, visit: Visit):
+    page._ask(page.load, 0, "nobody")
+    visit.tab.wait_for_selector("text=no policy nobody")
+    page._ask(page.reset)
+    steps = page.steps
+    wait_for(lambda: page.steps > steps + 5)
+
+
+def test_a_recording_is_a_page_that_plays_alone(
+    page: Page, visit: Visit, tmp_path: Path
+):
+    wait_for(lambda: len(page._memory) > 60)
+    with visit.tab.expect_download() as download:
+        visit.press("Save")
+    path = tmp_path / "saved.html"
+    download.value.save_as(path)
+    alone = Visit(visit.tab.context, path.as_uri())
+    wait_for(lambda: is_drawn(alone.canvas()))
+    assert alone.faults == []
+
+
+def test_other_visitors_and_lost_connections_disturb_nobody(page: Page, visit: Visit):
+    process = psutil.Process()
+    threads, memory = [], []
+    for _ in range(4):
+        other = Visit(visit.tab.context, page.address)
+        wait_for(lambda: len(page.server.get_clients()) == 2)
+        assert other.faults == []
+        other.tab.close()
+        wait_for(lambda: len(page.server.get_clients()) == 1)
+        threads.append(process.num_threads())
+        memory.append(process.memory_info().rss)
+    # The server keeps a pool of threads that it fills once.
+    assert threads[-1] - threads[0] <= 8
+    assert memory[-1] - memory[0] < 50e6
+    steps = page.steps
+    wait_for(lambda: page.steps > steps + 5)
+    page.server._websock_server.disconnect_all_clients()
+    # The browser finds the way back by itself.
+    wait_for(lambda: len(page.server.get_clients()) == 1)
+    steps = page.steps
+    wait_for(lambda: page.steps > steps + 5)
+    # What it says of the connection that was cut.
+    visit.faults[:] = [text for text in visit.faults if "WebSocket" not in text]

@@ -1,0 +1,94 @@
+"""The page of a robot without a policy: joints, and the directions its skin sees."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+pytest.importorskip("viser")
+
+from calling import fail
+from egoskin.robots.config import H1_2, read_robot
+from egoskin.viewer.web.skin_page import SkinPage, colour_directions, group_joints
+
+
+@pytest.fixture(scope="module")
+def page(skin) -> Iterator[SkinPage]:
+    page = SkinPage(H1_2, skin)
+    yield page
+    page.close()
+
+
+def test_a_joint_moves_the_links_below_it_alone(page: SkinPage):
+    elbow = H1_2.joints.index("left_elbow_joint")
+
+    def places() -> dict[str, np.ndarray]:
+        data = page.body.data
+        names = ("left_wrist_roll_link", "right_wrist_roll_link", "torso_link")
+        return {name: data.body(name).xpos.copy() for name in names}
+
+    page.reset()
+    before = places()
+    page.move(elbow, 1.5)
+    after = places()
+    moved = [name for name in before if not np.allclose(before[name], after[name])]
+    assert moved == ["left_wrist_roll_link"]
+    page.reset()
+    np.testing.assert_allclose(places()["left_wrist_roll_link"], before[moved[0]])
+
+
+def test_directions_are_shown_and_their_share_is_told(page: SkinPage):
+    clearance = np.full((36, 72), np.nan)
+    # Above the base by half of all: half of these seen.
+    clearance[18:, :36], clearance[18:, 36:] = 0.0, 0.5
+    page.show(clearance, 1.0)
+    assert page._result.content.startswith("**50.0%**")
+
+
+def test_never_seen_is_red_and_seen_is_not():
+    never, late, early = colour_directions(np.array([0.0, 0.1, 1.0])).tolist()
+    assert never == [200, 30, 40]
+    assert late[2] > late[1]
+    assert early[1] > early[2]
+
+
+def test_joints_are_grouped_each_once():
+    groups = group_joints(H1_2.joints)
+    assert sorted(i for group in groups.values() for i in group) == list(range(21))
+    assert all(len(group) <= 12 for group in groups.values())
+    assert list(group_joints([f"j{i}" for i in range(20)])) == ["joints 1", "joints 2"]
+
+
+def test_a_robot_of_ones_own_that_stands_fixed_is_shown(tmp_path):
+    path = tmp_path / "arm.xml"
+    path.write_text(
+        "<mujoco model='arm'><worldbody><body name='shoulder' pos='0 0 1'>"
+        "<geom type='cylinder' size='0.1 0.2' rgba='1 0 0 1'/><body name='upper'>"
+        "<joint name='lift' axis='0 1 0'/>"
+        "<geom type='ellipsoid' size='0.1 0.1 0.3' pos='0 0 0.3'/>"
+        "</body></body></worldbody></mujoco>"
+    )
+    page = SkinPage(read_robot(path), None)
+    try:
+        top = page.body.bounds()[1, 2]
+        page.move(0, math.pi)
+        assert page.body.bounds()[1, 2] < top
+        red = [p for p in page.body.parts() if p.rgba == (1, 0, 0, 1)]
+        np.testing.assert_allclose(np.ptp(red[0].vertices[:, 2]), 0.4)
+    finally:
+        page.close()
+
+
+@pytest.mark.parametrize(
+    ("args", "text"),
+    [
+        (["--robot", "nobody"], "--robot must be one of h1_2"),
+        (["--skin", "nothing.json"], "nothing.json"),
+        (["blind", "--robot", "h1_2"], "leave out --skin and --robot"),
+    ],
+)
+def test_bad_input_is_an_error(args: list, text: str):
+    assert text in fail("view", *args)
