@@ -17,7 +17,9 @@ def make_agent(
     env = make_worker_env(config, skin, num_envs=1, seed=0)
     sources = sparse_sources(config, skin)
     spec = PolicySpec.of(config, skin, network, env, sources)
-    agent = spec.build_agent(sources)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        agent = spec.build_agent(sources)
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
         for weight in agent.parameters():

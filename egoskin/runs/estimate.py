@@ -27,18 +27,23 @@ def estimate_seconds(config: TrainConfig, skin: Skin, frames: int) -> float:
         skin: Its skin.
         frames: Environment steps.
     """
-    threads = torch.get_num_threads()
+    agents = min(_AGENTS, config.num_envs)
+    threads, times = torch.get_num_threads(), []
     torch.set_num_threads(1)
     try:
-        agents = min(_AGENTS, config.num_envs)
-        env = make_worker_env(config.env, skin, num_envs=agents, seed=0)
-        state, times = env.reset(), []
-        for _ in range(_ROLLOUTS):
-            start = time.perf_counter()
-            state = env.rollout(
-                _STEPS, break_when_any_done=False, auto_reset=False, tensordict=state
-            )[:, -1]["next"]
-            times.append(time.perf_counter() - start)
+        # Random actions are drawn here, and the training must not notice.
+        with torch.random.fork_rng(devices=[]):
+            env = make_worker_env(config.env, skin, num_envs=agents, seed=0)
+            state = env.reset()
+            for _ in range(_ROLLOUTS):
+                start = time.perf_counter()
+                state = env.rollout(
+                    _STEPS,
+                    break_when_any_done=False,
+                    auto_reset=False,
+                    tensordict=state,
+                )[:, -1]["next"]
+                times.append(time.perf_counter() - start)
     finally:
         torch.set_num_threads(threads)
     workers = check_num_workers(config.num_envs, config.num_workers)

@@ -232,7 +232,12 @@ def test_meshes_are_read_from_regular_files_alone(tmp_path):
 def test_damaged_meshes_are_refused_by_name(tmp_path):
     raw = trimesh.creation.box().export(file_type="stl")
     path = tmp_path / "pelvis.stl"
-    for content, text in ((raw[:300], "is no mesh that"), (b"", "holds no triangles")):
+    for content, text in (
+        # Which of the two is trimesh's affair: from 5.2 on it takes it for text.
+        (raw[:300], "(is no mesh that|holds no triangles)"),
+        (b"endsolid a solid b endsolid", "is no mesh that"),
+        (b"", "holds no triangles"),
+    ):
         path.write_bytes(content)
         with pytest.raises(ValueError, match=rf"pelvis\.stl {text}"):
             meshes_in_folder(tmp_path, ["pelvis"])
