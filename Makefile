@@ -6,7 +6,7 @@ ARGS ?=
 # The policy of `make demo`.
 POLICY ?= field_proximity
 
-.PHONY: train demo test test-slow test-memory verify check bench clean
+.PHONY: train demo test test-slow test-memory verify check bench docs clean
 
 train: $(VENV)/run
 	$(BIN)/python scripts/ppo.py $(ARGS)
@@ -37,8 +37,13 @@ check: $(VENV)/dev
 bench: $(VENV)/run
 	$(BIN)/python scripts/bench.py loop $(ARGS)
 
+# The site: docs/_build/index.html.
+docs: $(VENV)/dev
+	$(BIN)/python -m sphinx --fail-on-warning --keep-going --nitpicky --quiet \
+		docs docs/_build
+
 clean:
-	rm -rf $(VENV)
+	rm -rf $(VENV) docs/_build
 
 $(VENV)/run: pyproject.toml
 	$(PYTHON) -m venv $(VENV)

@@ -4,41 +4,49 @@ TensorDict keys, by who writes them. ``*B`` batch, ``J`` joints, ``L`` links, ``
 objects, ``S`` sensors; suffix ``_w`` world frame, ``_b`` base frame; unit
 quaternions (w, x, y, z).
 
-=========================== ============= ============================= ==============
-key                         shape         content                       read by
-=========================== ============= ============================= ==============
+=========================== ============== ============================= ==============
+key                         shape          content                       read by
+=========================== ============== ============================= ==============
 from `egoskin.envs.dodgeball.DodgeballEnv` (all its keys: its docstring)
-``base_pose``               ``[*B, 7]``   pose in the world [m]         sensors
-``joint_pos``               ``[*B, J]``   hinges [rad], slides [m]      sensors
-``object_pose``             ``[*B, O, 7]`` pose in the world [m]        sensors
-``object_active``           ``[*B, O]``   bool: in play                 sensors
-``tactile``                 ``[*B, L]``   bool: link touched something  tactile
-``reward``, ``done``, ...   ``[*B, 1]``   TorchRL's                     PPO
+---------------------------------------------------------------------------------------
+``base_pose``               ``[*B, 7]``    pose in the world [m]         sensors
+``joint_pos``               ``[*B, J]``    hinges [rad], slides [m]      sensors
+``object_pose``             ``[*B, O, 7]`` pose in the world [m]         sensors
+``object_active``           ``[*B, O]``    bool: in play                 sensors
+``tactile``                 ``[*B, L]``    bool: link touched something  tactile
+``reward``, ``done``, ...   ``[*B, 1]``    TorchRL's                     PPO
 from `egoskin.sensors.FieldSensor` or ``RaySensor``
-``distance``                ``[*B, S]``   or ``[*B, S, K]`` [m], inf: none signals
-``object_detected``         ``[*B, O]``   bool: by any sensor           signals
+---------------------------------------------------------------------------------------
+``distance``                ``[*B, S]``    or ``[*B, S, K]`` [m]; or inf signals
+``object_detected``         ``[*B, O]``    bool: by any sensor           signals
 from `egoskin.sensors.imperfections.corruption.Corruption`
-``reading``                 as distance   as a real sensor reports it   signals
-``reading_clock``           ``[*B, 2]``   episode, step                 itself
-``reading_i_*``             any           state of the i-th imperfection itself
+---------------------------------------------------------------------------------------
+``reading``                 as distance    as a real sensor reports it   signals
+``reading_clock``           ``[*B, 2]``    episode, step                 itself
+``reading_i_*``             any            state of an imperfection      itself
 from `egoskin.sensors.Proximity`, ``Binary`` or ``Localization``
-``signal``                  ``[*B, S]``   or ``[*B, 3]`` (localization) actor, critic
+---------------------------------------------------------------------------------------
+``signal``                  ``[*B, S]``    or ``[*B, 3]`` (localization) actor, critic
 from `egoskin.sensors.history`
-``last_signal``             as signal     when last anything was seen   actor, critic
-``signal_history``          ``[*B, ...]`` the last signals              actor, critic
+---------------------------------------------------------------------------------------
+``last_signal``             as signal      when last anything was seen   actor, critic
+``signal_history``          ``[*B, ...]``  the last signals              actor, critic
 from `egoskin.sensors.tactile`, in tasks of your own
+---------------------------------------------------------------------------------------
 ``contact_force``           ``[*B, L, 3]`` yours [N]                     tactile
-``contact_free``            ``[*B, 1]``   bool: untouched so far        -
+``contact_free``            ``[*B, 1]``    bool: untouched so far        -
 from `egoskin.envs.observations`
-``observation``             ``[*B, 6+2J]`` body; 6+3J: and last action  actor, critic
-``privileged_observation``  ``[*B, P]``   observed in training only     critic
-``signal``                  ``[*B, 7 O]`` an oracle's: the truth        actor, critic
+---------------------------------------------------------------------------------------
+``observation``             ``[*B, 6+2J]`` body; 6+3J: and last action   actor, critic
+``privileged_observation``  ``[*B, P]``    observed in training only     critic
+``signal``                  ``[*B, 7 O]``  an oracle's: the truth        actor, critic
 from `egoskin.agents.networks.Agent`
-``action``                  ``[*B, J]``   see DodgeballEnv              env
-``action_log_prob``         ``[*B]``      of the action                 PPO
-``loc``, ``scale``          ``[*B, J]``   of the action's Gaussian      PPO
-``state_value``             ``[*B, 1]``   value of the state            PPO
-=========================== ============= ============================= ==============
+---------------------------------------------------------------------------------------
+``action``                  ``[*B, J]``    see DodgeballEnv              env
+``action_log_prob``         ``[*B]``       of the action                 PPO
+``loc``, ``scale``          ``[*B, J]``    of the action's Gaussian      PPO
+``state_value``             ``[*B, 1]``    value of the state            PPO
+=========================== ============== ============================= ==============
 """
 
 from __future__ import annotations

@@ -26,11 +26,11 @@ class RewardConfig:
     survival: _Weight = 0.1
     """For every control step without contact or fall."""
     upright: _Weight = 0.01
-    """Posture: times exp(-|gravity_xy|^2 / 0.2), the horizontal part in the base."""
+    """Posture: times ``exp(-|gravity_xy|^2 / 0.2)``, horizontal in the base."""
     posture: _Weight = -0.05
     """Posture: times the mean squared deviation from the default pose [rad^2]."""
     energy: _Weight = -5e-7
-    """Times the mechanical power, sum |torque x velocity| [W]."""
+    """Times the mechanical power, sum of ``|torque x velocity|`` [W]."""
     drift_speed: _Weight = -0.01
     """Drift: times the squared planar speed of the base [m^2/s^2]."""
     drift_distance: _Weight = -0.1

@@ -188,9 +188,9 @@ def to_onnx(policy: Policy, commit: str | None = None) -> onnx.ModelProto:
 def largest_difference(
     content: bytes, policy: Policy, observations: torch.Tensor
 ) -> float:
-    """Return how far onnxruntime is from PyTorch, in units of max(1, |action|).
+    """Return how far onnxruntime is from PyTorch, in units of ``max(1, |action|)``.
 
-    |action| is the largest of all joints.
+    ``|action|`` is the largest of all joints.
 
     Args:
         content: The ONNX file.
@@ -243,7 +243,7 @@ def export_onnx(policy: Policy, commit: str | None = None) -> tuple[bytes, float
         commit: Commit of the package that exports it, if it is known.
 
     Raises:
-        ValueError: If it is farther than 1e-5 max(1, |action|).
+        ValueError: If it is farther than ``1e-5 max(1, |action|)``.
     """
     content = to_onnx(policy, commit).SerializeToString()
     difference = largest_difference(content, policy, sample_observations(policy, 1000))

@@ -3,7 +3,7 @@
 The `pytorch_kinematics.Chain` is the description, the public reference and the
 oracle of the tests; this module evaluates only the branches that lead to the links
 asked for, all frames of one depth in one go, with the batch last and contiguous.
-`egoskin/sensors/kernels/kernels.cpp` evaluates the same `Steps`, bit for bit.
+``egoskin/sensors/kernels/kernels.cpp`` evaluates the same `Steps`, bit for bit.
 
 Contract: all poses are relative to the root of the chain (the robot's base), whatever
 offset the root itself has, so that they depend on the joint positions alone.

@@ -7,7 +7,7 @@
     checkpoint.safetensors   everything needed to go on, at most a minute old
     policies/<frames>.safetensors   self-contained policies, from the first on
     films/<frames>.mp4, .png   films of them, if asked for
-    not-finite-<frames>.safetensors   an update that failed, for `egoskin replay`
+    not-finite-<frames>.safetensors   an update that failed, for ``egoskin replay``
     lock                     held by the process that trains
 
 Contract: a checkpoint is written atomically, metrics written after it are dropped on

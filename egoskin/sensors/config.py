@@ -29,7 +29,7 @@ class SkinConfig:
     seed: Annotated[int, NOT_NEGATIVE] = 0
     """Seed of the placement (none with a file)."""
     placement: Literal["area_uniform", "poisson_disk"] = "area_uniform"
-    """Independent points or well-spread ones; `egoskin skin` has more to choose."""
+    """Independent points or well-spread ones; ``egoskin skin`` has more to choose."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for numbers out of bounds."""

@@ -3,7 +3,7 @@
 All is computed as a structure of arrays with the batch last (``[S, B]``), in the order
 of the skin, by +, -, x, /, `sincos` and `exact_sqrt` (`egoskin.rounding`) alone: a
 row's result has the same bits whatever rows are computed with it, here or, for balls
-and a transparent robot, in C++ (`egoskin/sensors/kernels/kernels.cpp`).
+and a transparent robot, in C++ (``egoskin/sensors/kernels/kernels.cpp``).
 
 Contract: a reading of infinity means that nothing is in range; NaN in the input gives
 a reading of NaN, never one of nothing.

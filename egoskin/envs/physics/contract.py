@@ -111,7 +111,7 @@ class StepResult:
     """Whether each link touched an object or the floor, ``[B, L]`` bool; None unless
     the scene asks for it."""
     power: Tensor
-    """Mean over the substeps of sum |torque x joint velocity| [W], ``[B]``."""
+    """Mean over the substeps of the sum of ``|torque x velocity|`` [W], ``[B]``."""
     torque_saturation: Tensor
     """Mean over the substeps of the share of joints at their torque limit, ``[B]``."""
     diverged: Tensor

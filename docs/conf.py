@@ -1,0 +1,100 @@
+"""Configuration of the documentation site; `make docs` builds it.
+
+Contract: it is built and read without the network.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from typing import Any
+
+from docutils import nodes
+from sphinx import addnodes
+from sphinx.application import Sphinx
+from sphinx.ext.napoleon.docstring import GoogleDocstring
+
+import egoskin
+from egoskin.runs.config import TrainConfig
+
+project = "egoskin"
+author = "The egoskin authors"
+copyright = author
+version = release = egoskin.__version__
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+exclude_patterns = ["_build"]
+default_role = "py:obj"
+
+# Headings are link targets, as on GitHub.
+myst_heading_anchors = 3
+
+autodoc_default_options = {"members": True}
+autodoc_member_order = "bysource"
+autodoc_typehints_format = "short"
+autodoc_preserve_defaults = True
+napoleon_numpy_docstring = False
+napoleon_custom_sections = ["Source"]
+# Names of other packages: their sites would be asked for them.
+nitpick_ignore_regex = [("py:.*", r"(?!egoskin).*")]
+
+# Else what stands before a colon is taken for the type of a field.
+setattr(GoogleDocstring, "_parse_attribute_docstring", GoogleDocstring._consume_to_end)
+# What tyro is told of a field is none of a reader's business.
+TrainConfig.__annotations__["env"] = "EnvConfig"
+
+html_theme = "furo"
+html_title = f"egoskin {version}"
+html_show_sourcelink = False
+html_copy_source = False
+
+_BOUNDED = re.compile(
+    r"Annotated\[(.+?), Interval\(gt=(.+?), ge=(.+?), lt=(.+?), le=(.+?)\)\]"
+)
+
+
+def _interval(match: re.Match[str]) -> str:
+    """Return a type with the interval of its numbers, as mathematics writes it."""
+    kind, gt, ge, lt, le = match.groups()
+    low = f"[{ge}" if ge != "None" else f"({gt}" if gt != "None" else "(-inf"
+    high = f"{le}]" if le != "None" else f"{lt})" if lt != "None" else "inf)"
+    return f"{kind} in {low}, {high}"
+
+
+def shorten_types(app: Sphinx, doctree: nodes.document) -> None:
+    """Write fields with bounds as ``float in [0, 1]``."""
+    for node in doctree.findall(addnodes.desc_annotation):
+        text = node.astext()
+        if "Annotated[" in text:
+            text = _BOUNDED.sub(_interval, text)
+            node[:] = [nodes.Text(text)]
+
+
+def leave_out_fields(app: Sphinx, what: str, name: str, obj: Any, *_: Any) -> Any:
+    """Leave the fields out of a configuration's signature: they follow one by one."""
+    fields = what == "class" and dataclasses.is_dataclass(obj)
+    return ("", None) if fields else None
+
+
+def find_alias(app: Sphinx, env: Any, node: Any, content: nodes.Element) -> Any:
+    """Link a name of a package to where its module documents it."""
+    target = node.get("reftarget", "")
+    package, _, name = target.rpartition(".")
+    domain = env.domains.python_domain
+    found = [
+        known
+        for known in domain.objects
+        if package and known.startswith(f"{package}.") and known.endswith(f".{name}")
+    ]
+    if node.get("refdomain") != "py" or len(found) != 1:
+        return None
+    return domain.resolve_xref(
+        env, node["refdoc"], app.builder, "obj", found[0], node, content
+    )
+
+
+def setup(app: Sphinx) -> None:
+    """Connect what is above."""
+    app.connect("doctree-read", shorten_types)
+    app.connect("autodoc-process-signature", leave_out_fields)
+    app.connect("missing-reference", find_alias)
