@@ -39,7 +39,7 @@ napoleon_custom_sections = ["Source"]
 nitpick_ignore_regex = [("py:.*", r"(?!egoskin).*")]
 
 # Else what stands before a colon is taken for the type of a field.
-setattr(GoogleDocstring, "_parse_attribute_docstring", GoogleDocstring._consume_to_end)
+GoogleDocstring._parse_attribute_docstring = GoogleDocstring._consume_to_end
 # What tyro is told of a field is none of a reader's business.
 TrainConfig.__annotations__["env"] = "EnvConfig"
 

@@ -1,18 +1,35 @@
-"""Code in the documents runs as it is given."""
+"""The documents: their code runs as it is given, their tables are the code's."""
 
 from __future__ import annotations
 
+import csv
+import doctest
+import fnmatch
+import io
 import re
+import shlex
 import subprocess
 import sys
+from contextlib import redirect_stdout
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 
 import egoskin
-from egoskin.policies.export import export_onnx
+from calling import succeed
+from egoskin.agents.ppo import PPOConfig
+from egoskin.envs.dodgeball import DodgeballConfig
+from egoskin.envs.throws import ThrowConfig
+from egoskin.make import EnvConfig, make_worker_env
+from egoskin.policies.export import export_onnx, observation_parts
+from egoskin.robots.config import H1_2
+from egoskin.runs.config import TrainConfig
+from egoskin.sensors.config import SensorConfig
 
-DEPLOY = Path(__file__).parents[1] / "docs" / "deploy.md"
+DOCS = Path(__file__).parents[1] / "docs"
+DEPLOY = DOCS / "deploy.md"
+SLOW = pytest.mark.slow
 CODE = re.findall(r"```python\n(.*?)```", DEPLOY.read_text(), re.DOTALL)
 
 DRIVER = '''
@@ -55,7 +72,6 @@ def test_the_document_has_its_examples():
     assert len(CODE) == 4
 
 
-SLOW = pytest.mark.slow
 ALL = [0, *(pytest.param(number, marks=SLOW) for number in (1, 2, 3))]
 
 
@@ -77,3 +93,233 @@ def test_an_example_runs_as_given(number, tmp_path):
         said = ["the distances of the skin are 0.5 s old", "4 targets"]
     lines = [line.strip() for line in done.stdout.splitlines() if "torchrl" not in line]
     assert lines == [line.strip() for line in said]
+
+
+# --- Tutorials --------------------------------------------------------------------
+
+# What a tutorial is made of: files (```json name), programs, commands with answers.
+BLOCK = re.compile(r"^```(\w+)(?: (\S+))?\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+# A command after "$ ", and what it prints.
+COMMAND = re.compile(r"^\$ (.*)\n((?:(?!\$ ).*\n)*)", re.MULTILINE)
+TUTORIALS = [
+    "tutorial-sensors",
+    "tutorial-gentact",
+    pytest.param("tutorial-study", marks=SLOW),
+    "tutorial-deploy",
+    pytest.param("sensors", marks=SLOW),
+]
+
+
+def agree(expected: str, found: str) -> bool:
+    """Whether a text is the expected one, in which ... stands for any."""
+    options = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+    return doctest.OutputChecker().check_output(expected, found, options)
+
+
+def said_by(code: str) -> str:
+    """What a program prints: comments behind print(...), or below in lines alone."""
+    return "".join(
+        f"{text}\n"
+        for text in re.findall(r"(?:print\(.*  |^)# (.*)", code, re.MULTILINE)
+    )
+
+
+@pytest.mark.parametrize("name", TUTORIALS)
+def test_a_tutorial_runs_as_given(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {"__name__": "tutorial"}
+    blocks = BLOCK.findall((DOCS / f"{name}.md").read_text())
+    assert blocks
+    for language, file, text in blocks:
+        if file:
+            Path(file).write_text(text)
+        elif language == "python":
+            with redirect_stdout(io.StringIO()) as out:
+                exec(compile(text, name, "exec"), names)
+            assert agree(said_by(text), out.getvalue()), out.getvalue()
+        else:
+            for command, answer in COMMAND.findall(text):
+                program, *words = shlex.split(command)
+                assert program == "egoskin"
+                found = succeed(*words)
+                assert agree(answer or "...", found), found
+
+
+# --- Tables -----------------------------------------------------------------------
+
+
+def table(page: str, heading: str) -> list[list[str]]:
+    """Return the cells of the first table below a heading that begins so."""
+    text = (DOCS / page).read_text()
+    _, _, below = text.partition(f"\n## {heading}")
+    rows = re.search(r"((?:^\|.*\n)+)", below, re.MULTILINE)[1].splitlines()
+    cells = [[cell.strip() for cell in row.strip("|").split("|")] for row in rows]
+    return cells[2:]
+
+
+def numbers(text: str) -> list[float]:
+    """Return the numbers in a text."""
+    found = re.findall(r"-?\d[\d,]*(?:\.\d+)?(?:e-?\d+)?", text)
+    return [float(number.replace(",", "")) for number in found]
+
+
+def code(text: str) -> list[str]:
+    """Return what stands in back quotes."""
+    return re.findall("`(.*?)`", text)
+
+
+def test_the_observation_is_what_the_actor_reads():
+    policy = egoskin.load_policy("field_proximity")
+    parts = [(p["name"], p["width"], p["unit"]) for p in observation_parts(policy)]
+    rows = table("task.md", "What the actor observes")
+    assert [(code(n)[0], int(w), u) for n, w, u, _ in rows] == parts
+
+
+def test_the_signals_are_as_wide_as_they_say():
+    text = (DOCS / "task.md").read_text()
+    said = dict(re.findall(r"^\| (`.*?) \| (\d+) \| .*\|$", text, re.MULTILINE))
+    kinds = {
+        "`field`; `proximity`, `closeness` or `binary`": SensorConfig(),
+        "`ray`, all beams": SensorConfig(coverage="ray"),
+        "`ray`, `--sensor.reduce min`": SensorConfig(coverage="ray", reduce="min"),
+        "`localization`, any sensors": SensorConfig(signal="localization"),
+    }
+    for words, sensor in kinds.items():
+        size = EnvConfig(sensor=sensor).pipeline().signal_size
+        assert int(said[words]) == size, words
+    env = make_worker_env(
+        EnvConfig(sensor=SensorConfig(coverage="oracle")), num_envs=1, seed=0
+    )
+    assert int(said["`oracle`"]) == env.observation_spec["signal"].shape[-1]
+    assert said["`none`"] == "0"
+
+
+def test_the_joints_have_the_gains_and_limits_they_say():
+    task = DodgeballConfig()
+    kp, kd = H1_2.joint_gains(task.physics.gains)
+    limit, left = H1_2.torque_limit, set(H1_2.joints)
+    for names, *said in table("task.md", "Action"):
+        for pattern in code(names):
+            stiffness, damping, torque, scale = map(float, said)
+            matching = fnmatch.filter(H1_2.joints, f"{pattern}_joint")
+            assert matching, pattern
+            for joint in matching:
+                i = H1_2.joints.index(joint)
+                assert (kp[i], kd[i], limit[i]) == (stiffness, damping, torque), joint
+                assert abs(task.action_scale * limit[i] / kp[i] - scale) < 5e-4
+                left.discard(joint)
+    assert not left
+
+
+def test_the_reward_has_the_weights_it_says():
+    rows = table("task.md", "Reward")
+    assert {code(n)[0]: float(w) for n, w, _ in rows} == asdict(
+        DodgeballConfig().reward
+    )
+
+
+def test_throws_and_ends_are_as_they_say():
+    throws, task = ThrowConfig(), DodgeballConfig()
+    expected = [
+        [throws.radius],
+        [throws.num_balls],
+        *map(list, (throws.first_delay, throws.interval, throws.height)),
+        *map(list, (throws.distance, throws.speed, throws.azimuth_deg)),
+    ]
+    rows = table("task.md", "Throws")
+    assert [numbers(value) for _, value in rows[:8]] == expected
+    assert (throws.aim, throws.flight) == ("skin", "straight")
+    text = " ".join((DOCS / "task.md").read_text().split())
+    for claim in (
+        f"Physics runs at {1 / task.physics.timestep:g} Hz",
+        f"the policy acts at {task.physics.control_hz:g} Hz",
+        f"scale = {task.action_scale:g} x torque limit / kp",
+        f"each joint within {task.start_joint_noise:g} rad",
+        f"by time (`truncated`) {task.episode_length_s:g} s after",
+        f"*Success* is to last for {task.success_s:g} s",
+        f"{len(H1_2.joints)} joints, {H1_2.model.body_mass.sum():.0f} kg",
+    ):
+        assert claim in text, claim
+
+
+def test_the_critic_is_told_what_they_say():
+    env = make_worker_env(EnvConfig(), num_envs=1, seed=0)
+    told = env.observation_spec["privileged_observation"].shape[-1]
+    assert sum(int(width) for _, width, _ in table("task.md", "The critic")) == told
+
+
+def test_learning_has_the_numbers_they_say():
+    run, ppo = TrainConfig(), PPOConfig()
+    net = ppo.network
+    rollouts = run.total_frames / run.frames_per_batch
+    assert [numbers(value) for _, value in table("task.md", "Learning")] == [
+        [run.num_envs, ppo.rollout_steps, run.frames_per_batch],
+        [rollouts, round(run.total_frames / 1e6, 1)],
+        [net.hidden[1]],
+        [ppo.ppo_epochs, ppo.num_mini_batches],
+        [ppo.gamma],
+        [ppo.gae_lambda, ppo.value_lambda],
+        [ppo.clip_epsilon],
+        [ppo.learning_rate, ppo.desired_kl],
+        [ppo.entropy_coeff, ppo.entropy_frames],
+        [net.init_std, *net.std_bounds],
+        [ppo.noise_correlation, ppo.noise_correlation_start],
+    ]
+    assert len(net.hidden) == 2
+
+
+def test_every_column_of_the_metrics_is_explained(trained):
+    with (trained / "metrics.csv").open() as file:
+        logged = next(csv.reader(file))
+    rows = table("metrics.md", "Every column of metrics.csv")
+    assert [code(name)[0] for name, _, _ in rows] == logged
+
+
+# --- The site ---------------------------------------------------------------------
+
+
+def anchors(path: Path) -> set[str]:
+    """Return the anchors of a page's headings, as GitHub and MyST make them."""
+    headings = re.findall(r"^#+ (.*)$", path.read_text(), re.MULTILINE)
+    plain = (re.sub(r"[^\w\- ]", "", heading.lower()) for heading in headings)
+    return {heading.replace(" ", "-") for heading in plain}
+
+
+PAGES = sorted(DOCS.glob("*.md"))
+
+
+@pytest.mark.parametrize("page", [*PAGES, DOCS.parent / "README.md"], ids=str)
+def test_links_lead_somewhere(page):
+    for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
+        if link.startswith("https://"):
+            continue
+        file, _, anchor = link.partition("#")
+        target = page.parent / file if file else page
+        assert target.exists(), link
+        assert not anchor or anchor in anchors(target), link
+
+
+def test_every_page_is_in_the_contents():
+    index = (DOCS / "index.md").read_text().splitlines()
+    assert [p.stem for p in PAGES if p.stem != "index" and p.stem not in index] == []
+
+
+def test_pictures_are_small():
+    for path in (*DOCS.glob("*.jpg"), *DOCS.glob("*.svg"), *DOCS.glob("pictures/*")):
+        assert path.stat().st_size < 200_000, path
+
+
+@pytest.mark.slow
+def test_the_site_is_built_without_warnings_and_read_offline(tmp_path):
+    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-n", "-q"]
+    subprocess.run([*command, str(DOCS), str(tmp_path)], check=True)
+    built = list(tmp_path.rglob("*.html"))
+    assert len(built) > len(PAGES)
+    # What a browser would fetch by itself: links are followed by people.
+    fetched = re.compile(r"<(?:script|img|link|iframe)[^>]+?=\"(?:https?:)?//[^\"]+")
+    for path in built:
+        assert not fetched.search(path.read_text()), path
+    for path in tmp_path.rglob("*.css"):
+        assert not re.search(r"url\(['\"]?(?:https?:)?//|@import", path.read_text()), (
+            path
+        )
