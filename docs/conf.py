@@ -29,7 +29,11 @@ default_role = "py:obj"
 # Headings are link targets, as on GitHub.
 myst_heading_anchors = 3
 
-autodoc_default_options = {"members": True}
+autodoc_default_options = {
+    "members": True,
+    # What every transform has for TorchRL.
+    "exclude-members": "compute, out_specs, start, advance, signal, measure",
+}
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
 autodoc_preserve_defaults = True

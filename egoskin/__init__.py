@@ -34,7 +34,7 @@ from `egoskin.sensors.history`
 from `egoskin.sensors.tactile`, in tasks of your own
 ---------------------------------------------------------------------------------------
 ``contact_force``           ``[*B, L, 3]`` yours [N]                     tactile
-``contact_free``            ``[*B, 1]``    bool: untouched so far        -
+``contact_free``            ``[*B, 1]``    bool: untouched so far        you
 from `egoskin.envs.observations`
 ---------------------------------------------------------------------------------------
 ``observation``             ``[*B, 6+2J]`` body; 6+3J: and last action   actor, critic

@@ -55,7 +55,7 @@ def draw_field(axes: Axes) -> None:
 def draw_ray(axes: Axes) -> None:
     """Draw a grid of beams, cut through its middle: each its first hit."""
     ray = Ray()
-    draw_coverage(axes, "ray: 8 x 8 distances, one row of them")
+    draw_coverage(axes, "ray: a row of its 8 x 8 beams")
     half = math.degrees(math.atan(ray.half_extent))
     axes.add_patch(Wedge((0, 0), RANGE, -half, half, color=BLUE, alpha=0.12))
     ball = np.array([1.4, 0.25])
@@ -101,7 +101,7 @@ def draw_signals(axes: Axes) -> None:
 def main(path: str) -> None:
     """Write the picture."""
     plt.rcParams.update({"svg.hashsalt": "egoskin", "font.size": 9})
-    figure, axes = plt.subplots(1, 3, figsize=(12, 3.8), layout="constrained")
+    figure, axes = plt.subplots(1, 3, figsize=(9.6, 3.4), layout="constrained")
     draw_field(axes[0])
     draw_ray(axes[1])
     draw_signals(axes[2])
