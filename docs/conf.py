@@ -13,6 +13,8 @@ from docutils import nodes
 from sphinx import addnodes
 from sphinx.application import Sphinx
 from sphinx.ext.napoleon.docstring import GoogleDocstring
+from sphinx.util.inspect import signature as signature_of
+from sphinx.util.inspect import stringify_signature
 
 import egoskin
 from egoskin.runs.config import TrainConfig
@@ -74,10 +76,17 @@ def shorten_types(app: Sphinx, doctree: nodes.document) -> None:
             node[:] = [nodes.Text(text)]
 
 
-def leave_out_fields(app: Sphinx, what: str, name: str, obj: Any, *_: Any) -> Any:
-    """Leave the fields out of a configuration's signature: they follow one by one."""
-    fields = what == "class" and dataclasses.is_dataclass(obj)
-    return ("", None) if fields else None
+def mend_signature(
+    app: Sphinx, what: str, name: str, obj: Any, options: Any, signature: str, *_: Any
+) -> Any:
+    """Leave out fields, which follow one by one; look through TorchRL's metaclass."""
+    if what == "class" and dataclasses.is_dataclass(obj):
+        return ("", None)
+    if what == "class" and signature == "(*args, **kwargs)":
+        own = signature_of(obj.__init__, bound_method=True)
+        own = own.replace(return_annotation=own.empty)
+        return stringify_signature(own, unqualified_typehints=True), None
+    return None
 
 
 def find_alias(app: Sphinx, env: Any, node: Any, content: nodes.Element) -> Any:
@@ -100,5 +109,5 @@ def find_alias(app: Sphinx, env: Any, node: Any, content: nodes.Element) -> Any:
 def setup(app: Sphinx) -> None:
     """Connect what is above."""
     app.connect("doctree-read", shorten_types)
-    app.connect("autodoc-process-signature", leave_out_fields)
+    app.connect("autodoc-process-signature", mend_signature)
     app.connect("missing-reference", find_alias)

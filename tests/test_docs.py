@@ -152,9 +152,10 @@ def table(page: str, heading: str) -> list[list[str]]:
     """Return the cells of the first table below a heading that begins so."""
     text = (DOCS / page).read_text()
     _, _, below = text.partition(f"\n## {heading}")
-    rows = re.search(r"((?:^\|.*\n)+)", below, re.MULTILINE)[1].splitlines()
-    cells = [[cell.strip() for cell in row.strip("|").split("|")] for row in rows]
-    return cells[2:]
+    found = re.search(r"(?:^\|.*\n)+", below, re.MULTILINE)
+    assert found, heading
+    rows = found[0].splitlines()[2:]
+    return [[cell.strip() for cell in row.strip("|").split("|")] for row in rows]
 
 
 def numbers(text: str) -> list[float]:

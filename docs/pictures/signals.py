@@ -82,16 +82,13 @@ def draw_signals(axes: Axes) -> None:
     start = torch.arange(len(time))[:, None] == 0
     noisy = corruption(clean.clone().set("is_init", start))
     proximity = Proximity(RANGE)
-    for name, signal, style in (
-        ("proximity", proximity(clean)["signal"], {"color": BLUE}),
-        ("binary", Binary(RANGE)(clean.copy())["signal"], {"color": GREY}),
-        (
-            "proximity of a time-of-flight sensor",
-            Proximity(RANGE, in_keys=["reading"])(noisy)["signal"],
-            {"color": ORANGE, "linewidth": 1},
-        ),
+    late = Proximity(RANGE, in_keys=["reading"])(noisy)["signal"]
+    for name, signal, colour in (
+        ("proximity", proximity(clean)["signal"], BLUE),
+        ("binary", Binary(RANGE)(clean.clone())["signal"], GREY),
+        ("proximity of a time-of-flight sensor", late, ORANGE),
     ):
-        axes.step(time, signal[:, 0], where="post", label=name, **style)
+        axes.step(time, signal[:, 0], where="post", label=name, color=colour)
     axes.set(xlabel="time [s]", ylabel="signal", title="a ball flies past")
     axes.set(ylim=(-0.05, 1.5), yticks=[0, 0.25, 0.5, 0.75, 1])
     axes.legend(fontsize=8, frameon=False, loc="upper left")
@@ -105,8 +102,8 @@ def main(path: str) -> None:
     draw_field(axes[0])
     draw_ray(axes[1])
     draw_signals(axes[2])
-    metadata = {"Date": None} if path.endswith(".svg") else None
-    figure.savefig(path, dpi=90, metadata=metadata)
+    # The same bytes each time.
+    figure.savefig(path, format="svg", metadata={"Date": None})
 
 
 if __name__ == "__main__":
