@@ -250,6 +250,7 @@ def build_slow(skin) -> TransformedEnv:
     return env
 
 
+@pytest.mark.slow
 def test_a_suspended_group_goes_on():
     code = f"""
 import sys

@@ -37,6 +37,8 @@ Watch = Callable[[TensorDictBase, TensorDictBase, Tensor], None]
 
 # Success is read once more at this age [s].
 _LATER = 5.0
+# Up to so many episodes take less time than workers take to start.
+_FEW = 64
 # Two-sided 95 % quantile of the normal distribution.
 _Z = 1.959964
 
@@ -155,7 +157,8 @@ def play_throws(
         throw_set: Seed of the throw set.
         episodes: Number of episodes, all played side by side.
         first: Row of the first of them; with ``watch`` alone.
-        num_workers: Processes; the result does not depend on it.
+        num_workers: Processes; the result does not depend on it. None: as many as fill
+            the cores, or of few episodes threads of this process, which start at once.
         hold: Whether the robot is held rigid in its default pose.
         mask: Links whose sensors detect nothing, or `egoskin.sensors.MASK_ALL`.
         on_step: Called with (steps done, episodes still running).
@@ -170,8 +173,11 @@ def play_throws(
         "seed": seed,
         "hold": hold,
         "mask": mask,
+        # Nobody reads observations.
+        "bare": policy is None,
     }
-    if watch is None:
+    few = num_workers is None and episodes <= _FEW
+    if watch is None and not few:
         env = make_env(config, skin, num_workers=num_workers, **shared)
     else:
         threads = check_num_workers(episodes, num_workers)
@@ -180,7 +186,7 @@ def play_throws(
             skin,
             num_threads=threads,
             row_offset=first,
-            keep_raw=True,
+            keep_raw=watch is not None,
             **shared,
         )
     steps = torch.zeros(episodes, dtype=torch.int64)

@@ -10,6 +10,7 @@ import pytest
 from calling import succeed
 
 
+@pytest.mark.slow
 def test_bench_loop_gives_its_rows(tmp_path: Path):
     succeed(
         *("bench", "loop"),

@@ -189,7 +189,6 @@ def test_an_evaluation_may_mask_all_sensors_or_those_of_some_links(
             *(task, policy.skin),
             throw_set=0,
             episodes=EPISODES,
-            num_workers=1,
             mask=mask,
         )
         assert result["survival_time"] == asdict(played.survival_time)

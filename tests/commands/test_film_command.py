@@ -40,7 +40,7 @@ def test_it_writes_a_film_and_a_sheet(tmp_path: Path):
 def test_a_film_is_of_the_longest_of_the_episodes_that_are_evaluated(
     skin: Skin, tmp_path: Path
 ):
-    which = {"throw_set": 3, "episodes": 6, "num_workers": 1, "hold": True}
+    which = {"throw_set": 3, "episodes": 6, "hold": True}
     config = EnvConfig()
     thrower = Thrower(config.task.throws, config.robot_config, 1 / 120)
     row = torch.arange(6)

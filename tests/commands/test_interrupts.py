@@ -18,7 +18,7 @@ from egoskin.commands import errors
 from egoskin.commands.errors import clear_errors
 from egoskin.interrupts import ENDING, say, take
 
-# The main job, and one of those that hand over to a command at once: they are all alike.
+# The main job, and one of those that hand over to a command at once: all are alike.
 SCRIPTS = [calling.SCRIPTS / "ppo.py", calling.SCRIPTS / "evaluate.py"]
 
 

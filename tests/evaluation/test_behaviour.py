@@ -255,8 +255,8 @@ def test_success_is_counted_from_the_first_throw():
 def test_balls_after_a_delay_are_those_that_the_environment_counts():
     config = make(throws=replace(BESIDE, first_delay=(0.3, 1.1)))
     skin = config.skin.build(H1_2)
-    watcher = Watcher(config, 1, 32)
-    which = {"throw_set": 1, "episodes": 32}
+    watcher = Watcher(config, 1, 16)
+    which = {"throw_set": 1, "episodes": 16}
     played = play_throws(None, config, skin, **which, hold=True, watch=watcher)
     arrived, avoided = watcher._arrived, watcher._arrived & ~watcher._hit
     for counted, seen in ((played.arrived, arrived), (played.avoided, avoided)):
@@ -330,9 +330,9 @@ def test_watching_changes_no_figure():
         def forward(self, td):
             return td.set("action", td["signal"] @ weights - weights.sum(0))
 
-    which = {"throw_set": 3, "episodes": 32}
+    which = {"throw_set": 3, "episodes": 16}
     result, behaviour = behave(Module(), config, skin, **which)
-    assert result == evaluate(Module(), config, skin, **which, num_workers=2)
+    assert result == evaluate(Module(), config, skin, **which)
     first = [g for g in behaviour.throws["direction"] if g.first_hits is not None]
     assert first
     assert behaviour.motion.power > behaviour.motion_zero_action.power > 0

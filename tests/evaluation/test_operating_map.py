@@ -118,7 +118,7 @@ def test_slow_balls_in_a_fast_sequence_all_arrive():
     for own in (throws, maps._with_enough_balls(throws)):
         task = replace(TASK, throws=own, episode_length_s=6.0)
         config = EnvConfig(task=task, sensor=SensorConfig(coverage="none"))
-        which = {"throw_set": 0, "episodes": 4, "num_workers": 1, "hold": True}
+        which = {"throw_set": 0, "episodes": 4, "hold": True}
         played = play_throws(None, config, SKIN, **which)
         assert not played.hit.any()
         arrived.append(played.arrived.sum(1))
@@ -138,7 +138,6 @@ def test_an_operating_map_is_the_success_on_each_throw(monkeypatch):
         SKIN,
         throw_set=5,
         episodes=16,
-        num_workers=1,
         mask=MASK_ALL,
         on_point=lambda *counts: done.append(counts),
     )
@@ -164,7 +163,6 @@ def test_an_operating_map_is_the_success_on_each_throw(monkeypatch):
             SKIN,
             throw_set=5,
             episodes=16,
-            num_workers=1,
         )
         assert point.success == summarize(played, played, task).success
         avoided = float(played.avoided.sum() / played.arrived.sum())

@@ -180,11 +180,11 @@ def make_case(version="2") -> dict:
     return {
         "config": config,
         "skin": config.skin.build(config.robot_config),
-        "episodes": 64,
+        "episodes": 32,
     }
 
 
-def test_a_throw_set_ends_the_same_with_1_2_and_4_workers():
+def test_a_throw_set_ends_the_same_in_this_process_and_on_4_workers():
     case = make_case()
     torch.manual_seed(0)
     weights = 0.5 * torch.randn(64, 21)
@@ -197,20 +197,18 @@ def test_a_throw_set_ends_the_same_with_1_2_and_4_workers():
         def forward(self, td):
             return policy(td)
 
-    first, *others = (
-        play_throws(Module(), **case, throw_set=3, num_workers=n) for n in (1, 2, 4)
+    one, four = (
+        play_throws(Module(), **case, throw_set=3, num_workers=n) for n in (None, 4)
     )
-    for other in others:
-        for field in dataclasses.fields(Episodes):
-            one, two = getattr(first, field.name), getattr(other, field.name)
-            assert torch.equal(one, two), field.name
-    assert len(first.steps) == 64
+    for field in dataclasses.fields(Episodes):
+        assert torch.equal(getattr(one, field.name), getattr(four, field.name))
+    assert len(one.steps) == 32
 
 
 @pytest.mark.parametrize("version", ["2", "1"])
 def test_every_standard_throw_meets_a_robot_that_does_not_move(version):
     case = make_case(version)
-    rigid = play_throws(None, **case, throw_set=3, num_workers=1, hold=True)
+    rigid = play_throws(None, **case, throw_set=3, hold=True)
     assert summarize(rigid, rigid, DodgeballConfig()).rigid_success <= 0.01
 
 
@@ -223,7 +221,7 @@ def delayed(delay: tuple[float, float], **throws) -> EnvConfig:
 @pytest.mark.parametrize("num_workers", [1, 2])
 def test_episodes_count_from_the_first_throw_whatever_the_delay(num_workers):
     # The rigid robot stands where it stands, and meets the same throws.
-    which = {"throw_set": 3, "episodes": 64, "hold": True, "num_workers": num_workers}
+    which = {"throw_set": 3, "episodes": 32, "hold": True, "num_workers": num_workers}
     at_once, late = (
         play_throws(None, config, skin_of(config), **which)
         for config in (delayed((0.0, 0.0)), delayed((0.5, 1.5)))
@@ -239,7 +237,7 @@ def test_an_episode_lasts_its_whole_length_after_the_latest_first_throw():
     config = delayed((0.1, 0.4), aim="box", box_height=(50.0, 50.0))
     task = dataclasses.replace(config.task, episode_length_s=0.5)
     config = dataclasses.replace(config, task=task)
-    which = {"throw_set": 0, "episodes": 16, "hold": True, "num_workers": 1}
+    which = {"throw_set": 0, "episodes": 16, "hold": True}
     played = play_throws(None, config, skin_of(config), **which)
     assert (played.steps == 30).all()
     assert not (played.hit | played.fallen | played.diverged).any()
@@ -262,7 +260,7 @@ def test_a_fall_before_the_first_throw_is_a_failure():
     action = torch.tensor(
         [-2.0 * ("hip_pitch" in name) for name in config.robot_config.joints]
     )
-    which = {"throw_set": 0, "episodes": 8, "num_workers": 1}
+    which = {"throw_set": 0, "episodes": 8}
     played = play_throws(Still(action), config, skin_of(config), **which)
     assert played.fallen.all()
     assert not played.arrived.any()
@@ -287,9 +285,7 @@ def test_ends_by_self_contact_are_told_apart():
         def forward(self, td):
             return td.set("action", inwards)
 
-    played = play_throws(
-        Module(), config, skin, throw_set=0, episodes=32, num_workers=1
-    )
+    played = play_throws(Module(), config, skin, throw_set=0, episodes=32)
     assert played.self_contact[:16].all()
     assert not played.self_contact[16:].any()
     # Every episode has one cause of its end.
@@ -300,8 +296,7 @@ def test_ends_by_self_contact_are_told_apart():
 def test_another_seed_is_another_throw_set():
     case = make_case()
     first, again, other = (
-        play_throws(None, **case, throw_set=seed, num_workers=1, hold=True).steps
-        for seed in (0, 0, 1)
+        play_throws(None, **case, throw_set=seed, hold=True).steps for seed in (0, 0, 1)
     )
     assert torch.equal(first, again)
     assert not torch.equal(first, other)

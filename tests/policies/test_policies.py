@@ -333,7 +333,7 @@ def test_an_action_that_is_not_finite_ends_an_evaluation():
         bias[4] = torch.nan
     config = standard_task(policy.env_config)
     with pytest.raises(ValueError, match="action is not finite at step 1"):
-        evaluate(policy, config, policy.skin, throw_set=0, episodes=4, num_workers=1)
+        evaluate(policy, config, policy.skin, throw_set=0, episodes=4)
 
 
 def test_a_file_that_is_there_comes_before_a_name(tmp_path, monkeypatch):

@@ -189,6 +189,7 @@ def check_logs_have_no_gap(run: Path) -> None:
     assert frames == [BATCH * (i + 1) for i in range(len(frames))]
 
 
+@pytest.mark.slow
 def test_a_trainer_killed_while_it_writes_a_checkpoint_goes_on(start, tmp_path):
     run = tmp_path / "run"
     often = ("--checkpoint-interval", "0.01")

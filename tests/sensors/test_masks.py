@@ -263,7 +263,7 @@ class Ducks(torch.nn.Module):
 
 def test_a_policy_whose_sensors_are_masked_does_what_one_does_without_sensors():
     config = EnvConfig(task=TASK)
-    which = {"throw_set": 0, "episodes": 16, "num_workers": 1}
+    which = {"throw_set": 0, "episodes": 16}
     senses = play_throws(Ducks(), config, SKIN, **which)
     masked = play_throws(Ducks(), config, SKIN, **which, mask=MASK_ALL)
     still = play_throws(None, config, SKIN, **which)

@@ -268,6 +268,7 @@ def test_a_study_costs_whole_runs_on_whole_cores(tiny: Manifest):
     assert total.wall_s(64) == pytest.approx(3.072)
 
 
+@pytest.mark.slow
 def test_the_speed_is_measured_and_nothing_is_left(
     tiny: Manifest, monkeypatch, tmp_path
 ):

@@ -227,7 +227,7 @@ def test_recordings_are_of_the_rows_of_the_throw_set(skin: Skin):
         config, skin, None, throw_set=3, first=5, episodes=2, hold=True
     )
     assert [r.row for r in recordings] == [5, 6]
-    which = {"throw_set": 3, "episodes": 8, "num_workers": 1, "hold": True}
+    which = {"throw_set": 3, "episodes": 8, "hold": True}
     steps = play_throws(None, config, skin, **which).steps
     # The start, and a state after each step up to the end.
     assert [len(r.states) - 1 for r in recordings] == steps[5:7].tolist()
