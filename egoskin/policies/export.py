@@ -30,7 +30,7 @@ _OPSET, _IR_VERSION = 13, 7
 # of all joints and of all observations of a size, for float32 itself rounds by a share
 # of what is summed, also where the sum happens to be small.
 _TOLERANCE = 1e-5
-# Sizes of the observations that are compared, from tiny to absurd, and how many of each.
+# Sizes of the observations that are compared, tiny to absurd, and how many of each.
 _SIZES, _OF_EACH = tuple(10.0**power for power in range(-3, 7)), 100
 
 
