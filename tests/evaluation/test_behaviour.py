@@ -255,8 +255,8 @@ def test_success_is_counted_from_the_first_throw():
 def test_balls_after_a_delay_are_those_that_the_environment_counts():
     config = make(throws=replace(BESIDE, first_delay=(0.3, 1.1)))
     skin = config.skin.build(H1_2)
-    watcher = Watcher(config, 1, 16)
-    which = {"throw_set": 1, "episodes": 16}
+    watcher = Watcher(config, 1, 32)
+    which = {"throw_set": 1, "episodes": 32}
     played = play_throws(None, config, skin, **which, hold=True, watch=watcher)
     arrived, avoided = watcher._arrived, watcher._arrived & ~watcher._hit
     for counted, seen in ((played.arrived, arrived), (played.avoided, avoided)):
