@@ -110,7 +110,7 @@ class RobotConfig:
     """Joint positions [rad], of slides [m], of the default pose by joint name pattern;
     else 0."""
     gains: Mapping[str, Mapping[str, Gain]] = field(default_factory=dict)
-    """Named sets of PD gains by joint name pattern."""
+    """Named sets of PD gains by joint name pattern; the first is the default."""
     feet: tuple[str, ...] = ()
     """Links that may touch the ground."""
     untargeted_links: tuple[str, ...] = ()
@@ -215,12 +215,22 @@ class RobotConfig:
         """Lower and upper end of each joint's range [rad], [m], ``[2, J]``."""
         return self.model.jnt_range[self._joint_ids].T.copy()
 
-    def joint_gains(self, gain_set: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return (kp [N m/rad], kd [N m s/rad]) of a named gain set, ``[J]`` each.
+    def joint_gains(self, gain_set: str | None) -> tuple[np.ndarray, np.ndarray]:
+        """Return (kp [N m/rad], kd [N m s/rad]) of a gain set, ``[J]`` each.
+
+        Args:
+            gain_set: Its name; None is the first.
 
         Raises:
-            ValueError: If the robot has no gain set of that name.
+            ValueError: If the robot has no gain set of that name, or none at all.
         """
+        if not self.gains:
+            raise ValueError(
+                f"{self.name} has no gains: no torque holds its joints (sensors can be "
+                "placed without, but no balls thrown)"
+            )
+        if gain_set is None:
+            gain_set = next(iter(self.gains))
         if gain_set not in self.gains:
             raise ValueError(
                 f"{self.name} has no gain set {gain_set!r}; it has "
@@ -232,12 +242,28 @@ class RobotConfig:
     @cached_property
     def default_base_height(self) -> float:
         """Height of the base when the default pose stands on the ground [m]."""
+        data = self._in_default_pose()
+        lowest, _ = self._extent(data)
+        return float(data.xpos[self._bodies[0], 2] - lowest)
+
+    @cached_property
+    def standing_height(self) -> float:
+        """Height of its highest point in the default pose, to the centimetre [m]."""
+        lowest, highest = self._extent(self._in_default_pose())
+        return round(highest - lowest, 2)
+
+    def _in_default_pose(self) -> mujoco.MjData:
+        """The robot alone in its default pose, its base where the file puts it."""
         model, data = self.model, mujoco.MjData(self.model)
         data.qpos[model.jnt_qposadr[self._joint_ids]] = self.default_joint_pos
         mujoco.mj_kinematics(model, data)
-        geoms = self._collision_geoms(self.links)
-        lowest = min(_lowest_point(model, data, geom) for geom in geoms)
-        return float(data.xpos[self._bodies[0], 2] - lowest)
+        return data
+
+    def _extent(self, data: mujoco.MjData) -> tuple[float, float]:
+        """Height of the lowest and of the highest point of its shapes [m]."""
+        ends = [_extent(self.model, data, g) for g in self._collision_geoms(self.links)]
+        lows, highs = zip(*ends, strict=True)
+        return min(lows), max(highs)
 
     @cached_property
     def primitives(self) -> tuple[Primitive, ...]:
@@ -349,8 +375,10 @@ def _primitive_kind(model: mujoco.MjModel, geom: int) -> str:
     return kind
 
 
-def _lowest_point(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
-    """Height of the lowest point of a primitive geom [m]."""
+def _extent(
+    model: mujoco.MjModel, data: mujoco.MjData, geom: int
+) -> tuple[float, float]:
+    """Height of the lowest and of the highest point of a primitive geom [m]."""
     size, kind = model.geom_size[geom], _primitive_kind(model, geom)
     z_row = data.geom_xmat[geom].reshape(3, 3)[2]
     if kind == "sphere":
@@ -359,7 +387,8 @@ def _lowest_point(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> floa
         reach = size[0] + size[1] * abs(z_row[2])
     else:
         reach = float(np.abs(z_row) @ size)
-    return float(data.geom_xpos[geom, 2] - reach)
+    centre = data.geom_xpos[geom, 2]
+    return float(centre - reach), float(centre + reach)
 
 
 _ARMS = tuple(
@@ -394,15 +423,6 @@ H1_2 = RobotConfig(
         "*_elbow_joint": 0.3,
     },
     gains={
-        # Unitree's figures for the real robot.
-        "real": {
-            "*_hip_*_joint": Gain(kp=200.0, kd=2.5),
-            "*_knee_joint": Gain(kp=300.0, kd=4.0),
-            "*_ankle_*_joint": Gain(kp=40.0, kd=2.0),
-            "torso_joint": Gain(kp=300.0, kd=3.0),
-            "*_shoulder_*_joint": Gain(kp=120.0, kd=2.0),
-            "*_elbow_joint": Gain(kp=80.0, kd=1.0),
-        },
         # kp = I w^2, kd = 2 zeta I w with the reflected rotor inertia I, w = 10 Hz
         # and damping ratio zeta = 2.
         "rotor_inertia": {
@@ -415,6 +435,15 @@ H1_2 = RobotConfig(
             "*_shoulder_yaw_joint": Gain(kp=7.9, kd=0.5),
             "*_elbow_joint": Gain(kp=7.9, kd=0.5),
         },
+        # Unitree's figures for the real robot.
+        "real": {
+            "*_hip_*_joint": Gain(kp=200.0, kd=2.5),
+            "*_knee_joint": Gain(kp=300.0, kd=4.0),
+            "*_ankle_*_joint": Gain(kp=40.0, kd=2.0),
+            "torso_joint": Gain(kp=300.0, kd=3.0),
+            "*_shoulder_*_joint": Gain(kp=120.0, kd=2.0),
+            "*_elbow_joint": Gain(kp=80.0, kd=1.0),
+        },
     },
     feet=tuple(
         f"{s}_ankle_{a}_link" for s in ("left", "right") for a in ("pitch", "roll")
@@ -424,7 +453,71 @@ H1_2 = RobotConfig(
 )
 """Unitree H1-2 without hands, wrists locked: 21 joints."""
 
-RobotName = Literal["h1_2"]
+G1 = RobotConfig(
+    name="g1",
+    model_path=ASSETS / "g1.xml",
+    base="pelvis",
+    # Knees bent, the centre of mass above the middle of the soles; arms clear of the body.
+    default_pose={
+        "*_hip_pitch_joint": -0.28,
+        "*_knee_joint": 0.56,
+        "*_ankle_pitch_joint": -0.28,
+        "*_shoulder_pitch_joint": 0.2,
+        "left_shoulder_roll_joint": 0.2,
+        "right_shoulder_roll_joint": -0.2,
+        "*_elbow_joint": 0.6,
+    },
+    gains={
+        # The next set, where that holds the robot up by itself: stiffer in what carries
+        # it forward and back. Hips and knees are as stiff as the H1-2's real ones.
+        "standing": {
+            "*_hip_pitch_joint": Gain(kp=200.0, kd=5.0),
+            "*_hip_yaw_joint": Gain(kp=40.2, kd=2.56),
+            "*_hip_roll_joint": Gain(kp=99.1, kd=6.31),
+            "*_knee_joint": Gain(kp=250.0, kd=6.31),
+            "*_ankle_pitch_joint": Gain(kp=250.0, kd=6.0),
+            "*_ankle_roll_joint": Gain(kp=100.0, kd=3.0),
+            "waist_yaw_joint": Gain(kp=40.2, kd=2.56),
+            "waist_[rp]*_joint": Gain(kp=200.0, kd=5.0),
+            "*_shoulder_*_joint": Gain(kp=14.3, kd=0.907),
+            "*_elbow_joint": Gain(kp=14.3, kd=0.907),
+            "*_wrist_roll_joint": Gain(kp=14.3, kd=0.907),
+            "*_wrist_[py]*_joint": Gain(kp=16.8, kd=1.07),
+        },
+        # As for the H1-2: from the armatures, at 10 Hz and damping ratio 2, as public
+        # controllers of the G1 have them (BeyondMimic, mjlab).
+        "rotor_inertia": {
+            "*_hip_pitch_joint": Gain(kp=40.2, kd=2.56),
+            "*_hip_yaw_joint": Gain(kp=40.2, kd=2.56),
+            "*_hip_roll_joint": Gain(kp=99.1, kd=6.31),
+            "*_knee_joint": Gain(kp=99.1, kd=6.31),
+            "*_ankle_*_joint": Gain(kp=28.5, kd=1.81),
+            "waist_yaw_joint": Gain(kp=40.2, kd=2.56),
+            "waist_[rp]*_joint": Gain(kp=28.5, kd=1.81),
+            "*_shoulder_*_joint": Gain(kp=14.3, kd=0.907),
+            "*_elbow_joint": Gain(kp=14.3, kd=0.907),
+            "*_wrist_roll_joint": Gain(kp=14.3, kd=0.907),
+            "*_wrist_[py]*_joint": Gain(kp=16.8, kd=1.07),
+        },
+        # Unitree's low-level example for the real robot (unitree_sdk2).
+        "real": {
+            "*_hip_*_joint": Gain(kp=60.0, kd=1.0),
+            "*_knee_joint": Gain(kp=100.0, kd=2.0),
+            "*_ankle_*_joint": Gain(kp=40.0, kd=1.0),
+            "waist_yaw_joint": Gain(kp=60.0, kd=1.0),
+            "waist_[rp]*_joint": Gain(kp=40.0, kd=1.0),
+            "*_shoulder_*_joint": Gain(kp=40.0, kd=1.0),
+            "*_elbow_joint": Gain(kp=40.0, kd=1.0),
+            "*_wrist_*_joint": Gain(kp=40.0, kd=1.0),
+        },
+    },
+    feet=H1_2.feet,
+    skin_links=("torso_link", *_ARMS),
+    untargeted_links=_SHINS_AND_FEET,
+)
+"""Unitree G1 with rubber hands: 29 joints."""
+
+RobotName = Literal["h1_2", "g1"]
 """Robots that can be chosen by name."""
-ROBOTS = {H1_2.name: H1_2}
+ROBOTS = {robot.name: robot for robot in (H1_2, G1)}
 """Robots by name, for configurations and policy files."""

@@ -40,8 +40,9 @@ OBJECT_MASS = 0.4
 class PhysicsConfig:
     """Actuation and rates of the simulation."""
 
-    gains: str = "rotor_inertia"
-    """Named PD gain set of the robot ("real", "rotor_inertia")."""
+    gains: str | None = None
+    """Named PD gain set of the robot (h1_2: "rotor_inertia", "real"); None: its
+    first."""
     control_hz: Annotated[float, Interval(ge=1, le=1e5)] = 60.0
     """Rate at which the policy acts [Hz]."""
     substeps: Annotated[int, Interval(ge=1, le=1000)] = 2
