@@ -155,7 +155,11 @@ class Thrower:
         self.config = config
         self._timestep = timestep
         self._robot = robot
-        self._size = robot.standing_height / _REFERENCE_HEIGHT
+
+    @cached_property
+    def _size(self) -> float:
+        """Height of the robot, that of the H1-2 being 1."""
+        return self._robot.standing_height / _REFERENCE_HEIGHT
 
     @cached_property
     def _aim_points(self) -> tuple[LinkKinematics, Tensor, Tensor]:

@@ -468,22 +468,6 @@ G1 = RobotConfig(
         "*_elbow_joint": 0.6,
     },
     gains={
-        # The next set, where that holds the robot up by itself: stiffer in what carries
-        # it forward and back. Hips and knees are as stiff as the H1-2's real ones.
-        "standing": {
-            "*_hip_pitch_joint": Gain(kp=200.0, kd=5.0),
-            "*_hip_yaw_joint": Gain(kp=40.2, kd=2.56),
-            "*_hip_roll_joint": Gain(kp=99.1, kd=6.31),
-            "*_knee_joint": Gain(kp=250.0, kd=6.31),
-            "*_ankle_pitch_joint": Gain(kp=250.0, kd=6.0),
-            "*_ankle_roll_joint": Gain(kp=100.0, kd=3.0),
-            "waist_yaw_joint": Gain(kp=40.2, kd=2.56),
-            "waist_[rp]*_joint": Gain(kp=200.0, kd=5.0),
-            "*_shoulder_*_joint": Gain(kp=14.3, kd=0.907),
-            "*_elbow_joint": Gain(kp=14.3, kd=0.907),
-            "*_wrist_roll_joint": Gain(kp=14.3, kd=0.907),
-            "*_wrist_[py]*_joint": Gain(kp=16.8, kd=1.07),
-        },
         # As for the H1-2: from the armatures, at 10 Hz and damping ratio 2, as public
         # controllers of the G1 have them (BeyondMimic, mjlab).
         "rotor_inertia": {
