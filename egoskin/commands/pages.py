@@ -18,7 +18,8 @@ Train a robot to dodge balls by what its skin observes.
                           is in range (proximity)
   --sensor.range FLOAT    to the ball's surface [m] (2.0)
   --skin.path PATH        skin file, see egoskin skin; else 64 random sensors
-  --robot NAME            the robot (h1_2)
+  --robot NAME|PATH       h1_2, g1, or your own: a folder with robot.toml, or
+                          my_robot.py:ROBOT (h1_2)
   --standard {2,1,paper}  version of the throws; see docs/standard-throw.md
   --seed INT              of everything random (0)
   --total-frames INT      environment steps of the whole run (65536000)
@@ -102,7 +103,7 @@ Show what a skin sees of the throws, before any training.
 
   --skin.path PATH        skin file; else 64 random sensors
   --skin.num-sensors INT  number of sensors to place (64)
-  --robot NAME            the robot (h1_2)
+  --robot NAME            the robot, or where yours is (h1_2)
   --coverages {field,ray} ...
                           coverages compared (field ray)
   --ranges FLOAT ...      ranges compared [m] (0.2 0.5 1.0 2.0)

@@ -1,8 +1,8 @@
-"""Robots: model file and the facts that no model file holds.
+"""Robots: a model and the facts that no model holds.
 
-Adding a robot is adding a `RobotConfig` here and its MJCF to ``assets/``; to place
-sensors on one elsewhere, make its `RobotConfig` there. Names are resolved to indices
-once, in the properties of the configuration.
+Those of the package are at the end, with their MJCF in ``assets/``; one of your own
+comes from a folder or a file of yours (`egoskin.robots.own`). Names are resolved to
+indices once, in the properties of the configuration.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ import fnmatch
 import glob
 import re
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -27,6 +27,7 @@ from egoskin.robots.chains import (
     build_chain,
     joint_name,
 )
+from egoskin.robots.model_text import checked_model
 from egoskin.storage.files import check_regular, read_regular
 
 ASSETS = Path(__file__).parents[1] / "assets"
@@ -88,7 +89,7 @@ class Primitive:
     """Orientation in the link frame (a capsule's axis is z), ``[3, 3]``."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True)
 class RobotConfig:
     """A robot: a base, and the hinges and slides below it.
 
@@ -98,9 +99,12 @@ class RobotConfig:
 
     name: str
     """Name by which configurations refer to the robot."""
-    model_path: Path
+    model_path: Path | None = None
     """MJCF or URDF; only what hangs on the base counts. Of a URDF links on fixed joints
     are links, too, and meshes, which seldom lie where it says, are left out."""
+    model_xml: str | None = None
+    """An MJCF as text instead, which names no other file: what policies and runs keep
+    (`egoskin.robots.own.portable`)."""
     base: str
     """Root of `chain`, the *robot's centre frame*: the body with the free joint or, of
     a robot that stands fixed, one that is welded to the world, or ``"world"``."""
@@ -116,6 +120,22 @@ class RobotConfig:
     untargeted_links: tuple[str, ...] = ()
     """Links that throws are not aimed at."""
 
+    def __post_init__(self) -> None:
+        """Raise ValueError unless there is one model."""
+        if (self.model_path is None) == (self.model_xml is None):
+            raise ValueError(
+                f"robot {self.name!r} must have a model_path or a model_xml, one of "
+                "the two"
+            )
+
+    def __hash__(self) -> int:
+        """Return a hash, which its tables have not."""
+        return hash((self.name, self.base, self.model_path, self.model_xml))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy or another process needs: nothing that is computed."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}
+
     @cached_property
     def model(self) -> mujoco.MjModel:
         """The robot alone, compiled."""
@@ -123,21 +143,26 @@ class RobotConfig:
         try:
             return spec.compile()
         except ValueError as error:
-            raise _unreadable(self.model_path, error) from error
+            raise self._unreadable(error) from error
 
     def spec(self) -> mujoco.MjSpec:
         """Return a fresh, editable specification of the robot.
 
         Raises:
-            ValueError: If the file is no MJCF or URDF that MuJoCo can read.
+            ValueError: If the model is no MJCF or URDF that MuJoCo can read, or, as
+                text, holds more than a robot of primitives.
             OSError: If there is no such file.
         """
-        path = self.model_path
-        is_urdf = _root_tag(read_regular(path)) == "robot"
+        path, is_urdf, text = self.model_path, self.is_urdf, ""
+        if self.model_xml is not None:
+            text = checked_model(self.model_xml, f"robot {self.name!r}")
         try:
-            spec = mujoco.MjSpec.from_file(str(path))
+            if path is None:
+                spec = mujoco.MjSpec.from_string(text)
+            else:
+                spec = mujoco.MjSpec.from_file(str(path))
         except ValueError as error:
-            raise _unreadable(path, error) from error
+            raise self._unreadable(error) from error
         if is_urdf:
             for element in (*_mesh_geoms(spec), *spec.meshes):
                 spec.delete(element)
@@ -146,6 +171,19 @@ class RobotConfig:
             spec.compiler.boundmass = spec.compiler.boundinertia = 1e-6
             spec.compiler.balanceinertia = True
         return spec
+
+    @property
+    def is_urdf(self) -> bool:
+        """Whether its model is a URDF."""
+        path = self.model_path
+        return path is not None and _root_tag(read_regular(path)) == "robot"
+
+    def _unreadable(self, error: ValueError) -> ValueError:
+        """The error for a model that MuJoCo refuses, on one line."""
+        what = self.model_path or f"the model of {self.name!r}"
+        return ValueError(
+            f"{what} is no robot that MuJoCo can read: {' '.join(str(error).split())}"
+        )
 
     @cached_property
     def _bodies(self) -> list[int]:
@@ -349,13 +387,6 @@ def _mesh_geoms(spec: mujoco.MjSpec) -> list[mujoco.MjsGeom]:
     return [g for g in spec.geoms if g.type == mujoco.mjtGeom.mjGEOM_MESH]
 
 
-def _unreadable(path: Path, error: ValueError) -> ValueError:
-    """The error for a file that MuJoCo refuses, on one line."""
-    return ValueError(
-        f"{path} is no robot that MuJoCo can read: {' '.join(str(error).split())}"
-    )
-
-
 def _primitive_kind(model: mujoco.MjModel, geom: int) -> str:
     """Return "sphere", "capsule" or "box".
 
@@ -501,7 +532,5 @@ G1 = RobotConfig(
 )
 """Unitree G1 with rubber hands: 29 joints."""
 
-RobotName = Literal["h1_2", "g1"]
-"""Robots that can be chosen by name."""
 ROBOTS = {robot.name: robot for robot in (H1_2, G1)}
-"""Robots by name, for configurations and policy files."""
+"""Robots that can be chosen by name."""
