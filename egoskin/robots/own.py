@@ -235,10 +235,13 @@ def read_folder(folder: Path) -> RobotConfig:
     )
     # What names links and joints can be told wrong only once they are known.
     try:
-        links = robot.links
+        _ = robot.model
     except ValueError as error:
-        at = "base" if "no body" in str(error) else "model"
-        raise toml.error(str(error), at) from None
+        raise toml.error(str(error), "model") from None
+    try:
+        links = robot.links
+    except KeyError as error:
+        raise toml.error(str(error.args[0]), "base") from None
     lists = {key: _links(toml, key, links) for key in _LISTS}
     for key, table in (("default_pose", robot.default_pose), *_flat(robot.gains)):
         for pattern in table:
