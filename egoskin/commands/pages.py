@@ -98,6 +98,16 @@ Place, import, export and show skins.
 
 egoskin skin place --help lists the options of place, and so for each.
 """,
+    "robot": """\
+Look at a robot before it is trained; docs/your-robot.md says how to bring yours.
+
+  egoskin robot check my_robot --out robot.png
+                          tell what would go wrong: gains, limits, feet, skin, does
+                          it stand? And draw the robot with its skin
+
+A robot is h1_2, g1, a folder with robot.toml, or my_robot.py:ROBOT. egoskin robot check
+--help lists the options of check.
+""",
     "visibility": """\
 Show what a skin sees of the throws, before any training.
 
@@ -194,7 +204,7 @@ egoskin bench loop --help lists the options of loop, and so for each.
 """,
 }
 """Text by command."""
-WITH_SUBCOMMANDS = ("skin", "study", "bench")
+WITH_SUBCOMMANDS = ("skin", "robot", "study", "bench")
 """Commands whose first argument is a command of their own."""
 
 

@@ -284,6 +284,13 @@ class RobotConfig:
         lowest, _ = self._extent(data)
         return float(data.xpos[self._bodies[0], 2] - lowest)
 
+    @property
+    def lowest_link(self) -> str:
+        """The link that reaches lowest in the default pose."""
+        data, geoms = self._in_default_pose(), self._collision_geoms(self.links)
+        geom = min(geoms, key=lambda g: _extent(self.model, data, g)[0])
+        return body_name(self.model, int(self.model.geom_bodyid[geom]))
+
     @cached_property
     def standing_height(self) -> float:
         """Height of its highest point in the default pose, to the centimetre [m]."""
