@@ -42,9 +42,9 @@ Play a policy on a fixed set of throws that no training has seen.
                           version of the throws to judge by (2)
   --mask [LINK ...]       links whose sensors detect nothing; alone: all sensors
   --behaviour             also hits by kind of throw, displacement, effort
+  --perturbed             also on robots that are not their model, late, pushed
   --map PATH              picture of success against speed, tempo, height, direction
   --check-substeps INT    once more with finer physics (8: 480 Hz)
-  --num-workers INT       processes; else one for each core
   --json PATH             file to write the figures to
 
   egoskin evaluate field_proximity --episodes 256
