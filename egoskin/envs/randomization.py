@@ -102,9 +102,7 @@ class Randomization:
         """
         config, joints = self.config, self._joints
         sizes = (self._links, 1, joints, joints)
-        u = uniform(
-            seed, Stream.ROBOT, ids, episode, torch.zeros_like(ids), sum(sizes)
-        )
+        u = uniform(seed, Stream.ROBOT, ids, episode, torch.zeros_like(ids), sum(sizes))
         mass, friction, gains, limit = u.split(sizes, -1)
         return Variation(
             link_mass=_between(config.link_mass, mass),

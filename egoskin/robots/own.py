@@ -81,7 +81,9 @@ def find_robot(name: str) -> RobotConfig:
     if path.name == TOML_NAME and path.is_file():
         return read_folder(path.parent)
     if path.suffix == ".py" and path.is_file():
-        raise ValueError(f"which robot of {name}? Say {name}:ROBOT, the variable's name")
+        raise ValueError(
+            f"which robot of {name}? Say {name}:ROBOT, the variable's name"
+        )
     if path.exists():
         return read_robot(path)
     raise ValueError(
@@ -361,9 +363,11 @@ def portable(robot: RobotConfig) -> RobotConfig:
             spec.delete(body)
     for geom in list(spec.geoms):
         touches = geom.contype or geom.conaffinity or geom.name in in_pairs
-        if geom.parent is spec.worldbody or geom.parent.name == "world":
-            spec.delete(geom)
-        elif not touches and geom.type not in _PRIMITIVES:
+        if (
+            geom.parent is spec.worldbody
+            or geom.parent.name == "world"
+            or (not touches and geom.type not in _PRIMITIVES)
+        ):
             spec.delete(geom)
         elif geom.type == mujoco.mjtGeom.mjGEOM_CYLINDER:
             _round_off(geom)
@@ -445,5 +449,3 @@ def _set_bits(spec: mujoco.MjSpec) -> None:
         own = (1 << (31 - _NUM_WORLD_BITS)) - 1
         geom.contype = (geom.contype & own) << _NUM_WORLD_BITS
         geom.conaffinity = (geom.conaffinity & own) << _NUM_WORLD_BITS | _WORLD_BITS
-
-

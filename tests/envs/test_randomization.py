@@ -1,4 +1,4 @@
-"""Randomisation for the real world: what is drawn, what it does, and that it is exact."""
+"""Randomisation for the real world: what is drawn, what it does, what stays exact."""
 
 from __future__ import annotations
 
