@@ -495,7 +495,7 @@ G1 = RobotConfig(
     name="g1",
     model_path=ASSETS / "g1.xml",
     base="pelvis",
-    # Knees bent, the centre of mass above the middle of the soles; arms clear of the body.
+    # Knees bent, the centre of mass above the soles; arms clear of the body.
     default_pose={
         "*_hip_pitch_joint": -0.28,
         "*_knee_joint": 0.56,

@@ -97,6 +97,11 @@ def _by_name_or_portable(name: str) -> str | RobotConfig:
     return name if name in ROBOTS else portable(find_robot(name))
 
 
+def _name(robot: str | RobotConfig) -> str:
+    """Return the name of a robot as configurations keep it."""
+    return robot if isinstance(robot, str) else robot.name
+
+
 Robot = Annotated[
     str | RobotConfig,
     PrimitiveConstructorSpec(
@@ -104,7 +109,7 @@ Robot = Annotated[
         metavar="NAME|PATH",
         instance_from_str=lambda texts: _by_name_or_portable(texts[0]),
         is_instance=lambda value: isinstance(value, (str, RobotConfig)),
-        str_from_instance=lambda value: [getattr(value, "name", value)],
+        str_from_instance=lambda value: [_name(value)],
     ),
 ]
 """A robot of the package by its name, or another as data; an option of a command takes
@@ -363,10 +368,8 @@ def portable(robot: RobotConfig) -> RobotConfig:
             spec.delete(body)
     for geom in list(spec.geoms):
         touches = geom.contype or geom.conaffinity or geom.name in in_pairs
-        if (
-            geom.parent is spec.worldbody
-            or geom.parent.name == "world"
-            or (not touches and geom.type not in _PRIMITIVES)
+        if geom.parent.name == "world" or (
+            not touches and geom.type not in _PRIMITIVES
         ):
             spec.delete(geom)
         elif geom.type == mujoco.mjtGeom.mjGEOM_CYLINDER:

@@ -240,7 +240,7 @@ class MujocoPhysics(Physics):
     def vary(self, rows: Tensor, variation: Variation) -> None:
         """Give rows model fields of their own; see `Physics.vary`."""
         model, which, expand = self.model, rows.numpy(), self._batch.expand
-        links = [body_id(model, link) for link in self.scene.robot.links]
+        links = np.array([body_id(model, link) for link in self.scene.robot.links])
         joints = model.actuator_trnid[:, 0]
         at_links, at_joints = np.ix_(which, links), np.ix_(which, joints)
         mass, gains, limit = (
