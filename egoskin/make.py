@@ -25,7 +25,8 @@ from egoskin.envs.observations import HideObjects, Oracle, Privileged, Proprioce
 from egoskin.envs.standards import standard_of
 from egoskin.memory import check_memory, check_shared_memory
 from egoskin.parallel import WorkerPool, default_num_workers
-from egoskin.robots.config import ROBOTS, RobotConfig, RobotName
+from egoskin.robots.config import RobotConfig
+from egoskin.robots.own import Robot, robot_of
 from egoskin.sensors import History, Skin
 from egoskin.sensors.config import SensorConfig, SkinConfig
 from egoskin.sensors.geometry import STATE_KEYS
@@ -46,8 +47,9 @@ _NETWORK_KEYS = ("observation", "privileged_observation", "signal")
 class EnvConfig:
     """Robot, task, skin, sensors: everything an environment is made of."""
 
-    robot: RobotName = "h1_2"
-    """Robot by name."""
+    robot: Robot = "h1_2"
+    """Robot by name, or one of your own: a folder with robot.toml, or my_robot.py:ROBOT
+    (docs/your-robot.md)."""
     task: DodgeballConfig = dataclasses.field(default_factory=DodgeballConfig)
     """The dodgeball task."""
     skin: SkinConfig = dataclasses.field(default_factory=SkinConfig)
@@ -62,14 +64,14 @@ class EnvConfig:
     """Observations of this many steps, the present one included."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for a history out of bounds, or gains of another robot."""
+        """Raise ValueError for a history out of bounds, or what the robot lacks."""
         check_bounds(self)
         self.robot_config.joint_gains(self.task.physics.gains)
 
     @property
     def robot_config(self) -> RobotConfig:
         """The robot."""
-        return ROBOTS[self.robot]
+        return robot_of(self.robot)
 
     @property
     def standard(self) -> str:

@@ -31,6 +31,9 @@ class Stream(IntEnum):
     THROW = 1
     SENSOR = 2
     FIRST_DELAY = 3
+    ROBOT = 4
+    DELAY = 5
+    PUSH = 6
 
 
 def philox(counter: Tensor, key: tuple[int, int]) -> Tensor:

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import copy
+
 import mujoco
 import numpy as np
 import torch
 from torch import Tensor
 
-from egoskin.envs.physics import Physics, PhysicsState, Scene, StepResult
+from egoskin.envs.physics import (
+    Physics,
+    PhysicsState,
+    Scene,
+    StepResult,
+    Variation,
+)
 from egoskin.envs.physics.mujoco import build_scene
 
 FAR = 1000.0
@@ -20,6 +28,7 @@ class SimplePhysics(Physics):
     def __init__(self, scene: Scene, num_envs: int, *, num_threads: int = 1) -> None:
         self.scene, robot = scene, scene.robot
         self.model = model = build_scene(scene)
+        self.models = [copy.copy(model) for _ in range(num_envs)]
         self.rows = [mujoco.MjData(model) for _ in range(num_envs)]
         # Targets of the step before, for a velocity target by finite differences.
         self.last = torch.zeros(num_envs, len(robot.joints))
@@ -29,7 +38,7 @@ class SimplePhysics(Physics):
     def reset(self, rows: Tensor, base_pose: Tensor, joint_pos: Tensor) -> None:
         for row, pose, joints in zip(rows.tolist(), base_pose, joint_pos, strict=True):
             data = self.rows[row]
-            mujoco.mj_resetData(self.model, data)
+            mujoco.mj_resetData(self.models[row], data)
             data.qpos[: self.stop] = torch.cat((pose, joints))
             data.qpos[self.stop :] = [0, 0, FAR] * len(self.scene.objects)
             self.last[row] = joints
@@ -41,6 +50,26 @@ class SimplePhysics(Physics):
             first = self.stop + 3 * int(objects[i])
             self.rows[row].qpos[first : first + 3] = position[i]
             self.rows[row].qvel[first - 1 : first + 2] = velocity[i]
+
+    def vary(self, rows: Tensor, variation: Variation) -> None:
+        robot = self.scene.robot
+        for i, row in enumerate(rows.tolist()):
+            self.models[row] = model = copy.copy(self.model)
+            for name, factor in zip(robot.links, variation.link_mass[i], strict=True):
+                model.body(name).mass *= float(factor)
+                model.body(name).inertia *= float(factor)
+            model.geom_friction *= float(variation.friction[i])
+            factors = zip(variation.gains[i], variation.torque_limit[i], strict=True)
+            for name, (gain, limit) in zip(robot.joints, factors, strict=True):
+                model.actuator(name).gainprm[0] *= float(gain)
+                model.actuator(name).biasprm[1:3] *= float(gain)
+                model.actuator(name).forcerange *= float(limit)
+                model.jnt_actfrcrange[model.joint(name).id] *= float(limit)
+            mujoco.mj_setConst(model, mujoco.MjData(model))
+
+    def push(self, rows: Tensor, velocity: Tensor) -> None:
+        for row, change in zip(rows.tolist(), velocity, strict=True):
+            self.rows[row].qvel[:3] += change.double().numpy()
 
     def step(self, target: Tensor, active: Tensor) -> StepResult:
         given = zip(range(len(self.rows)), target, active, strict=True)
@@ -70,12 +99,12 @@ class SimplePhysics(Physics):
             data.ctrl[:] = target + torch.from_numpy(kd / kp).float() * velocity
             self.last[row] = target
         start = data.qpos[: self.stop].copy()
-        low, high = self.model.actuator_forcerange.T
+        low, high = self.models[row].actuator_forcerange.T
         hit, links = np.zeros(len(active), bool), np.zeros(len(robot.links), bool)
         fallen, own, power, limited = False, False, 0.0, 0.0
         before = sum(warning.number for warning in data.warning)
         for _ in range(config.substeps):
-            mujoco.mj_step(self.model, data)
+            mujoco.mj_step(self.models[row], data)
             for pair in data.contact.geom:
                 touching = [self.body_of[g] for g in pair]
                 mine = [name for name in touching if name in robot.links]

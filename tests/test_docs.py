@@ -17,15 +17,17 @@ from pathlib import Path
 import pytest
 
 import egoskin
-from calling import succeed
+from calling import call, succeed
 from egoskin.agents.ppo import PPOConfig
 from egoskin.envs.dodgeball import DodgeballConfig
+from egoskin.envs.randomization import RandomizationConfig
 from egoskin.envs.throws import ThrowConfig
 from egoskin.make import EnvConfig, make_worker_env
 from egoskin.policies.export import export_onnx, observation_parts
 from egoskin.robots.config import H1_2
-from egoskin.runs.config import TrainConfig
+from egoskin.runs.config import TrainConfig, parse_config
 from egoskin.sensors.config import SensorConfig
+from owning import write_robot
 
 DOCS = Path(__file__).parents[1] / "docs"
 DEPLOY = DOCS / "deploy.md"
@@ -325,3 +327,41 @@ def test_the_site_is_built_without_warnings_and_read_offline(tmp_path):
         assert not re.search(r"url\(['\"]?(?:https?:)?//|@import", path.read_text()), (
             path
         )
+
+
+YOUR_ROBOT = (DEPLOY.parent / "your-robot.md").read_text()
+
+
+def test_the_tutorial_of_your_robot_runs_as_given(tmp_path, monkeypatch):
+    (toml,) = re.findall(r"```toml\n(.*?)```", YOUR_ROBOT, re.DOTALL)
+    (shell,) = re.findall(r"```sh\n(.*?)```", YOUR_ROBOT, re.DOTALL)
+    write_robot(tmp_path / "pip", toml)
+    monkeypatch.chdir(tmp_path)
+    said = [succeed(*line.split()[1:]) for line in shell.splitlines()]
+    assert "it stands for 2 s by itself" in said[0]
+    assert (tmp_path / "pip.png").is_file()
+    assert "done: 512 frames" in said[1]
+    assert "throw set 0 of 8 episodes" in said[2]
+    # The line of the error that it quotes.
+    write_robot(tmp_path / "pip", toml.replace('"*_foot"]      ', '"left_fot"]', 1))
+    assert re.search(
+        r"pip/robot\.toml:3: no link 'left_fot', did you mean 'left_foot'\?",
+        "".join(call("robot", "check", "pip").stderr),
+    )
+
+
+def test_the_tutorial_names_options_that_there_are():
+    options = re.findall(
+        r"--(task\.randomization[\w.-]+) ([\d.]+) ([\d.]+)", YOUR_ROBOT
+    )
+    assert len(options) == 6
+    args = [text for name, *pair in options for text in (f"--{name}", *pair)]
+    found = parse_config(args).env.task.randomization
+    assert found == RandomizationConfig(
+        link_mass=(0.8, 1.2),
+        friction=(0.4, 1.0),
+        gains=(0.8, 1.2),
+        torque_limit=(0.6, 1.0),
+        delay_steps=(0, 2),
+        push_speed=(0.3, 0.6),
+    )

@@ -49,6 +49,7 @@ TOP = "commands"
 MUJOCO = {
     "robots.chains",
     "robots.config",
+    "robots.own",
     "shapes",
     "envs.physics.mujoco",
     "sensors.skin.mesh_surface",

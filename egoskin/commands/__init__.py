@@ -23,6 +23,7 @@ COMMANDS = {
     "view": "see a policy in the browser, and throw balls at it",
     "film": "film an episode, with a contact sheet of its moments",
     "skin": "place, import, export and show skins",
+    "robot": "tell what would go wrong with a robot, and draw it",
     "visibility": "show what a skin sees, before any training",
     "upper-bound": "search what the body could still do when a ball is in reach",
     "replay": "replay an update that was not finite",
@@ -43,7 +44,7 @@ _OTHER_NAMES = {
 }
 
 # Commands that draw the robot.
-_PICTURES = ("film", "skin")
+_PICTURES = ("film", "skin", "robot")
 
 
 def main() -> None:

@@ -5,6 +5,7 @@ egoskin evaluate localization
 egoskin evaluate runs/NAME/policies/000005046272.safetensors --json out.json
 egoskin evaluate runs/NAME --behaviour --check-substeps 8
 egoskin evaluate runs/NAME --mask
+egoskin evaluate runs/NAME --perturbed
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from egoskin.bounds import COUNT, check_bounds
 from egoskin.commands.errors import check_packages
 from egoskin.evaluation.behaviour import Behaviour, Motion, behave
 from egoskin.evaluation.operating_map import check_map, draw_map, operating_map
+from egoskin.evaluation.perturbations import Perturbed, perturb
 from egoskin.evaluation.throw_set import Estimate, Evaluation, evaluate, standard_task
 from egoskin.make import EnvConfig, check_num_workers
 from egoskin.policies.policy import load_policy
@@ -61,6 +63,9 @@ class EvaluateConfig:
     map: Path | None = None
     """Picture to draw of success against speed, tempo, height and direction of the
     throws, within and beyond what is trained on (a quarter of the episodes each)."""
+    perturbed: bool = False
+    """Also play on robots that are not their model: other masses, friction, gains and
+    torque limits, late actions, pushes (a quarter of the episodes each)."""
     json: Path | None = None
     """File to write the figures to."""
 
@@ -164,6 +169,22 @@ def behaviour_table(result: Behaviour) -> str:
     )
 
 
+def perturbed_table(rows: list[Perturbed], age: float) -> str:
+    """Return success under each perturbation as text, with the age of success [s]."""
+    lines = [
+        f"\n  {'perturbed by':<26} {f'{age:g} s':>8}  {'(95 % interval)':<16} "
+        f"{'5 s':>8}  ended by a fall"
+    ]
+    for row in rows:
+        low, high = (100 * x for x in (row.success.low, row.success.high))
+        lines.append(
+            f"  {row.name:<26} {share(row.success.mean)}  "
+            f"{f'({low:.1f} to {high:.1f})':<16} {share(row.success_5s.mean)}  "
+            f"{share(row.ended_by_fall)}"
+        )
+    return "\n".join(lines)
+
+
 def with_substeps(config: EnvConfig, substeps: int) -> EnvConfig:
     """Return the configuration with another number of physics steps."""
     physics = dataclasses.replace(config.task.physics, substeps=substeps)
@@ -241,6 +262,23 @@ def main(args: list[str]) -> None:
         print(f"  success lost by the other physics rate: {lost:.2f} points")
         content["check_substeps"] = config.check_substeps
         content["checked"] = dataclasses.asdict(checked)
+    if config.perturbed:
+
+        def on_perturbed(done: int, total: int) -> None:
+            line.show(f"perturbed: {done} of {total}")
+
+        rows = perturb(
+            policy,
+            env_config,
+            policy.skin,
+            throw_set=config.throw_set,
+            episodes=max(config.episodes // 4, 1),
+            mask=config.masked,
+            on_point=on_perturbed,
+        )
+        line.finish()
+        print(perturbed_table(rows, age))
+        content["perturbed"] = [dataclasses.asdict(row) for row in rows]
     if config.map is not None:
         lines = operating_map(
             policy,

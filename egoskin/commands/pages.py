@@ -18,7 +18,8 @@ Train a robot to dodge balls by what its skin observes.
                           is in range (proximity)
   --sensor.range FLOAT    to the ball's surface [m] (2.0)
   --skin.path PATH        skin file, see egoskin skin; else 64 random sensors
-  --robot NAME            the robot (h1_2)
+  --robot NAME|PATH       h1_2, g1, or your own: a folder with robot.toml, or
+                          my_robot.py:ROBOT (h1_2)
   --standard {2,1,paper}  version of the throws; see docs/standard-throw.md
   --seed INT              of everything random (0)
   --total-frames INT      environment steps of the whole run (65536000)
@@ -41,9 +42,9 @@ Play a policy on a fixed set of throws that no training has seen.
                           version of the throws to judge by (2)
   --mask [LINK ...]       links whose sensors detect nothing; alone: all sensors
   --behaviour             also hits by kind of throw, displacement, effort
+  --perturbed             also on robots that are not their model, late, pushed
   --map PATH              picture of success against speed, tempo, height, direction
   --check-substeps INT    once more with finer physics (8: 480 Hz)
-  --num-workers INT       processes; else one for each core
   --json PATH             file to write the figures to
 
   egoskin evaluate field_proximity --episodes 256
@@ -97,12 +98,22 @@ Place, import, export and show skins.
 
 egoskin skin place --help lists the options of place, and so for each.
 """,
+    "robot": """\
+Look at a robot before it is trained; docs/your-robot.md says how to bring yours.
+
+  egoskin robot check my_robot --out robot.png
+                          tell what would go wrong: gains, limits, feet, skin, does
+                          it stand? And draw the robot with its skin
+
+A robot is h1_2, g1, a folder with robot.toml, or my_robot.py:ROBOT. egoskin robot check
+--help lists the options of check.
+""",
     "visibility": """\
 Show what a skin sees of the throws, before any training.
 
   --skin.path PATH        skin file; else 64 random sensors
   --skin.num-sensors INT  number of sensors to place (64)
-  --robot NAME            the robot (h1_2)
+  --robot NAME            the robot, or where yours is (h1_2)
   --coverages {field,ray} ...
                           coverages compared (field ray)
   --ranges FLOAT ...      ranges compared [m] (0.2 0.5 1.0 2.0)
@@ -193,7 +204,7 @@ egoskin bench loop --help lists the options of loop, and so for each.
 """,
 }
 """Text by command."""
-WITH_SUBCOMMANDS = ("skin", "study", "bench")
+WITH_SUBCOMMANDS = ("skin", "robot", "study", "bench")
 """Commands whose first argument is a command of their own."""
 
 

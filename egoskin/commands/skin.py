@@ -25,8 +25,9 @@ from tensordict import TensorDict
 
 from egoskin.commands.errors import parse_subcommand
 from egoskin.progress import counted
-from egoskin.robots.config import ROBOTS, Primitive, RobotConfig, RobotName, read_robot
+from egoskin.robots.config import ROBOTS, Primitive, RobotConfig
 from egoskin.robots.kinematics import LinkKinematics
+from egoskin.robots.own import find_robot
 from egoskin.sensors import Skin
 from egoskin.sensors.skin.coverage import Coverage
 from egoskin.sensors.skin.gentact import load_gentact, save_gentact
@@ -70,8 +71,8 @@ class Place:
 
     out: Path
     """Skin file to write (JSON)."""
-    robot: RobotName = "h1_2"
-    """Robot by name."""
+    robot: str = "h1_2"
+    """Robot by name, or its folder, file of Python, MJCF or URDF."""
     num_sensors: int | None = 64
     """Number of sensors; None: as many as the spacing lets in."""
     method: Literal["area_uniform", "poisson_disk"] = "area_uniform"
@@ -102,7 +103,7 @@ class Place:
                 raise ValueError(
                     f"--density: the weight of {link} must be a number, got {weight!r}"
                 ) from None
-        robot = ROBOTS[self.robot]
+        robot = find_robot(self.robot)
         if self.num_sensors is None or self.num_sensors >= _MANY:
             print("placing many sensors: this may take some minutes", flush=True)
         skin = place_sensors(
@@ -129,7 +130,7 @@ class Import:
     out: Path
     """Skin file to write (JSON)."""
     robot: str = "h1_2"
-    """Robot by name, or the path of its MJCF or URDF."""
+    """Robot by name, or its folder, file of Python, MJCF or URDF."""
     scale: float | None = None
     """Metres of one unit of the files; None: that of the dialect."""
     link_map: tuple[str, ...] = ()
@@ -171,23 +172,6 @@ class Import:
             )
 
 
-def find_robot(name: str) -> RobotConfig:
-    """Return the robot of a name or of a file.
-
-    Raises:
-        ValueError: If there is neither, or the file is no robot.
-    """
-    if name in ROBOTS:
-        return ROBOTS[name]
-    try:
-        return read_robot(name)
-    except FileNotFoundError:
-        raise ValueError(
-            f"--robot must be one of {', '.join(ROBOTS)}, or the path of an MJCF or "
-            f"URDF; there is no {name}"
-        ) from None
-
-
 def _known_shapes(robot: RobotConfig) -> list[Primitive]:
     """Return the shapes of those links whose shapes are all primitives."""
     shapes: list[Primitive] = []
@@ -224,6 +208,9 @@ class Show:
     """Skin file (JSON)."""
     picture: Path | None = None
     """Picture to write, .png: the robot from the front and from behind."""
+    robot: str | None = None
+    """Its robot, if that is none of the package: folder, file of Python, MJCF or
+    URDF."""
 
     def run(self) -> None:
         """Print the summary; write the picture."""
@@ -231,14 +218,16 @@ class Show:
             check_path(self.picture, (".png",))
         skin = Skin.load(self.skin)
         robot = ROBOTS.get(skin.robot)
+        if self.robot is not None:
+            robot = find_robot(self.robot)
         if robot is not None:
             skin.check_links(robot.links)
         print(table(skin, str(self.skin)))
         if self.picture is not None:
             if robot is None:
                 raise ValueError(
-                    f"{self.skin} is for the robot {skin.robot!r}; pictures can be "
-                    f"drawn of {', '.join(ROBOTS)}"
+                    f"{self.skin} is for the robot {skin.robot!r}: say where it is, "
+                    "--robot PATH"
                 )
             save_picture(self.picture, views(robot, skin))
 

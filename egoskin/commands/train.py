@@ -47,7 +47,7 @@ def open_run(config: TrainConfig) -> Run:
         check_packages("--log wandb", "wandb", "wandb")
     run = Run.create(config) if config.resume is None else Run(config.resume, config)
     print(
-        f"run {run.path}: {config.env.robot}, {config.env.sensor.label()}, "
+        f"run {run.path}: {config.env.robot_config.name}, {config.env.sensor.label()}, "
         f"throws of standard {config.env.standard}, seed {config.seed}",
         flush=True,
     )

@@ -41,7 +41,7 @@ from egoskin.envs.physics import PhysicsConfig
 from egoskin.envs.throws import ThrowConfig
 from egoskin.evaluation.visibility import Analysis, analyse
 from egoskin.progress import counted
-from egoskin.robots.config import ROBOTS, RobotName
+from egoskin.robots.own import find_robot
 from egoskin.sensors import Field, Ray
 from egoskin.sensors.config import SensorConfig, SkinConfig
 from egoskin.storage.serialization import to_plain
@@ -57,8 +57,8 @@ BLIND, NOWHERE = "#c1272d", "#e6e6e6"
 class VisibilityConfig:
     """Show what a skin sees, before any training: a picture, a table and JSON."""
 
-    robot: RobotName = "h1_2"
-    """Robot by name."""
+    robot: str = "h1_2"
+    """Robot by name, or its folder, file of Python, MJCF or URDF."""
     skin: SkinConfig = dataclasses.field(default_factory=SkinConfig)
     """Where the sensors sit; what a sensor's file says of its type and range holds."""
     coverages: Annotated[
@@ -230,7 +230,7 @@ def main(args: list[str]) -> None:
     # Before the minutes that the analysis takes.
     check_path(config.out, PICTURE_SUFFIXES)
     check_path(config.json, (".json",))
-    robot = ROBOTS[config.robot]
+    robot = find_robot(config.robot)
     skin = config.skin.build(robot)
     physics = PhysicsConfig()
     own = {"field": {"field": config.field}, "ray": {"ray": config.ray}}

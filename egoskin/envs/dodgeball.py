@@ -23,6 +23,7 @@ from egoskin.envs.physics import (
     PhysicsState,
     Scene,
 )
+from egoskin.envs.randomization import Randomization, RandomizationConfig
 from egoskin.envs.rewards import TERMS, RewardConfig, reward_terms
 from egoskin.envs.state import STATE, state_spec, state_table
 from egoskin.envs.throws import ThrowConfig, Thrower
@@ -42,6 +43,8 @@ class DodgeballConfig:
     """The balls and how they are thrown."""
     reward: RewardConfig = field(default_factory=RewardConfig)
     """Weights of the reward terms."""
+    randomization: RandomizationConfig = field(default_factory=RandomizationConfig)
+    """How robots differ from their model, for the real world; nothing by default."""
     action_scale: Annotated[float, Interval(gt=0, le=100)] = 0.3
     """q* = q_default + action_scale x torque limit / kp x action, per joint. (It is not
     clipped to the joint's range: an ankle could then ask for little torque.)"""
@@ -167,6 +170,13 @@ class DodgeballEnv(EnvBase):
             "O": len(self.scene.objects),
             "R": len(TERMS),
         }
+        self.randomization = Randomization(
+            config.randomization,
+            num_envs,
+            self._sizes["L"],
+            self._sizes["J"],
+            config.physics.control_hz,
+        )
         self._make_specs(num_envs)
 
     def _make_specs(self, n: int) -> None:
@@ -234,6 +244,7 @@ class DodgeballEnv(EnvBase):
         joint_pos = self._default + (0.0 if self.scene.hold else noise)
         self.physics.reset(rows, pose[:n], joint_pos.expand_as(noise)[:n])
         self.balls.start(rows, seed, ids, episode)
+        self.randomization.start(self.physics, rows, seed, ids[:n], episode[:n])
 
     def _throw(self, rows: Tensor) -> None:
         """Throw the next ball of some rows, none or more."""
@@ -249,7 +260,11 @@ class DodgeballEnv(EnvBase):
         counters, config = self._counters, self.config
         action = tensordict["action"]
         # q* = q_default + scale x action
-        target = self._default + self._action_scale * action
+        acting = self.randomization.delayed(action)
+        target = self._default + self._action_scale * acting
+        pushed = self.randomization.due(counters["step"])
+        if len(pushed) and not self.scene.hold:
+            self.randomization.push(self.physics, pushed, *self._draws_of(pushed))
         result = self.physics.step(target, self.balls.state["active"])
         counters["step"] += 1
         state = self.physics.read()
@@ -331,7 +346,7 @@ class DodgeballEnv(EnvBase):
 
     def simulation_state(self) -> dict[str, Tensor]:
         """Return everything needed to continue bit for bit, ``[B, ...]`` each."""
-        counted = {**self._counters, **self.balls.state}
+        counted = self._counted()
         return {
             "physics": self.physics.state(),
             **{key: value.clone() for key, value in counted.items()},
@@ -344,9 +359,17 @@ class DodgeballEnv(EnvBase):
             state: The state of *all* rows of the run; this environment takes its own.
         """
         mine = slice(int(self._rows[0]), int(self._rows[-1]) + 1)
-        self.physics.load_state(state["physics"][mine])
-        for key, value in {**self._counters, **self.balls.state}.items():
+        for key, value in self._counted().items():
             value.copy_(state[key][mine])
+        if self.config.randomization.varies_robot:
+            rows = torch.arange(len(self._rows))
+            own = self.randomization.variation(*self._draws_of(rows))
+            self.physics.vary(rows, own)
+        self.physics.load_state(state["physics"][mine])
+
+    def _counted(self) -> dict[str, Tensor]:
+        """All that is remembered beside the physics, ``[B, ...]`` each."""
+        return {**self._counters, **self.balls.state, **self.randomization.state}
 
 
 if DodgeballEnv.__doc__:

@@ -10,6 +10,7 @@ from dataclasses import replace
 from typing import Literal
 
 from egoskin.envs.dodgeball import DodgeballConfig
+from egoskin.envs.randomization import RandomizationConfig
 from egoskin.envs.throws import ThrowConfig
 
 Standard = Literal["2", "1", "paper"]
@@ -58,14 +59,18 @@ def training_task(version: Standard, task: DodgeballConfig) -> DodgeballConfig:
 def evaluation_task(version: Standard, task: DodgeballConfig) -> DodgeballConfig:
     """Return a task with the throws and ends that a version judges by.
 
-    The first ball is thrown at the start of the episode.
+    The first ball is thrown at the start of the episode, and the robot is its model.
 
     Args:
         version: The version.
         task: What else the task is made of.
     """
     trained = training_task(version, task)
-    return replace(trained, throws=replace(trained.throws, first_delay=_AT_ONCE))
+    return replace(
+        trained,
+        throws=replace(trained.throws, first_delay=_AT_ONCE),
+        randomization=RandomizationConfig(),
+    )
 
 
 def standard_of(task: DodgeballConfig) -> str:

@@ -1,8 +1,9 @@
 """Throws: which ball flies from where to which point of the body, and when.
 
-A throw is made of draws that do not depend on the robot (direction, distance, height,
-speed, interval, point aimed at) and is turned into a position and a velocity for the
-pose the robot has at release. One throw set of draws therefore serves every policy.
+A throw is made of draws that depend on nothing of the robot but its size (direction,
+distance, height, speed, interval, point aimed at) and is turned into a position and a
+velocity for the pose the robot has at release. One throw set of draws therefore serves
+every policy.
 """
 
 from __future__ import annotations
@@ -29,6 +30,8 @@ _NUM_AIM_POINTS, _AIM_SEED = 4096, 0
 # A robot that runs away faster than this share of the ball's speed is led as if it
 # ran at it; otherwise no throw could reach it.
 _MAX_LEAD_RATIO = 0.9
+# Height of the H1-2 [m], for which heights of release are given.
+_REFERENCE_HEIGHT = 1.78
 # Bounds that leave every throw finite in float32 and MuJoCo a model that it can make.
 _Delay = Annotated[tuple[float, float], Interval(ge=0, le=1000)]
 _Seconds = Annotated[tuple[float, float], Interval(gt=0, le=1000)]
@@ -56,7 +59,8 @@ class ThrowConfig:
     interval: _Seconds = (1.0, 2.0)
     """Time from one throw to the next [s]."""
     height: _Metres = (2.0, 3.0)
-    """Height of release above ground [m]."""
+    """Height of release above ground [m] for a robot as tall as the H1-2 (1.78 m): of
+    another it is scaled with the robot's height."""
     distance: _Metres = (4.0, 6.0)
     """Horizontal distance of release from the base [m]."""
     speed: _MetresPerSecond = (4.0, 8.0)
@@ -153,6 +157,11 @@ class Thrower:
         self._robot = robot
 
     @cached_property
+    def _size(self) -> float:
+        """Height of the robot, that of the H1-2 being 1."""
+        return self._robot.standing_height / _REFERENCE_HEIGHT
+
+    @cached_property
     def _aim_points(self) -> tuple[LinkKinematics, Tensor, Tensor]:
         """Kinematics of the links aimed at; link index and position of each point."""
         robot = self._robot
@@ -247,7 +256,7 @@ class Thrower:
         return Draw(
             azimuth=torch.deg2rad(scale(0, config.azimuth_deg)),
             distance=scale(1, config.distance),
-            height=scale(2, config.height),
+            height=self._size * scale(2, config.height),
             speed=scale(3, config.speed),
             interval=scale(4, config.interval),
             target=u[:, 5:7],

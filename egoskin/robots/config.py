@@ -1,8 +1,8 @@
-"""Robots: model file and the facts that no model file holds.
+"""Robots: a model and the facts that no model holds.
 
-Adding a robot is adding a `RobotConfig` here and its MJCF to ``assets/``; to place
-sensors on one elsewhere, make its `RobotConfig` there. Names are resolved to indices
-once, in the properties of the configuration.
+Those of the package are at the end, with their MJCF in ``assets/``; one of your own
+comes from a folder or a file of yours (`egoskin.robots.own`). Names are resolved to
+indices once, in the properties of the configuration.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ import fnmatch
 import glob
 import re
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -27,6 +27,7 @@ from egoskin.robots.chains import (
     build_chain,
     joint_name,
 )
+from egoskin.robots.model_text import checked_model
 from egoskin.storage.files import check_regular, read_regular
 
 ASSETS = Path(__file__).parents[1] / "assets"
@@ -88,7 +89,7 @@ class Primitive:
     """Orientation in the link frame (a capsule's axis is z), ``[3, 3]``."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True)
 class RobotConfig:
     """A robot: a base, and the hinges and slides below it.
 
@@ -98,9 +99,12 @@ class RobotConfig:
 
     name: str
     """Name by which configurations refer to the robot."""
-    model_path: Path
+    model_path: Path | None = None
     """MJCF or URDF; only what hangs on the base counts. Of a URDF links on fixed joints
     are links, too, and meshes, which seldom lie where it says, are left out."""
+    model_xml: str | None = None
+    """An MJCF as text instead, which names no other file: what policies and runs keep
+    (`egoskin.robots.own.portable`)."""
     base: str
     """Root of `chain`, the *robot's centre frame*: the body with the free joint or, of
     a robot that stands fixed, one that is welded to the world, or ``"world"``."""
@@ -110,11 +114,27 @@ class RobotConfig:
     """Joint positions [rad], of slides [m], of the default pose by joint name pattern;
     else 0."""
     gains: Mapping[str, Mapping[str, Gain]] = field(default_factory=dict)
-    """Named sets of PD gains by joint name pattern."""
+    """Named sets of PD gains by joint name pattern; the first is the default."""
     feet: tuple[str, ...] = ()
     """Links that may touch the ground."""
     untargeted_links: tuple[str, ...] = ()
     """Links that throws are not aimed at."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError unless there is one model."""
+        if (self.model_path is None) == (self.model_xml is None):
+            raise ValueError(
+                f"robot {self.name!r} must have a model_path or a model_xml, one of "
+                "the two"
+            )
+
+    def __hash__(self) -> int:
+        """Return a hash, which its tables have not."""
+        return hash((self.name, self.base, self.model_path, self.model_xml))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy or another process needs: nothing that is computed."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}
 
     @cached_property
     def model(self) -> mujoco.MjModel:
@@ -123,21 +143,26 @@ class RobotConfig:
         try:
             return spec.compile()
         except ValueError as error:
-            raise _unreadable(self.model_path, error) from error
+            raise self._unreadable(error) from error
 
     def spec(self) -> mujoco.MjSpec:
         """Return a fresh, editable specification of the robot.
 
         Raises:
-            ValueError: If the file is no MJCF or URDF that MuJoCo can read.
+            ValueError: If the model is no MJCF or URDF that MuJoCo can read, or, as
+                text, holds more than a robot of primitives.
             OSError: If there is no such file.
         """
-        path = self.model_path
-        is_urdf = _root_tag(read_regular(path)) == "robot"
+        path, is_urdf, text = self.model_path, self.is_urdf, ""
+        if self.model_xml is not None:
+            text = checked_model(self.model_xml, f"robot {self.name!r}")
         try:
-            spec = mujoco.MjSpec.from_file(str(path))
+            if path is None:
+                spec = mujoco.MjSpec.from_string(text)
+            else:
+                spec = mujoco.MjSpec.from_file(str(path))
         except ValueError as error:
-            raise _unreadable(path, error) from error
+            raise self._unreadable(error) from error
         if is_urdf:
             for element in (*_mesh_geoms(spec), *spec.meshes):
                 spec.delete(element)
@@ -146,6 +171,19 @@ class RobotConfig:
             spec.compiler.boundmass = spec.compiler.boundinertia = 1e-6
             spec.compiler.balanceinertia = True
         return spec
+
+    @property
+    def is_urdf(self) -> bool:
+        """Whether its model is a URDF."""
+        path = self.model_path
+        return path is not None and _root_tag(read_regular(path)) == "robot"
+
+    def _unreadable(self, error: ValueError) -> ValueError:
+        """The error for a model that MuJoCo refuses, on one line."""
+        what = self.model_path or f"the model of {self.name!r}"
+        return ValueError(
+            f"{what} is no robot that MuJoCo can read: {' '.join(str(error).split())}"
+        )
 
     @cached_property
     def _bodies(self) -> list[int]:
@@ -215,12 +253,22 @@ class RobotConfig:
         """Lower and upper end of each joint's range [rad], [m], ``[2, J]``."""
         return self.model.jnt_range[self._joint_ids].T.copy()
 
-    def joint_gains(self, gain_set: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return (kp [N m/rad], kd [N m s/rad]) of a named gain set, ``[J]`` each.
+    def joint_gains(self, gain_set: str | None) -> tuple[np.ndarray, np.ndarray]:
+        """Return (kp [N m/rad], kd [N m s/rad]) of a gain set, ``[J]`` each.
+
+        Args:
+            gain_set: Its name; None is the first.
 
         Raises:
-            ValueError: If the robot has no gain set of that name.
+            ValueError: If the robot has no gain set of that name, or none at all.
         """
+        if not self.gains:
+            raise ValueError(
+                f"{self.name} has no gains: no torque holds its joints (sensors can be "
+                "placed without, but no balls thrown)"
+            )
+        if gain_set is None:
+            gain_set = next(iter(self.gains))
         if gain_set not in self.gains:
             raise ValueError(
                 f"{self.name} has no gain set {gain_set!r}; it has "
@@ -232,12 +280,35 @@ class RobotConfig:
     @cached_property
     def default_base_height(self) -> float:
         """Height of the base when the default pose stands on the ground [m]."""
+        data = self._in_default_pose()
+        lowest, _ = self._extent(data)
+        return float(data.xpos[self._bodies[0], 2] - lowest)
+
+    @property
+    def lowest_link(self) -> str:
+        """The link that reaches lowest in the default pose."""
+        data, geoms = self._in_default_pose(), self._collision_geoms(self.links)
+        geom = min(geoms, key=lambda g: _extent(self.model, data, g)[0])
+        return body_name(self.model, int(self.model.geom_bodyid[geom]))
+
+    @cached_property
+    def standing_height(self) -> float:
+        """Height of its highest point in the default pose, to the centimetre [m]."""
+        lowest, highest = self._extent(self._in_default_pose())
+        return round(highest - lowest, 2)
+
+    def _in_default_pose(self) -> mujoco.MjData:
+        """The robot alone in its default pose, its base where the file puts it."""
         model, data = self.model, mujoco.MjData(self.model)
         data.qpos[model.jnt_qposadr[self._joint_ids]] = self.default_joint_pos
         mujoco.mj_kinematics(model, data)
-        geoms = self._collision_geoms(self.links)
-        lowest = min(_lowest_point(model, data, geom) for geom in geoms)
-        return float(data.xpos[self._bodies[0], 2] - lowest)
+        return data
+
+    def _extent(self, data: mujoco.MjData) -> tuple[float, float]:
+        """Height of the lowest and of the highest point of its shapes [m]."""
+        ends = [_extent(self.model, data, g) for g in self._collision_geoms(self.links)]
+        lows, highs = zip(*ends, strict=True)
+        return min(lows), max(highs)
 
     @cached_property
     def primitives(self) -> tuple[Primitive, ...]:
@@ -323,13 +394,6 @@ def _mesh_geoms(spec: mujoco.MjSpec) -> list[mujoco.MjsGeom]:
     return [g for g in spec.geoms if g.type == mujoco.mjtGeom.mjGEOM_MESH]
 
 
-def _unreadable(path: Path, error: ValueError) -> ValueError:
-    """The error for a file that MuJoCo refuses, on one line."""
-    return ValueError(
-        f"{path} is no robot that MuJoCo can read: {' '.join(str(error).split())}"
-    )
-
-
 def _primitive_kind(model: mujoco.MjModel, geom: int) -> str:
     """Return "sphere", "capsule" or "box".
 
@@ -349,8 +413,10 @@ def _primitive_kind(model: mujoco.MjModel, geom: int) -> str:
     return kind
 
 
-def _lowest_point(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
-    """Height of the lowest point of a primitive geom [m]."""
+def _extent(
+    model: mujoco.MjModel, data: mujoco.MjData, geom: int
+) -> tuple[float, float]:
+    """Height of the lowest and of the highest point of a primitive geom [m]."""
     size, kind = model.geom_size[geom], _primitive_kind(model, geom)
     z_row = data.geom_xmat[geom].reshape(3, 3)[2]
     if kind == "sphere":
@@ -359,7 +425,8 @@ def _lowest_point(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> floa
         reach = size[0] + size[1] * abs(z_row[2])
     else:
         reach = float(np.abs(z_row) @ size)
-    return float(data.geom_xpos[geom, 2] - reach)
+    centre = data.geom_xpos[geom, 2]
+    return float(centre - reach), float(centre + reach)
 
 
 _ARMS = tuple(
@@ -394,15 +461,6 @@ H1_2 = RobotConfig(
         "*_elbow_joint": 0.3,
     },
     gains={
-        # Unitree's figures for the real robot.
-        "real": {
-            "*_hip_*_joint": Gain(kp=200.0, kd=2.5),
-            "*_knee_joint": Gain(kp=300.0, kd=4.0),
-            "*_ankle_*_joint": Gain(kp=40.0, kd=2.0),
-            "torso_joint": Gain(kp=300.0, kd=3.0),
-            "*_shoulder_*_joint": Gain(kp=120.0, kd=2.0),
-            "*_elbow_joint": Gain(kp=80.0, kd=1.0),
-        },
         # kp = I w^2, kd = 2 zeta I w with the reflected rotor inertia I, w = 10 Hz
         # and damping ratio zeta = 2.
         "rotor_inertia": {
@@ -415,6 +473,15 @@ H1_2 = RobotConfig(
             "*_shoulder_yaw_joint": Gain(kp=7.9, kd=0.5),
             "*_elbow_joint": Gain(kp=7.9, kd=0.5),
         },
+        # Unitree's figures for the real robot.
+        "real": {
+            "*_hip_*_joint": Gain(kp=200.0, kd=2.5),
+            "*_knee_joint": Gain(kp=300.0, kd=4.0),
+            "*_ankle_*_joint": Gain(kp=40.0, kd=2.0),
+            "torso_joint": Gain(kp=300.0, kd=3.0),
+            "*_shoulder_*_joint": Gain(kp=120.0, kd=2.0),
+            "*_elbow_joint": Gain(kp=80.0, kd=1.0),
+        },
     },
     feet=tuple(
         f"{s}_ankle_{a}_link" for s in ("left", "right") for a in ("pitch", "roll")
@@ -424,7 +491,53 @@ H1_2 = RobotConfig(
 )
 """Unitree H1-2 without hands, wrists locked: 21 joints."""
 
-RobotName = Literal["h1_2"]
+G1 = RobotConfig(
+    name="g1",
+    model_path=ASSETS / "g1.xml",
+    base="pelvis",
+    # Knees bent, the centre of mass above the soles; arms clear of the body.
+    default_pose={
+        "*_hip_pitch_joint": -0.28,
+        "*_knee_joint": 0.56,
+        "*_ankle_pitch_joint": -0.28,
+        "*_shoulder_pitch_joint": 0.2,
+        "left_shoulder_roll_joint": 0.2,
+        "right_shoulder_roll_joint": -0.2,
+        "*_elbow_joint": 0.6,
+    },
+    gains={
+        # As for the H1-2: from the armatures, at 10 Hz and damping ratio 2, as public
+        # controllers of the G1 have them (BeyondMimic, mjlab).
+        "rotor_inertia": {
+            "*_hip_pitch_joint": Gain(kp=40.2, kd=2.56),
+            "*_hip_yaw_joint": Gain(kp=40.2, kd=2.56),
+            "*_hip_roll_joint": Gain(kp=99.1, kd=6.31),
+            "*_knee_joint": Gain(kp=99.1, kd=6.31),
+            "*_ankle_*_joint": Gain(kp=28.5, kd=1.81),
+            "waist_yaw_joint": Gain(kp=40.2, kd=2.56),
+            "waist_[rp]*_joint": Gain(kp=28.5, kd=1.81),
+            "*_shoulder_*_joint": Gain(kp=14.3, kd=0.907),
+            "*_elbow_joint": Gain(kp=14.3, kd=0.907),
+            "*_wrist_roll_joint": Gain(kp=14.3, kd=0.907),
+            "*_wrist_[py]*_joint": Gain(kp=16.8, kd=1.07),
+        },
+        # Unitree's low-level example for the real robot (unitree_sdk2).
+        "real": {
+            "*_hip_*_joint": Gain(kp=60.0, kd=1.0),
+            "*_knee_joint": Gain(kp=100.0, kd=2.0),
+            "*_ankle_*_joint": Gain(kp=40.0, kd=1.0),
+            "waist_yaw_joint": Gain(kp=60.0, kd=1.0),
+            "waist_[rp]*_joint": Gain(kp=40.0, kd=1.0),
+            "*_shoulder_*_joint": Gain(kp=40.0, kd=1.0),
+            "*_elbow_joint": Gain(kp=40.0, kd=1.0),
+            "*_wrist_*_joint": Gain(kp=40.0, kd=1.0),
+        },
+    },
+    feet=H1_2.feet,
+    skin_links=("torso_link", *_ARMS),
+    untargeted_links=_SHINS_AND_FEET,
+)
+"""Unitree G1 with rubber hands: 29 joints."""
+
+ROBOTS = {robot.name: robot for robot in (H1_2, G1)}
 """Robots that can be chosen by name."""
-ROBOTS = {H1_2.name: H1_2}
-"""Robots by name, for configurations and policy files."""

@@ -29,7 +29,7 @@ from torch import Tensor
 
 from egoskin.storage.serialization import read_json
 
-FORMAT = 3
+FORMAT = 4
 """Number of the format that is written."""
 _SEAL = ("format", "egoskin", "sha256")
 _ANY = object()
@@ -90,6 +90,19 @@ _MIGRATIONS = {
             "env.sensor.localization.over_range": False,
             "env.sensor.localization.frame": "base",
             "env.sensor.localization": {},
+        },
+    ),
+    3: Migration(
+        added={
+            "env.task.randomization": {
+                "link_mass": [1.0, 1.0],
+                "friction": [1.0, 1.0],
+                "gains": [1.0, 1.0],
+                "torque_limit": [1.0, 1.0],
+                "delay_steps": [0, 0],
+                "push_speed": [0.0, 0.0],
+                "push_interval": [1.0, 3.0],
+            },
         },
     ),
 }

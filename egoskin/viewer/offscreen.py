@@ -42,8 +42,8 @@ _IDLE_RADIUS, _LIT_RADIUS, _LINE_RADIUS = 0.017, 0.03, 0.006
 # Lines fade with their length, from opaque at 0 to the faintest at this [m].
 _FADE_LENGTH, _FAINTEST = 2.5, 0.25
 # The camera's point of attention follows the base with this time constant [s] and
-# stays at this height [m].
-_FOLLOW_TIME, _LOOK_HEIGHT = 0.4, 1.0
+# stays at this height, of a robot as tall as the H1-2 (1.78 m) [m].
+_FOLLOW_TIME, _LOOK_HEIGHT, _REFERENCE_HEIGHT = 0.4, 1.0, 1.78
 _IS_LINUX = sys.platform == "linux"
 
 
@@ -56,7 +56,8 @@ class CameraConfig:
     """Where the camera is, relative to the robot that it follows."""
 
     distance: float = 3.4
-    """Distance to the robot [m]."""
+    """Distance to the robot [m], to one as tall as the H1-2 (1.78 m): to another it is
+    scaled with the robot's height."""
     azimuth_deg: float = 30.0
     """Bearing of the camera, from the robot's heading at the start [deg]."""
     elevation_deg: float = 10.0
@@ -272,6 +273,7 @@ class Painter:
         self._model = _build_model(robot, objects, size)
         self._data = mujoco.MjData(self._model)
         self._camera_config = camera or CameraConfig()
+        self._size = robot.standing_height / _REFERENCE_HEIGHT
         self._camera = mujoco.MjvCamera()
         self._last_time: float | None = None
         model = self._model
@@ -371,13 +373,13 @@ class Painter:
     def _follow(self, base_pose: np.ndarray, time: float) -> None:
         """Move the camera's point of attention towards the base."""
         camera, config = self._camera, self._camera_config
-        goal = np.array([*base_pose[:2], _LOOK_HEIGHT])
+        goal = np.array([*base_pose[:2], self._size * _LOOK_HEIGHT])
         if self._last_time is None or time < self._last_time:
             w, _, _, z = base_pose[3:]
             # An upright base: its heading is twice the angle of (w, z).
             heading = math.degrees(2 * math.atan2(z, w))
             camera.lookat[:] = goal
-            camera.distance = config.distance
+            camera.distance = self._size * config.distance
             # MuJoCo's azimuth is the direction in which the camera looks.
             camera.azimuth = heading + config.azimuth_deg + 180.0
             camera.elevation = -config.elevation_deg

@@ -19,6 +19,7 @@ import egoskin
 from calling import BATCH, SMALL, call, fail, succeed
 from egoskin.commands.evaluate import EvaluateConfig
 from egoskin.evaluation import operating_map
+from egoskin.evaluation.perturbations import PERTURBATIONS
 from egoskin.evaluation.throw_set import evaluate, standard_task
 from egoskin.sensors import MASK_ALL
 from egoskin.storage.tensor_file import load_tensors
@@ -239,6 +240,13 @@ def test_an_evaluation_draws_an_operating_map(
     assert [point["values"] for point in speed["points"]] == [[4.0], [8.0]]
     assert interval["trained"] == [[1.0, 2.0]]
     assert [point["values"] for point in both["points"]] == [[4.0, 1.0], [8.0, 1.0]]
+
+
+def test_an_evaluation_tells_what_a_policy_bears(trained: Path, tmp_path: Path):
+    result, text = figures_of(tmp_path, trained, "--perturbed")
+    names = [row["name"] for row in result["perturbed"]]
+    assert names == list(PERTURBATIONS)
+    assert all(f"\n  {name} " in text for name in names)
 
 
 def test_an_upper_bound_counts_what_policy_and_search_avoid(tmp_path: Path):

@@ -9,12 +9,22 @@ import torch
 
 from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
 from egoskin.envs.physics import DEFAULT_ENGINE, PhysicsConfig
+from egoskin.envs.randomization import RandomizationConfig
 from egoskin.envs.throws import ThrowConfig
 from egoskin.robots.config import H1_2
 from simple_physics import SimplePhysics
 
 # Balls at all sides, early and often.
 OFTEN = ThrowConfig(first_delay=(0.0, 0.6), interval=(0.2, 0.4), distance=(1.5, 2.5))
+RANDOM = RandomizationConfig(
+    link_mass=(0.7, 1.4),
+    friction=(0.3, 1.2),
+    gains=(0.7, 1.3),
+    torque_limit=(0.2, 1.2),
+    delay_steps=(0, 2),
+    push_speed=(0.5, 2.0),
+    push_interval=(0.1, 0.3),
+)
 STIFF = PhysicsConfig(gains="real", target_velocity="finite_difference", substeps=3)
 
 
@@ -36,8 +46,13 @@ STIFF = PhysicsConfig(gains="real", target_velocity="finite_difference", substep
             False,
             {"hit", "self_contact"},
         ),
+        (
+            DodgeballConfig(throws=OFTEN, randomization=RANDOM),
+            False,
+            {"hit", "fallen"},
+        ),
     ],
-    ids=["default", "rigid", "stiff"],
+    ids=["default", "rigid", "stiff", "random"],
 )
 def test_an_engine_of_a_loop_over_single_simulations_gives_the_same_bits(
     config, hold, ends

@@ -310,7 +310,9 @@ def test_an_option_that_is_no_more_is_refused_where_it_had_an_effect(run: Path):
 
 def test_a_migration_leaves_alone_what_is_there_and_makes_no_parts():
     given = {"env": {"task": {"throws": {"aim": "box", "first_delay": [0, 1]}}}}
-    assert migrate(given, 1) == (given, {})
+    same, _ = migrate(given, 1)
+    assert same["env"]["task"].pop("randomization")["gains"] == [1.0, 1.0]
+    assert same == given
     assert migrate({"ppo": {"gamma": 0.9}}, 1) == ({"ppo": {"gamma": 0.9}}, {})
     bare, _ = migrate({"env": {}}, 1)
     assert bare["env"]["task"]["throws"] == {"aim": "body", "first_delay": [0.0, 0.0]}
@@ -349,7 +351,8 @@ def test_sensor_options_of_format_2_go_or_have_another_name():
     sensor = {"validity": False, "ray": {"sub_beams": 1, "grid": [4, 4]}}
     old = {"env": {"sensor": {**sensor, "localization": position}}}
     sensor = {"keep_last": True, "ray": {"grid": [4, 4]}}
-    assert migrate(old, 2) == ({"env": {"sensor": sensor}}, {})
+    present, retired = migrate(old, 2)
+    assert (present["env"]["sensor"], retired) == (sensor, {})
     position["frame"] = "torso"
     assert migrate(old, 2)[1] == {"env.sensor.localization.frame": "torso"}
 

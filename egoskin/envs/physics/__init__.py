@@ -7,6 +7,7 @@ from egoskin.envs.physics.contract import (
     PhysicsState,
     Scene,
     StepResult,
+    Variation,
 )
 from egoskin.envs.physics.mujoco import MujocoPhysics
 
@@ -21,4 +22,5 @@ __all__ = [
     "PhysicsState",
     "Scene",
     "StepResult",
+    "Variation",
 ]

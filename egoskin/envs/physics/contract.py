@@ -12,7 +12,8 @@ the floor, nor each other) and never turn: their quaternion stays (1, 0, 0, 0).
 - **Rows are independent.** What happens in a row depends on what was asked of that row
   alone: not on the number of rows, nor of threads, nor on a row that diverged.
 - **A control step** is ``substeps`` physics steps of ``timestep`` each. In every one of
-  them each joint gets the torque clip(kp (q* - q) + kd (qdot* - qdot), +-limit).
+  them each joint gets the torque clip(kp (q* - q) + kd (qdot* - qdot), +-limit); a
+  `Variation` scales kp, kd and the limit, masses and friction, row by row.
 - **Contacts** are those of every physics state of a control step but its final one,
   which is the next step's first: no state is skipped or seen twice.
 - **Divergence** (a failed solver, numbers that are not finite, speeds that physics did
@@ -40,8 +41,9 @@ OBJECT_MASS = 0.4
 class PhysicsConfig:
     """Actuation and rates of the simulation."""
 
-    gains: str = "rotor_inertia"
-    """Named PD gain set of the robot ("real", "rotor_inertia")."""
+    gains: str | None = None
+    """Named PD gain set of the robot (h1_2: "rotor_inertia", "real"); None: its
+    first."""
     control_hz: Annotated[float, Interval(ge=1, le=1e5)] = 60.0
     """Rate at which the policy acts [Hz]."""
     substeps: Annotated[int, Interval(ge=1, le=1000)] = 2
@@ -75,6 +77,20 @@ class Scene:
     """Whether `StepResult.link_contact` is asked for, which costs a few per cent."""
     hold: bool = False
     """Whether the robot is held rigid where it is put."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Variation:
+    """How the robots of some rows differ from their model: factors."""
+
+    link_mass: Tensor
+    """Of mass and inertia of each link, ``[n, L]``."""
+    friction: Tensor
+    """Of all friction, ``[n]``."""
+    gains: Tensor
+    """Of kp and kd of each joint, ``[n, J]``."""
+    torque_limit: Tensor
+    """Of the torque limit of each joint, ``[n, J]``."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,6 +173,22 @@ class Physics(ABC):
             objects: Which object of each row, ``[n]`` int64.
             position: Positions in the world [m], ``[n, 3]``.
             velocity: Velocities in the world [m/s], ``[n, 3]``.
+        """
+
+    @abstractmethod
+    def vary(self, rows: Tensor, variation: Variation) -> None:
+        """Make the robots of some rows ``[n]`` differ from their model from now on.
+
+        It is no part of `state`, and a reset leaves it as it is.
+        """
+
+    @abstractmethod
+    def push(self, rows: Tensor, velocity: Tensor) -> None:
+        """Change the velocity of the base of some rows ``[n]``, at once.
+
+        Args:
+            rows: Row indices, ``[n]``.
+            velocity: What is added, in the world [m/s], ``[n, 3]``.
         """
 
     @abstractmethod

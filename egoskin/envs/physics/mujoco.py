@@ -18,7 +18,9 @@ from egoskin.envs.physics.contract import (
     PhysicsState,
     Scene,
     StepResult,
+    Variation,
 )
+from egoskin.robots.chains import body_id
 
 # Contact bits of the model files: geoms listen to balls (1) and to the floor (2);
 # every further bit is self-collision. Objects and floor listen to nothing.
@@ -234,6 +236,34 @@ class MujocoPhysics(Physics):
             ctrl = target + self._kd_over_kp * velocity
             self._last_target.copy_(target)
         self._ctrl[:] = ctrl.numpy()
+
+    def vary(self, rows: Tensor, variation: Variation) -> None:
+        """Give rows model fields of their own; see `Physics.vary`."""
+        model, which, expand = self.model, rows.numpy(), self._batch.expand
+        links = np.array([body_id(model, link) for link in self.scene.robot.links])
+        joints = model.actuator_trnid[:, 0]
+        at_links, at_joints = np.ix_(which, links), np.ix_(which, joints)
+        mass, gains, limit = (
+            factor.double().numpy()
+            for factor in (variation.link_mass, variation.gains, variation.torque_limit)
+        )
+        friction = variation.friction.double().numpy()[:, None, None]
+        expand("body_mass")[at_links] = mass * model.body_mass[links]
+        expand("body_inertia")[at_links] = mass[..., None] * model.body_inertia[links]
+        expand("geom_friction")[which] = friction * model.geom_friction
+        expand("actuator_gainprm")[which] = gains[..., None] * model.actuator_gainprm
+        expand("actuator_biasprm")[which] = gains[..., None] * model.actuator_biasprm
+        ranges = expand("actuator_forcerange")
+        ranges[which] = limit[..., None] * model.actuator_forcerange
+        self._torque_limit = ranges[..., 1]
+        # The joints clip once more.
+        clip = limit[..., None] * model.jnt_actfrcrange[joints]
+        expand("jnt_actfrcrange")[at_joints] = clip
+        self._batch.set_const(which)
+
+    def push(self, rows: Tensor, velocity: Tensor) -> None:
+        """Change the velocity of the base of some rows; see `Physics.push`."""
+        self._qvel[rows.numpy(), :3] += velocity.double().numpy()
 
     def park(self, objects: Tensor) -> None:
         """Take objects out of play, ``[B, O]`` bool: they wait at rest far above."""

@@ -1,0 +1,247 @@
+"""Look at a robot before it is trained.
+
+egoskin robot check my_robot
+egoskin robot check my_robot.py:ROBOT --out robot.png
+egoskin robot check g1
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import torch
+import tyro
+
+from egoskin.commands.errors import parse_subcommand
+from egoskin.commands.skin import views
+from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
+from egoskin.envs.physics import PhysicsConfig
+from egoskin.envs.throws import ThrowConfig
+from egoskin.progress import counted
+from egoskin.robots.config import ROBOTS, RobotConfig
+from egoskin.robots.own import find_robot, portable
+from egoskin.sensors.config import SkinConfig
+from egoskin.viewer.film import check_path, save_picture
+
+# How long a robot is watched that gets no action [s].
+_STAND_S = 2.0
+# A joint that an action of 1 moves by less can hardly be used [rad].
+_SMALL_REACH = 0.1
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was looked at."""
+
+    kind: Literal["ok", "note", "wrong"]
+    """Fine; worth knowing; or what keeps the robot from being trained."""
+    text: str
+    """What was found, and what to do."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check:
+    """Tell what would go wrong with a robot, and draw it with its skin."""
+
+    robot: Annotated[str, tyro.conf.Positional]
+    """Its folder (with robot.toml), my_robot.py:ROBOT, or a name."""
+    skin: SkinConfig = field(default_factory=SkinConfig)
+    """Where the sensors sit."""
+    out: Path | None = None
+    """Picture to write, .png: the robot from the front and from behind."""
+
+    def run(self) -> None:
+        """Print what was found; write the picture.
+
+        Raises:
+            ValueError: If the robot cannot be trained.
+        """
+        if self.out is not None:
+            check_path(self.out, (".png",))
+        robot = find_robot(self.robot)
+        if robot.name not in ROBOTS or robot is not ROBOTS[robot.name]:
+            robot = portable(robot)
+        mass = float(robot.model.body_mass.sum())
+        print(
+            f"{robot.name}: {counted(len(robot.joints), 'joint')}, "
+            f"{counted(len(robot.links), 'link')}, {mass:.2f} kg"
+        )
+        wrong = 0
+        for finding in findings(robot, self.skin):
+            print(f"  {finding.kind:<5}  {finding.text}", flush=True)
+            wrong += finding.kind == "wrong"
+        if self.out is not None:
+            save_picture(self.out, views(robot, self.skin.build(robot)))
+            print(f"{self.out}: the robot with its skin")
+        if wrong:
+            raise ValueError(
+                f"{robot.name} cannot be trained: {counted(wrong, 'thing')} above must "
+                "be mended"
+            )
+
+
+def findings(robot: RobotConfig, skin: SkinConfig) -> Iterator[Finding]:
+    """Look at a robot, from its file to how it stands.
+
+    Args:
+        robot: The robot.
+        skin: Where its sensors are to sit.
+    """
+    static = [*_joints(robot), *_feet(robot), *_skin(robot, skin)]
+    yield from static
+    if any(finding.kind == "wrong" for finding in static):
+        yield Finding("note", "whether it stands is told once that is mended")
+        return
+    yield from _actuation(robot)
+    yield from _standing(robot)
+
+
+def _joints(robot: RobotConfig) -> Iterator[Finding]:
+    """Look at base, joints, gains and limits."""
+    try:
+        robot.check_floating_base()
+        yield Finding("ok", f"the base {robot.base} floats, all joints are hinges")
+    except ValueError as error:
+        yield Finding("wrong", str(error))
+    try:
+        for gains in robot.gains or [None]:
+            robot.joint_gains(gains)
+        yield Finding("ok", f"gains: {', '.join(robot.gains)} (the first is used)")
+    except ValueError as error:
+        yield Finding("wrong", str(error))
+    without = _names(robot, robot.torque_limit <= 0)
+    if without:
+        yield Finding(
+            "wrong",
+            f"no torque limit: {without}; say actuatorfrcrange of the joint (URDF: "
+            "effort of its limit)",
+        )
+    low, high = robot.joint_range
+    if without := _names(robot, low >= high):
+        yield Finding(
+            "note", f"no range: {without}; nothing stops them but their own shapes"
+        )
+    pose = robot.default_joint_pos
+    outside = _names(robot, (low < high) & ((pose < low) | (pose > high)))
+    if outside:
+        yield Finding("wrong", f"the default pose is out of range: {outside}")
+
+
+def _names(robot: RobotConfig, which: np.ndarray) -> str:
+    """Return the names of some joints, ``[J]`` bool."""
+    return ", ".join(np.array(robot.joints)[which])
+
+
+def _feet(robot: RobotConfig) -> Iterator[Finding]:
+    """Look at what stands on the ground."""
+    if not robot.feet:
+        yield Finding("wrong", "no feet: to touch the floor with anything is a fall")
+    if missing := sorted({*robot.feet} - {*robot.links}):
+        yield Finding("wrong", f"feet that are no links: {', '.join(missing)}")
+    try:
+        if not robot.primitives:
+            yield Finding("wrong", "no shape touches anything")
+            return
+        base, tall = robot.default_base_height, robot.standing_height
+    except ValueError as error:
+        yield Finding("wrong", str(error))
+        return
+    lowest = robot.lowest_link
+    kind = "ok" if lowest in robot.feet else "wrong"
+    yield Finding(
+        kind,
+        f"it stands on {lowest}{'' if kind == 'ok' else ', which is no foot'}: "
+        f"{tall:.2f} m tall, its base {base:.2f} m up",
+    )
+
+
+def _skin(robot: RobotConfig, skin: SkinConfig) -> Iterator[Finding]:
+    """Look at what carries sensors, and at the throws, which are aimed at it."""
+    if not robot.skin_links:
+        yield Finding("wrong", "no skin_links: no sensor sits, no ball is aimed there")
+        return
+    for name in ("skin_links", "untargeted_links"):
+        if missing := sorted({*getattr(robot, name)} - {*robot.links}):
+            yield Finding("wrong", f"{name} that are no links: {', '.join(missing)}")
+            return
+    try:
+        made = skin.build(robot)
+    except ValueError as error:
+        yield Finding("wrong", str(error))
+        return
+    on = counted(len(set(made.links)), "link")
+    yield Finding("ok", f"skin: {counted(len(made), 'sensor')} on {on}")
+
+
+def _actuation(robot: RobotConfig) -> Iterator[Finding]:
+    """Look at how far an action moves the joints."""
+    scale = DodgeballConfig().action_scale
+    for name in robot.gains:
+        kp, _ = robot.joint_gains(name)
+        reach = scale * robot.torque_limit / kp
+        yield Finding(
+            "ok",
+            f"gains {name}: an action of 1 moves a joint by {reach.min():.2f} to "
+            f"{reach.max():.2f} rad (half of them by {np.median(reach):.2f} or more)",
+        )
+        if small := _names(robot, reach < _SMALL_REACH):
+            yield Finding(
+                "note",
+                f"... by less than {_SMALL_REACH:g} rad: {small}; stiff for their "
+                "torque limit, a policy will hardly move them",
+            )
+
+
+def _standing(robot: RobotConfig) -> Iterator[Finding]:
+    """Let it stand without an action, by each set of gains."""
+    for name in robot.gains:
+        task = DodgeballConfig(
+            physics=PhysicsConfig(gains=name),
+            # No ball comes meanwhile.
+            throws=ThrowConfig(first_delay=(10 * _STAND_S, 10 * _STAND_S)),
+            start_joint_noise=0.0,
+        )
+        env = DodgeballEnv(robot, task, num_envs=1)
+        td, hz = env.reset(), task.physics.control_hz
+        fell, touched = math.inf, False
+        for step in range(1, round(_STAND_S * hz) + 1):
+            td["action"] = torch.zeros(env.action_spec.shape)
+            td = env.step(td)["next"]
+            if td["diverged"].item():
+                yield Finding(
+                    "wrong",
+                    f"gains {name}: the simulation fails after {step / hz:.2f} s; "
+                    "masses, armature or gains are out of proportion",
+                )
+                break
+            if step == 1:
+                touched = bool(td["self_contact"].item())
+            if td["fallen"].item():
+                fell = step / hz
+                break
+        else:
+            yield Finding("ok", f"gains {name}: it stands for {_STAND_S:g} s by itself")
+        if touched:
+            yield Finding("note", "in its default pose it touches itself")
+        if fell < 0.5:
+            yield Finding(
+                "wrong",
+                f"gains {name}: it falls within {fell:.2f} s, before it can learn: "
+                "look at the default pose and the feet",
+            )
+        elif math.isfinite(fell):
+            yield Finding(
+                "note",
+                f"gains {name}: without an action it falls after {fell:.1f} s; it must "
+                "learn to stand (as the H1-2, after 1.7 s)",
+            )
+
+
+def main(args: list[str]) -> None:
+    """Run the command."""
+    parse_subcommand({"check": Check}, args, description=__doc__).run()

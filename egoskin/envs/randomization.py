@@ -1,0 +1,176 @@
+"""Randomisation for the real world: robots that differ, late actions, pushes.
+
+Contract: what a robot is like in an episode, and when and how it is pushed, are
+functions of (seed, row, episode, ...), as all draws are (`egoskin.rng`). With the
+defaults nothing is drawn, and not one bit is another than without this file.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import Annotated
+
+import torch
+from torch import Tensor
+
+from egoskin.bounds import Interval, check_bounds
+from egoskin.envs.physics.contract import Physics, Variation
+from egoskin.rng import Stream, uniform
+
+_Factor = Annotated[tuple[float, float], Interval(ge=0.01, le=100)]
+_NONE = (1.0, 1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomizationConfig:
+    """How robots differ from their model; every range is drawn from uniformly."""
+
+    link_mass: _Factor = _NONE
+    """Mass and inertia of each link, times this."""
+    friction: _Factor = _NONE
+    """Friction of robot and floor, times this."""
+    gains: _Factor = _NONE
+    """kp and kd of each joint, times this."""
+    torque_limit: _Factor = _NONE
+    """Torque limit of each joint, times this."""
+    delay_steps: Annotated[tuple[int, int], Interval(ge=0, le=100)] = (0, 0)
+    """Control steps by which all actions of an episode come late."""
+    push_speed: Annotated[tuple[float, float], Interval(ge=0, le=100)] = (0.0, 0.0)
+    """Pushes: what the base's speed changes by, in any direction over the ground [m/s];
+    0: none."""
+    push_interval: Annotated[tuple[float, float], Interval(gt=0, le=1000)] = (1.0, 3.0)
+    """Time from one push to the next [s]."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for what is no range."""
+        check_bounds(self)
+        for field in fields(self):
+            low, high = getattr(self, field.name)
+            if low > high:
+                raise ValueError(f"{field.name} must be (low, high), got {low, high}")
+
+    @property
+    def varies_robot(self) -> bool:
+        """Whether robots differ from their model."""
+        factors = (self.link_mass, self.friction, self.gains, self.torque_limit)
+        return any(factor != _NONE for factor in factors)
+
+    @property
+    def pushes(self) -> bool:
+        """Whether robots are pushed."""
+        return self.push_speed[1] > 0
+
+
+class Randomization:
+    """What is random of the robots of every row.
+
+    Args:
+        config: The ranges.
+        num_envs: Number of rows ``B``.
+        num_links: Number of links ``L``.
+        num_joints: Number of joints ``J``.
+        control_hz: Rate of the control steps [Hz].
+    """
+
+    def __init__(
+        self,
+        config: RandomizationConfig,
+        num_envs: int,
+        num_links: int,
+        num_joints: int,
+        control_hz: float,
+    ) -> None:
+        self.config, self._hz = config, control_hz
+        self._links, self._joints = num_links, num_joints
+        zeros = torch.zeros(num_envs, dtype=torch.int64)
+        self.state: dict[str, Tensor] = {}
+        """What is remembered, ``[B, ...]`` each, to be saved and put back."""
+        if most := config.delay_steps[1]:
+            late = torch.zeros(num_envs, most, num_joints)
+            self.state |= {"delay": zeros.clone(), "late_actions": late}
+        if config.pushes:
+            self.state |= {"push": zeros.clone(), "next_push_step": zeros.clone()}
+
+    def variation(self, seed: int, ids: Tensor, episode: Tensor) -> Variation:
+        """Return how robots differ from their model, a function of the arguments.
+
+        Args:
+            seed: Seed of the draws.
+            ids: Global rows, ``[n]``.
+            episode: Their episodes, ``[n]``.
+        """
+        config, joints = self.config, self._joints
+        sizes = (self._links, 1, joints, joints)
+        u = uniform(seed, Stream.ROBOT, ids, episode, torch.zeros_like(ids), sum(sizes))
+        mass, friction, gains, limit = u.split(sizes, -1)
+        return Variation(
+            link_mass=_between(config.link_mass, mass),
+            friction=_between(config.friction, friction[:, 0]),
+            gains=_between(config.gains, gains),
+            torque_limit=_between(config.torque_limit, limit),
+        )
+
+    def start(
+        self, physics: Physics, rows: Tensor, seed: int, ids: Tensor, episode: Tensor
+    ) -> None:
+        """Begin episodes of some rows ``[n]``; they are named by their draws.
+
+        Args:
+            physics: The simulations.
+            rows: Rows whose episodes begin, ``[n]``.
+            seed: Seed of the draws.
+            ids: Global indices of these rows.
+            episode: Their episodes.
+        """
+        for value in self.state.values():
+            value[rows] = 0
+        if self.config.varies_robot:
+            physics.vary(rows, self.variation(seed, ids, episode))
+        if "delay" in self.state:
+            low, high = self.config.delay_steps
+            u = uniform(seed, Stream.DELAY, ids, episode, torch.zeros_like(ids), 1)
+            self.state["delay"][rows] = low + (u[:, 0] * (high + 1 - low)).long()
+        if self.config.pushes:
+            self._plan_push(rows, seed, ids, episode)
+
+    def _plan_push(self, rows: Tensor, seed: int, ids: Tensor, episode: Tensor) -> None:
+        """Draw when the next push comes."""
+        count = self.state["push"][rows]
+        wait = uniform(seed, Stream.PUSH, ids, episode, count, 3)[:, 0]
+        steps = (_between(self.config.push_interval, wait) * self._hz).round().long()
+        self.state["next_push_step"][rows] += steps.clamp(min=1)
+
+    def due(self, step: Tensor) -> Tensor:
+        """Return the rows that are to be pushed at an age ``[B]``, ``[n]``."""
+        if not self.config.pushes:
+            return step.new_empty(0)
+        return (step >= self.state["next_push_step"]).nonzero()[:, 0]
+
+    def push(
+        self, physics: Physics, rows: Tensor, seed: int, ids: Tensor, episode: Tensor
+    ) -> None:
+        """Push the robots of some rows; arguments as in `start`."""
+        count = self.state["push"][rows]
+        u = uniform(seed, Stream.PUSH, ids, episode, count, 3)
+        speed, n = _between(self.config.push_speed, u[:, 2]), len(rows)
+        # A cosine's bits depend on where it stands in a row that is no multiple of 32.
+        angle = torch.nn.functional.pad(2 * math.pi * u[:, 1], (0, -n % 32))
+        way = torch.stack((angle.cos(), angle.sin()), -1)[:n]
+        velocity = torch.cat((speed[:, None] * way, torch.zeros(n, 1)), -1)
+        physics.push(rows, velocity)
+        self.state["push"][rows] += 1
+        self._plan_push(rows, seed, ids, episode)
+
+    def delayed(self, action: Tensor) -> Tensor:
+        """Return what acts now, of actions ``[B, J]`` that come late; 0 at first."""
+        if "delay" not in self.state:
+            return action
+        all_actions = torch.cat((action[:, None], self.state["late_actions"]), 1)
+        self.state["late_actions"].copy_(all_actions[:, :-1])
+        return all_actions[torch.arange(len(action)), self.state["delay"]]
+
+
+def _between(bounds: tuple[float, float], u: Tensor) -> Tensor:
+    low, high = bounds
+    return low + (high - low) * u

@@ -1,0 +1,454 @@
+"""Robots of your own: from a folder, from a file of Python, and as data alone.
+
+A folder holds an MJCF or URDF and ``robot.toml``::
+
+    model = "robot.xml"                    # in the folder
+    base = "pelvis"                        # the link that floats
+    feet = ["*_foot"]                      # links that may touch the ground
+    skin_links = ["torso", "*_arm"]        # links that carry sensors
+    untargeted_links = ["*_shin"]          # optional: no ball is aimed at them
+    name = "my_robot"                      # optional: else the folder's name
+
+    [default_pose]                         # [rad] by joint; else 0
+    "*_knee" = 0.4
+
+    [gains.soft]                           # N m/rad, N m s/rad; the first set is used
+    "*" = { kp = 100, kd = 5 }
+
+Names may be patterns (``*``, ``?``, ``[ab]``). Contract: what `portable` returns names
+no file and is the same robot wherever it is loaded.
+"""
+
+from __future__ import annotations
+
+import difflib
+import fnmatch
+import re
+import runpy
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import mujoco
+from tyro.constructors import PrimitiveConstructorSpec
+
+from egoskin.robots.chains import body_name
+from egoskin.robots.config import (
+    ROBOTS,
+    Gain,
+    RobotConfig,
+    read_robot,
+)
+from egoskin.storage.files import read_regular
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+TOML_NAME = "robot.toml"
+"""Name of the file that makes a folder a robot."""
+_LISTS = ("feet", "skin_links", "untargeted_links")
+_TABLES = ("default_pose", "gains")
+_KEYS = ("name", "model", "base", *_LISTS, *_TABLES)
+_NEEDED = ("model", "base", "feet", "skin_links", "gains")
+# Bits of collision that balls and floor ask for; a robot's own come above them.
+_WORLD_BITS, _NUM_WORLD_BITS = 3, 2
+
+
+def find_robot(name: str) -> RobotConfig:
+    """Return a robot by its name, or from where it is described.
+
+    Args:
+        name: That of a robot of the package, a folder with ``robot.toml``, a
+            `RobotConfig` in a file of Python (``my_robot.py:ROBOT``, which is run), or
+            an MJCF or URDF, to place sensors on (`egoskin.robots.config.read_robot`).
+
+    Raises:
+        ValueError: If there is no such robot, or its description is wrong.
+        OSError: If a file that it names cannot be read.
+    """
+    if name in ROBOTS:
+        return ROBOTS[name]
+    file, _, variable = name.rpartition(":")
+    if file.endswith(".py"):
+        return _from_python(Path(file), variable)
+    path = Path(name)
+    if path.is_dir():
+        return read_folder(path)
+    if path.name == TOML_NAME and path.is_file():
+        return read_folder(path.parent)
+    if path.suffix == ".py" and path.is_file():
+        raise ValueError(
+            f"which robot of {name}? Say {name}:ROBOT, the variable's name"
+        )
+    if path.exists():
+        return read_robot(path)
+    raise ValueError(
+        f"no robot {name!r}: it must be one of {', '.join(ROBOTS)}, a folder with "
+        f"{TOML_NAME}, my_robot.py:ROBOT, or the path of an MJCF or URDF"
+    )
+
+
+def _by_name_or_portable(name: str) -> str | RobotConfig:
+    """Return a robot as configurations keep it."""
+    return name if name in ROBOTS else portable(find_robot(name))
+
+
+def _name(robot: str | RobotConfig) -> str:
+    """Return the name of a robot as configurations keep it."""
+    return robot if isinstance(robot, str) else robot.name
+
+
+Robot = Annotated[
+    str | RobotConfig,
+    PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="NAME|PATH",
+        instance_from_str=lambda texts: _by_name_or_portable(texts[0]),
+        is_instance=lambda value: isinstance(value, (str, RobotConfig)),
+        str_from_instance=lambda value: [_name(value)],
+    ),
+]
+"""A robot of the package by its name, or another as data; an option of a command takes
+what `find_robot` does."""
+
+
+def robot_of(robot: str | RobotConfig) -> RobotConfig:
+    """Return the robot that a configuration keeps.
+
+    Raises:
+        ValueError: If it is neither one of the package nor data alone.
+    """
+    if isinstance(robot, str):
+        if robot not in ROBOTS:
+            raise ValueError(
+                f"no robot {robot!r}: it must be one of {', '.join(ROBOTS)}, or data: "
+                "egoskin.robots.own.portable(find_robot(PATH))"
+            )
+        return ROBOTS[robot]
+    if robot.model_path is not None:
+        raise ValueError(
+            f"robot {robot.name!r} is kept in a file, {robot.model_path}, and what is "
+            "loaded elsewhere must hold it: egoskin.robots.own.portable(robot)"
+        )
+    return robot
+
+
+def _from_python(path: Path, variable: str) -> RobotConfig:
+    """Run a file of Python, and return the robot of one of its variables."""
+    if not path.is_file():
+        raise ValueError(f"no file {path}: a robot is my_robot.py:ROBOT")
+    names = runpy.run_path(str(path))
+    robot = names.get(variable)
+    if not isinstance(robot, RobotConfig):
+        robots = [n for n, value in names.items() if isinstance(value, RobotConfig)]
+        raise ValueError(
+            f"{path} has no robot {variable!r}; its variables that are a RobotConfig: "
+            f"{', '.join(robots) or 'none'}"
+        )
+    return robot
+
+
+class _Toml:
+    """A file of TOML, whose errors name the line of what is wrong."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.text = path, read_regular(path).decode(errors="replace")
+        try:
+            self.content: dict[str, Any] = tomllib.loads(self.text)
+        except tomllib.TOMLDecodeError as error:
+            # It says where: (at line 3, column 5), or (at end of document).
+            text = str(error)
+            if where := re.search(r" \(at line (\d+), column \d+\)$", text):
+                text, line = text[: where.start()], where[1]
+            else:
+                line = len(self.text.splitlines()) or 1
+            raise ValueError(f"{path}:{line}: {text}") from None
+
+    def error(self, text: str, *keys: str) -> ValueError:
+        """Return an error at the line of a key, or of the innermost that is found."""
+        return ValueError(f"{self.path}:{self._line(keys)}: {text}")
+
+    def _line(self, keys: Sequence[str]) -> int:
+        """Return the line of a key path, of which the last may be an item's text."""
+        lines, at = self.text.splitlines(), 0
+        for key in keys:
+            quoted = rf"(?:{re.escape(key)}|\"{re.escape(key)}\"|'{re.escape(key)}')"
+            # As a key, as part of a table's name, or else as a string.
+            patterns = (
+                rf"^\s*(?:\[[^\]#]*)?(?<![\w-]){quoted}\s*[=.\]]",
+                rf"[{{,.]\s*{quoted}\s*=",
+                rf"[\"']{re.escape(key)}[\"']",
+            )
+            found = next(
+                (
+                    i
+                    for pattern in patterns
+                    for i in range(at, len(lines))
+                    if re.search(pattern, lines[i])
+                ),
+                None,
+            )
+            if found is None:
+                break
+            at = found
+        return at + 1
+
+
+def read_folder(folder: Path) -> RobotConfig:
+    """Return the robot of a folder with an MJCF or URDF and ``robot.toml``.
+
+    Raises:
+        ValueError: If there is none, or something in it is wrong; the text names the
+            file, the line, and what is right.
+        OSError: If a file cannot be read.
+    """
+    path = folder / TOML_NAME
+    if not path.is_file():
+        raise ValueError(
+            f"{folder} is no robot: it has no {TOML_NAME} (model, base, feet, "
+            "skin_links, gains)"
+        )
+    toml = _Toml(path)
+    content = toml.content
+    for key in content:
+        if key not in _KEYS:
+            near = difflib.get_close_matches(key, _KEYS, n=1)
+            hint = f", did you mean {near[0]!r}?" if near else ""
+            raise toml.error(
+                f"there is no key {key!r}{hint} (keys: {', '.join(_KEYS)})", key
+            )
+    for key in _NEEDED:
+        if key not in content:
+            raise toml.error(f"{key} is missing")
+    for key, value in content.items():
+        kind = list if key in _LISTS else dict if key in _TABLES else str
+        if not isinstance(value, kind):
+            names = {list: "a list of links", dict: "a table", str: "a text"}
+            raise toml.error(f"{key} must be {names[kind]}, got {value!r}", key)
+    model = folder / content["model"]
+    if not model.is_file():
+        raise toml.error(f"there is no file {model}", "model")
+    robot = RobotConfig(
+        name=content.get("name", folder.resolve().name),
+        model_path=model,
+        base=content["base"],
+        skin_links=(),
+        default_pose=_pose(toml),
+        gains=_gains(toml),
+    )
+    # What names links and joints can be told wrong only once they are known.
+    try:
+        _ = robot.model
+    except ValueError as error:
+        raise toml.error(str(error), "model") from None
+    try:
+        links = robot.links
+    except KeyError as error:
+        raise toml.error(str(error.args[0]), "base") from None
+    lists = {key: _links(toml, key, links) for key in _LISTS}
+    for key, table in (("default_pose", robot.default_pose), *_flat(robot.gains)):
+        for pattern in table:
+            if not fnmatch.filter(robot.joints, pattern):
+                raise toml.error(
+                    _no_match(pattern, robot.joints, "joint"), *key.split("/"), pattern
+                )
+    for name, gain_set in robot.gains.items():
+        for joint in robot.joints:
+            matching = [p for p in gain_set if fnmatch.fnmatchcase(joint, p)]
+            if len(matching) != 1:
+                patterns = " and ".join(map(repr, matching)) or "none of its patterns"
+                raise toml.error(
+                    f"gains.{name}: joint {joint!r} must match one pattern, and "
+                    f"matches {patterns}",
+                    *("gains", name, *matching[1:2]),
+                )
+    try:
+        _ = robot.default_joint_pos
+    except ValueError as error:
+        raise toml.error(str(error), "default_pose") from None
+    return replace(robot, **lists)
+
+
+def _flat(
+    gains: Mapping[str, Mapping[str, Gain]],
+) -> list[tuple[str, Mapping[str, Gain]]]:
+    """Return sets of gains by the path of their keys."""
+    return [(f"gains/{name}", table) for name, table in gains.items()]
+
+
+def _pose(toml: _Toml) -> dict[str, float]:
+    """Return the default pose."""
+    pose = {}
+    for joint, value in toml.content.get("default_pose", {}).items():
+        if not _is_number(value):
+            raise toml.error(
+                f"the position of {joint!r} must be a number [rad], got {value!r}",
+                *("default_pose", joint),
+            )
+        pose[joint] = float(value)
+    return pose
+
+
+def _gains(toml: _Toml) -> dict[str, dict[str, Gain]]:
+    """Return the sets of gains."""
+    if not toml.content["gains"]:
+        raise toml.error("gains must have a set: [gains.NAME]", "gains")
+    sets: dict[str, dict[str, Gain]] = {}
+    for name, table in toml.content["gains"].items():
+        sets[name] = {}
+        if not isinstance(table, dict):
+            raise toml.error(f"gains.{name} must be a table of joints", "gains", name)
+        for joint, gain in table.items():
+            if (
+                not isinstance(gain, dict)
+                or gain.keys() != {"kp", "kd"}
+                or not all(map(_is_number, gain.values()))
+                or gain["kp"] <= 0
+                or gain["kd"] < 0
+            ):
+                raise toml.error(
+                    f"the gains of {joint!r} must be {{ kp = N m/rad > 0, kd = "
+                    f"N m s/rad >= 0 }}, got {gain!r}",
+                    *("gains", name, joint),
+                )
+            sets[name][joint] = Gain(kp=float(gain["kp"]), kd=float(gain["kd"]))
+    return sets
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _links(toml: _Toml, key: str, links: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the links that a list of patterns names, in the robot's order."""
+    wanted: set[str] = set()
+    for pattern in toml.content.get(key, []):
+        matching = fnmatch.filter(links, str(pattern))
+        if not matching:
+            raise toml.error(_no_match(str(pattern), links, "link"), key, str(pattern))
+        wanted.update(matching)
+    return tuple(link for link in links if link in wanted)
+
+
+def _no_match(pattern: str, names: Sequence[str], what: str) -> str:
+    near = difflib.get_close_matches(pattern, names, n=1)
+    hint = f", did you mean {near[0]!r}?" if near else ""
+    return f"no {what} {pattern!r}{hint} ({what}s: {', '.join(names)})"
+
+
+def portable(robot: RobotConfig) -> RobotConfig:
+    """Return a robot as data alone: its model is an MJCF of primitives, as text.
+
+    What only looks, and actuators, sensors, key frames and whatever does not hang on
+    the base are left out; masses stay. A cylinder becomes the capsule inside it, as
+    long and as wide, or a flat one a box. The base of a URDF floats. Where the file's
+    bits of collision are not this package's (`egoskin/assets/h1_2.xml` explains them),
+    the robot's own shapes meet as there, and balls and floor meet them all.
+
+    Args:
+        robot: A robot of the task; `RobotConfig.model_path` is read.
+
+    Raises:
+        ValueError: If a shape that touches is no primitive, or the model holds what is
+            neither left out nor a robot of primitives.
+    """
+    if robot.model_xml is not None:
+        return robot
+    spec, model = robot.spec(), robot.model
+    keep = set(robot.links)
+    _fix_inertia(spec, model)
+    in_pairs = {pair.geomname1 for pair in spec.pairs}
+    in_pairs |= {pair.geomname2 for pair in spec.pairs}
+    for body in list(spec.worldbody.bodies):
+        if body.name not in keep:
+            spec.delete(body)
+    for geom in list(spec.geoms):
+        touches = geom.contype or geom.conaffinity or geom.name in in_pairs
+        if geom.parent.name == "world" or (
+            not touches and geom.type not in _PRIMITIVES
+        ):
+            spec.delete(geom)
+        elif geom.type == mujoco.mjtGeom.mjGEOM_CYLINDER:
+            _round_off(geom)
+        elif geom.type not in _PRIMITIVES:
+            raise ValueError(
+                f"{robot.name}: link {geom.parent.name!r} touches with a shape, "
+                f"{geom.name or 'without a name'}, that is "
+                f"{geom.type.name.removeprefix('mjGEOM_').lower()}, and a robot that "
+                "is kept as data is made of spheres, capsules, boxes and cylinders: "
+                'put some of these in its place, or let it only look (contype="0" '
+                'conaffinity="0")'
+            )
+    _set_bits(spec)
+    for elements in (
+        *(spec.actuators, spec.sensors, spec.keys, spec.cameras, spec.lights),
+        *(spec.meshes, spec.textures, spec.hfields, spec.skins),
+        *(spec.texts, spec.numerics, spec.tuples),
+    ):
+        for element in list(elements):
+            spec.delete(element)
+    for material in spec.materials:
+        material.textures = [""] * len(material.textures)
+    base = spec.body(robot.base)
+    if robot.is_urdf and not base.joints:
+        base.add_freejoint(name="floating_base")
+    try:
+        spec.compile()
+    except ValueError as error:
+        text = " ".join(str(error).split())
+        raise ValueError(f"{robot.name} cannot be kept as data: {text}") from error
+    data = replace(robot, model_path=None, model_xml=spec.to_xml())
+    # What else it holds is refused here.
+    _ = data.model
+    return data
+
+
+_PRIMITIVES = (
+    mujoco.mjtGeom.mjGEOM_SPHERE,
+    mujoco.mjtGeom.mjGEOM_CAPSULE,
+    mujoco.mjtGeom.mjGEOM_BOX,
+    mujoco.mjtGeom.mjGEOM_CYLINDER,
+)
+
+
+def _fix_inertia(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
+    """Say the inertia of each link, which may come from shapes that are left out."""
+    for body in spec.bodies:
+        if body.name == "world" or body.explicitinertial:
+            continue
+        which = next(
+            i for i in range(1, model.nbody) if body_name(model, i) == body.name
+        )
+        body.mass = model.body_mass[which]
+        body.ipos, body.iquat = model.body_ipos[which], model.body_iquat[which]
+        body.inertia = model.body_inertia[which]
+        body.explicitinertial = True
+
+
+def _round_off(geom: mujoco.MjsGeom) -> None:
+    """Make a capsule of a cylinder, or a box of a flat one."""
+    radius, half = float(geom.size[0]), float(geom.size[1])
+    if half > radius:
+        geom.type = mujoco.mjtGeom.mjGEOM_CAPSULE
+        geom.size = [radius, half - radius, 0]
+    else:
+        geom.type = mujoco.mjtGeom.mjGEOM_BOX
+        geom.size = [radius, radius, half]
+
+
+def _set_bits(spec: mujoco.MjSpec) -> None:
+    """Let balls and floor meet all that touches, where the model is not made so."""
+    touching = [g for g in spec.geoms if g.contype or g.conaffinity]
+    if all(
+        g.conaffinity & _WORLD_BITS == _WORLD_BITS and not g.contype & _WORLD_BITS
+        for g in touching
+    ):
+        return
+    for geom in touching:
+        own = (1 << (31 - _NUM_WORLD_BITS)) - 1
+        geom.contype = (geom.contype & own) << _NUM_WORLD_BITS
+        geom.conaffinity = (geom.conaffinity & own) << _NUM_WORLD_BITS | _WORLD_BITS

@@ -1,0 +1,74 @@
+"""Looking at a robot before it is trained, as a user does it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from calling import call, succeed
+from owning import MODEL, TOML, write_robot
+
+
+@pytest.mark.parametrize("script", ["robot", "robot.py"])
+def test_a_robot_that_stands_is_told_so_and_drawn(script, tmp_path):
+    picture = tmp_path / "pip.png"
+    out = succeed(script, "check", write_robot(tmp_path / "pip"), "--out", picture)
+    # 10 + 2 x (1 + 2 + 0.5) kg; 0.69 + 0.4 m.
+    assert out.startswith("pip: 6 joints, 7 links, 17.00 kg\n")
+    assert "1.09 m tall, its base 0.69 m up" in out
+    assert "skin: 64 sensors on 3 links" in out
+    # 0.3 x 60 / 150 rad.
+    assert "an action of 1 moves a joint by 0.12 to 0.90 rad" in out
+    assert "gains stiff: it stands for 2 s by itself" in out
+    assert "wrong" not in out
+    image = np.asarray(Image.open(picture))
+    assert image.shape == (960, 1280, 3)
+    # Sensors are drawn: nothing else has their colour.
+    assert (np.abs(image.astype(int) - [25, 242, 255]).sum(-1) < 120).sum() > 500
+
+
+def test_a_robot_that_falls_must_learn_to_stand():
+    out = succeed("robot", "check", "h1_2")
+    assert "without an action it falls after 1.7 s; it must learn to stand" in out
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ('actuatorfrcrange="-60 60" ', "", "no torque limit: left_shoulder, right"),
+        ("<freejoint/>", "", "must be the free joint of its base 'trunk'"),
+        ('range="-1.5 1.5"', 'range="0.2 1.5"', "out of range: left_shoulder, right"),
+        ('feet = ["*_foot"]', "feet = []", "no feet: to touch the floor"),
+        ('feet = ["*_foot"]', 'feet = ["*_leg"]', "left_foot, which is no foot"),
+        ("*_arm", "left_arm", None),
+        ("left_shoulder = 0.1", '"*_hip" = 1.5', "falls within"),
+    ],
+)
+def test_what_is_wrong_with_a_robot_is_told(old, new, told, tmp_path):
+    folder = write_robot(
+        tmp_path / "pip", TOML.replace(old, new), MODEL.replace(old, new)
+    )
+    done = call("robot", "check", folder)
+    if told is None:
+        assert done.returncode == 0, done.stdout
+        return
+    assert done.returncode == 2
+    assert told in done.stdout
+    assert "error: pip cannot be trained" in done.stderr
+
+
+def test_a_model_alone_cannot_be_trained(tmp_path: Path):
+    done = call("robot", "check", write_robot(tmp_path) / "pip.xml")
+    assert "pip has no gains" in done.stdout
+    assert done.returncode == 2
+
+
+def test_a_joint_without_a_range_and_a_weak_one_are_notes(tmp_path):
+    model = MODEL.replace(' range="-1.5 1.5"', "")
+    toml = TOML.replace("kp = 20, kd", "kp = 500, kd")
+    out = succeed("robot", "check", write_robot(tmp_path / "pip", toml, model))
+    assert "no range: left_shoulder, right_shoulder, left_hip" in out
+    assert "by less than 0.1 rad: left_shoulder, right_shoulder;" in out

@@ -1,0 +1,337 @@
+"""Robots of one's own: from a folder or a file, kept as data, safe to load."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import pickle
+import re
+import shutil
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+import egoskin
+from calling import SMALL, call, succeed
+from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
+from egoskin.make import EnvConfig
+from egoskin.robots.config import G1, H1_2, RobotConfig
+from egoskin.robots.own import find_robot, portable, read_folder, robot_of
+from egoskin.storage.formats import read_sealed
+from egoskin.storage.serialization import from_plain, to_plain
+from egoskin.storage.tensor_file import load_tensors, save_tensors
+from owning import MODEL, TOML, write_robot
+
+URDF = """<robot name="stump">
+  <link name="hull">
+    <inertial><mass value="3"/>
+      <inertia ixx=".1" iyy=".1" izz=".1" ixy="0" ixz="0" iyz="0"/></inertial>
+    <visual><geometry><mesh filename="package://nowhere/hull.stl"/></geometry></visual>
+    <collision><geometry><box size=".2 .2 .2"/></geometry></collision>
+  </link>
+  <link name="foot">
+    <inertial><mass value="1"/>
+      <inertia ixx=".1" iyy=".1" izz=".1" ixy="0" ixz="0" iyz="0"/></inertial>
+    <collision><geometry><cylinder radius=".1" length=".04"/></geometry></collision>
+  </link>
+  <joint name="ankle" type="revolute">
+    <origin xyz="0 0 -.3"/><parent link="hull"/><child link="foot"/><axis xyz="0 1 0"/>
+    <limit lower="-.5" upper=".6" effort="30" velocity="5"/>
+  </joint>
+</robot>"""
+
+
+@pytest.fixture(scope="module")
+def pip(tmp_path_factory) -> RobotConfig:
+    """The small robot, as data."""
+    return portable(read_folder(write_robot(tmp_path_factory.mktemp("own") / "pip")))
+
+
+# --- from a folder, from a file ---------------------------------------------------
+
+
+def test_a_folder_is_a_robot(tmp_path):
+    robot = find_robot(str(write_robot(tmp_path / "pip")))
+    assert robot.name == "pip"
+    assert robot.feet == ("left_foot", "right_foot")
+    assert robot.skin_links == ("trunk", "left_arm", "right_arm")
+    assert robot.default_joint_pos.tolist() == [0.1, 0, 0, 0, 0, 0]
+    kp, kd = robot.joint_gains(None)
+    assert kp.tolist() == [20, 20, 150, 150, 150, 150]
+    assert kd.tolist() == [1, 1, 5, 5, 5, 5]
+    assert find_robot(str(tmp_path / "pip" / "robot.toml")).links == robot.links
+
+
+def test_a_variable_of_a_python_file_is_a_robot(tmp_path):
+    folder = write_robot(tmp_path / "pip")
+    (tmp_path / "mine.py").write_text(
+        "from pathlib import Path\n"
+        "from egoskin.robots.config import Gain, RobotConfig\n"
+        f"ROBOT = RobotConfig(name='pip', model_path=Path({str(folder)!r}, 'pip.xml'),"
+        " base='trunk', skin_links=('trunk',), feet=('left_foot', 'right_foot'),"
+        " gains={'one': {'*': Gain(kp=50, kd=2)}})\n"
+    )
+    robot = portable(find_robot(f"{tmp_path}/mine.py:ROBOT"))
+    assert robot.joint_gains("one")[0].tolist() == [50] * 6
+    with pytest.raises(ValueError, match="RobotConfig: ROBOT"):
+        find_robot(f"{tmp_path}/mine.py:NOBODY")
+    with pytest.raises(ValueError, match="which robot"):
+        find_robot(f"{tmp_path}/mine.py")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "text"),
+    [
+        ('base = "trunk"', "base = trunk", 2, "Invalid value"),
+        ('base = "trunk"', 'base = "chest"', 2, "chest"),
+        ('base = "trunk"', "", 1, "base is missing"),
+        ('base = "trunk"', 'bas = "trunk"', 2, "did you mean 'base'"),
+        ('"pip.xml"', '"no.xml"', 1, "no file"),
+        ('["*_foot"]', '["left_fot"]', 3, "did you mean 'left_foot'"),
+        ('["*_foot"]', '"left_foot"', 3, "feet must be a list of links"),
+        ('    "*_arm",', '    "*_hand",', 6, "no link '*_hand'"),
+        ("left_shoulder = 0.1", "left_shouldr = 0.1", 11, "did you mean"),
+        ("left_shoulder = 0.1", "left_shoulder = true", 11, "must be a number"),
+        ('"*_ankle" = {', '"*_anke" = {', 15, "no joint"),
+        ("{ kp = 20, kd = 1 }", "{ kp = 20 }", 16, "'*_shoulder' must be"),
+        ("{ kp = 20, kd = 1 }", "{ kp = 0, kd = 1 }", 16, "'*_shoulder' must be"),
+        ('"*_shoulder" =', '"*_*" =', 16, "matches '*_hip' and '*_*'"),
+        ('"*_shoulder" =', '"left_*er" =', 13, "none of its patterns"),
+        ("[gains.stiff]", "[gains]", 14, "table of joints|N m/rad"),
+    ],
+)
+def test_what_is_wrong_is_told_with_its_line(old, new, line, text, tmp_path):
+    folder = write_robot(tmp_path / "pip", TOML.replace(old, new))
+    with pytest.raises(ValueError, match=r"robot\.toml:\d+: ") as error:
+        read_folder(folder)
+    assert f"robot.toml:{line}: " in str(error.value)
+    parts = text.split("|")
+    assert any(part in str(error.value) for part in parts), error.value
+
+
+def test_what_is_no_robot_is_told(tmp_path):
+    with pytest.raises(
+        ValueError, match="no robot 'nobody': it must be one of h1_2, g1"
+    ):
+        find_robot("nobody")
+    with pytest.raises(ValueError, match=r"has no robot\.toml"):
+        find_robot(str(tmp_path))
+
+
+# --- as data ----------------------------------------------------------------------
+
+
+def test_a_robot_as_data_is_the_same_robot(pip, tmp_path):
+    before = read_folder(write_robot(tmp_path / "pip"))
+    assert (pip.links, pip.joints) == (before.links, before.joints)
+    for name in ("body_mass", "body_inertia", "jnt_range", "jnt_actfrcrange"):
+        own = getattr(before.model, name)
+        np.testing.assert_allclose(getattr(pip.model, name), own, atol=1e-5)
+    # The ground, the light and the motor are left out.
+    assert (pip.model.nu, pip.model.nlight) == (0, 0)
+    assert "ground" not in pip.model_xml
+    # 0.05 + 0.62 + 0.02: hip, leg, half a sole.
+    assert pip.default_base_height == pytest.approx(0.69)
+
+
+def test_cylinders_become_capsules_as_long_and_as_wide(pip):
+    (leg,) = (shape for shape in pip.primitives if shape.link == "left_leg")
+    assert (leg.kind, *leg.size[:2]) == ("capsule", 0.05, pytest.approx(0.23))
+
+
+def test_balls_and_floor_meet_a_robot_that_was_not_made_for_them(pip):
+    task = DodgeballConfig()
+    env = DodgeballEnv(pip, task, num_envs=8, seed=0)
+    td = env.reset()
+    heights = []
+    for _ in range(120):
+        td["action"] = torch.zeros(8, 6)
+        td = env.step(td)["next"]
+        heights.append(td["base_pose"][:, 2])
+    assert torch.stack(heights).min() > 0
+    assert td["balls_arrived"].sum() + td["hit"].sum() > 0
+    both = pip.model.geom_conaffinity & 3
+    assert np.all(both == 3)
+    assert not np.any(pip.model.geom_contype & 3)
+    # Its own shapes meet as before: MuJoCo's default is that all do.
+    assert np.all(pip.model.geom_contype & pip.model.geom_conaffinity)
+
+
+def test_shapes_that_only_look_are_dropped_and_their_masses_stay(tmp_path):
+    (tmp_path / "tetra.obj").write_text(
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    )
+    text = MODEL.replace(
+        "<worldbody>",
+        '<asset><mesh name="t" file="tetra.obj" scale=".3 .3 .3"/></asset><worldbody>',
+    ).replace(
+        '<body name="left_arm"',
+        '<geom type="mesh" mesh="t" contype="0" conaffinity="0" mass="4"/>'
+        '<body name="left_arm"',
+    )
+    folder = write_robot(tmp_path, model=text)
+    before, after = read_folder(folder), portable(read_folder(folder))
+    trunk = before.model.body("trunk").id
+    assert before.model.body_mass[trunk] == pytest.approx(14)
+    for name in ("body_mass", "body_inertia", "body_ipos"):
+        own = getattr(before.model, name)[1:]
+        np.testing.assert_allclose(getattr(after.model, name)[1:], own, atol=1e-5)
+    assert "mesh" not in after.model_xml
+    touching = text.replace('contype="0" conaffinity="0"', "")
+    with pytest.raises(ValueError, match=r"link .trunk. touches with a shape.* mesh"):
+        portable(read_folder(write_robot(tmp_path, model=touching)))
+
+
+def test_the_base_of_a_urdf_floats(tmp_path):
+    (tmp_path / "stump.urdf").write_text(URDF)
+    (tmp_path / "robot.toml").write_text(
+        'model = "stump.urdf"\nbase = "hull"\nfeet = ["foot"]\nskin_links = ["hull"]\n'
+        "[gains.a]\nankle = { kp = 40, kd = 2 }\n"
+    )
+    robot = portable(read_folder(tmp_path))
+    robot.check_floating_base()
+    assert robot.torque_limit.tolist() == [30]
+    assert robot.joint_range.T.tolist() == [[-0.5, 0.6]]
+    # A flat cylinder is a box: a sole, not a ball.
+    assert [s.kind for s in robot.primitives] == ["box", "box"]
+
+
+def test_a_robot_as_data_comes_back_as_it_was(pip):
+    config = EnvConfig(robot=pip)
+    content = json.loads(json.dumps(to_plain(config)))
+    again = from_plain(EnvConfig, content, "it")
+    assert again == config
+    assert hash(again.robot) == hash(pip)
+    _ = pip.model
+    assert pickle.loads(pickle.dumps(pip)) == pip
+    assert "model" not in vars(pickle.loads(pickle.dumps(pip)))
+
+
+def test_names_of_the_package_stay_names():
+    assert to_plain(EnvConfig())["robot"] == "h1_2"
+    assert EnvConfig().robot_config is H1_2
+    assert robot_of("g1") is G1
+
+
+def test_a_robot_has_one_model():
+    with pytest.raises(ValueError, match="one of the two"):
+        RobotConfig(name="r", base="b", skin_links=())
+    with pytest.raises(ValueError, match="one of the two"):
+        dataclasses.replace(H1_2, model_xml="<mujoco/>")
+
+
+# --- in a policy ------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory) -> Path:
+    """A run of one rollout with a robot whose folder is gone."""
+    root = tmp_path_factory.mktemp("trained")
+    folder = write_robot(root / "pip")
+    succeed(
+        *("train", *SMALL, "--robot", folder, "--skin.num-sensors", "8"),
+        *("--total-frames", "512", "--run-dir", root / "run"),
+    )
+    shutil.rmtree(folder)
+    return root / "run"
+
+
+def test_a_trained_policy_is_loaded_where_its_robot_is_not(trained, pip, tmp_path):
+    (file,) = (p for p in (trained / "policies").iterdir() if "512" in p.name)
+    alone = tmp_path / "policy.safetensors"
+    shutil.copy(file, alone)
+    for path in (trained, alone):
+        policy = egoskin.load_policy(path)
+        assert policy.env_config.robot == pip
+        env = egoskin.make_worker_env(
+            policy.env_config, policy.skin, num_envs=2, seed=0
+        )
+        assert env.rollout(3, policy)["action"].shape == (2, 3, 6)
+    # No path of this machine is in the file.
+    assert str(trained.parent) not in json.dumps(load_tensors(alone)[1])
+
+
+def test_a_run_with_a_robot_of_ones_own_is_repeated_and_resumed(trained, tmp_path):
+    run = Path(shutil.copytree(trained, tmp_path / "run"))
+    succeed("train", "--resume", run, "--total-frames", "1024", "--num-workers", "1")
+    again = tmp_path / "again"
+    config = trained / "config.json"
+    succeed("train", "--config", config, "--run-dir", again)
+    robots = [read_sealed(r / "config.json")[0]["env"]["robot"] for r in (run, again)]
+    assert robots[0] == robots[1]
+
+
+HOSTILE = {
+    "an include": '<include file="FILE"/>',
+    "a mesh": '<asset><mesh name="m" file="FILE"/></asset>',
+    "a texture": '<asset><texture name="t" type="2d" file="FILE"/></asset>',
+    "another model": '<asset><model name="m" file="FILE"/></asset>',
+    "a plugin": '<extension><plugin plugin="mujoco.pid"/></extension>',
+    "a size": '<size memory="1000G"/>',
+    "a crowd": '<worldbody><replicate count="1000000"><body/></replicate></worldbody>',
+}
+
+
+@pytest.mark.parametrize("what", [*HOSTILE, "a path", "a script", "an entity", "deep"])
+def test_a_hostile_policy_reads_no_file_and_runs_nothing(what, trained, tmp_path):
+    # Valid in its place: it would load if it were read.
+    secret = tmp_path / "secret.xml"
+    secret.write_text(MODEL)
+    script = tmp_path / "evil.py"
+    script.write_text(f"open({str(tmp_path / 'ran')!r}, 'w')\nROBOT = None\n")
+    tensors, header = load_tensors(trained / "checkpoint.safetensors")
+    robot = header["policy"]["env"]["robot"]
+    if what in HOSTILE:
+        evil = HOSTILE[what].replace("FILE", str(secret))
+        robot["model_xml"] = re.sub("(<mujoco.*?>)", rf"\1{evil}", robot["model_xml"])
+    elif what == "a path":
+        robot |= {"model_xml": None, "model_path": str(secret)}
+    elif what == "a script":
+        header["policy"]["env"]["robot"] = f"{script}:ROBOT"
+    elif what == "an entity":
+        entity = f'<!DOCTYPE m [<!ENTITY e SYSTEM "file://{secret}">]>'
+        robot["model_xml"] = entity + robot["model_xml"]
+    else:
+        nested = "<body>" * 300 + "</body>" * 300
+        robot["model_xml"] = f"<mujoco><worldbody>{nested}</worldbody></mujoco>"
+    file = tmp_path / "policy.safetensors"
+    save_tensors(file, tensors, {"policy": header["policy"]})
+    opened = []
+    watch_opens(opened, tmp_path)
+    with pytest.raises(ValueError, match=r"its model|is kept in a file|no robot"):
+        egoskin.load_policy(file)
+    assert [name for name in opened if name != str(file)] == []
+    assert not (tmp_path / "ran").exists()
+
+
+def watch_opens(names: list[str], folder: Path) -> None:
+    """Note what Python opens in a folder from now on."""
+    import sys
+
+    def note(event: str, args: tuple) -> None:
+        if event == "open" and str(args[0]).startswith(str(folder)):
+            names.append(str(args[0]))
+
+    sys.addaudithook(note)
+
+
+def test_mistakes_of_the_command_line_are_told(tmp_path):
+    toml = TOML.replace('["*_foot"]', '["left_fot"]')
+    told = call("train", "--robot", write_robot(tmp_path / "pip", toml))
+    assert told.returncode == 2
+    assert "did you mean 'left_foot'" in " ".join(told.stderr.split())
+    bare = tmp_path / "bare.xml"
+    bare.write_text(MODEL)
+    told = call("train", "--robot", bare)
+    assert "has no gains" in " ".join(told.stderr.split())
+
+
+def test_the_portable_g1_keeps_what_it_collides_with():
+    one = portable(G1)
+    for name in ("geom_contype", "geom_conaffinity", "exclude_signature"):
+        own = getattr(G1.model, name)
+        np.testing.assert_array_equal(getattr(one.model, name), own)
+    assert mujoco.mj_getTotalmass(one.model) == pytest.approx(33.34, abs=0.01)
