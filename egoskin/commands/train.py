@@ -23,6 +23,10 @@ from egoskin.runs.run import Run
 from egoskin.runs.trainer import Trainer, open_trainer, train
 
 
+# So few frames [environment steps] take seconds, as the guess of their time would.
+_SOON_DONE = 100_000
+
+
 class Stop:
     """Notes the first signal that ends a script; a second Ctrl-C ends it at once."""
 
@@ -59,12 +63,15 @@ def announce(trainer: Trainer) -> None:
     config, done = trainer.config, trainer.frames
     to_do = max(config.total_frames - done, 0)
     workers = check_num_workers(config.num_envs, config.num_workers)
-    time = _rough_time(estimate_seconds(config, trainer.run.load_skin(), to_do))
+    time = ""
+    if to_do > _SOON_DONE:
+        seconds = estimate_seconds(config, trainer.run.load_skin(), to_do)
+        time = f"; here about {_rough_time(seconds)}"
     print(
         f"{to_do:,} frames{f' after {done:,}' if done else ''}: "
         f"{counted(config.num_envs, 'agent')} on {counted(workers, 'worker')}, "
         f"learner on {config.device} with "
-        f"{counted(config.num_learner_threads, 'thread')}; here about {time}\n"
+        f"{counted(config.num_learner_threads, 'thread')}{time}\n"
         f"curves while it trains: tensorboard --logdir {trainer.run.path}",
         flush=True,
     )
