@@ -332,6 +332,7 @@ def test_the_site_is_built_without_warnings_and_read_offline(tmp_path):
 YOUR_ROBOT = (DEPLOY.parent / "your-robot.md").read_text()
 
 
+@pytest.mark.slow
 def test_the_tutorial_of_your_robot_runs_as_given(tmp_path, monkeypatch):
     (toml,) = re.findall(r"```toml\n(.*?)```", YOUR_ROBOT, re.DOTALL)
     (shell,) = re.findall(r"```sh\n(.*?)```", YOUR_ROBOT, re.DOTALL)

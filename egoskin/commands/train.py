@@ -22,7 +22,6 @@ from egoskin.runs.estimate import estimate_seconds
 from egoskin.runs.run import Run
 from egoskin.runs.trainer import Trainer, open_trainer, train
 
-
 # So few frames [environment steps] take seconds, as the guess of their time would.
 _SOON_DONE = 100_000
 

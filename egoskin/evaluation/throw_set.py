@@ -173,8 +173,8 @@ def play_throws(
         "seed": seed,
         "hold": hold,
         "mask": mask,
-        # Nobody reads observations.
-        "bare": policy is None,
+        # Nobody reads what sensors give.
+        "bare": policy is None and watch is None,
     }
     few = num_workers is None and episodes <= _FEW
     if watch is None and not few:

@@ -310,7 +310,33 @@ CELLS = [
 ]
 
 
-@pytest.mark.parametrize("sensor", CELLS, ids=lambda args: "-".join(args[1::2]))
+# By default, one of each kind of observation; all others are slow.
+QUICK = (
+    "oracle-2",
+    "field-localization",
+    "field-binary",
+    "ray-proximity",
+    "ray-localization",
+    "ray-binary-min",
+    "time_of_flight-3",
+)
+
+
+def cell_id(args: list[str]) -> str:
+    return "-".join(args[1::2])
+
+
+@pytest.mark.parametrize(
+    "sensor",
+    [
+        pytest.param(
+            cell,
+            id=cell_id(cell),
+            marks=[] if cell_id(cell) in QUICK else pytest.mark.slow,
+        )
+        for cell in CELLS
+    ],
+)
 def test_every_sensor_trains(sensor: list[str], tmp_path: Path):
     size = (*SMALL, "--num-workers", "1", "--total-frames", 2 * BATCH)
     succeed("train", *size, "--run-dir", tmp_path / "run", *sensor)

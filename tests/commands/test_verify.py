@@ -49,7 +49,8 @@ def test_training_is_exact_at_the_default_size(monkeypatch):
     succeed("verify", "--iterations", "4")
 
 
-@pytest.mark.parametrize("exact", [pytest.param(True, marks=pytest.mark.slow), False])
+@pytest.mark.slow
+@pytest.mark.parametrize("exact", [True, False])
 def test_a_difference_of_one_bit_is_found(exact, monkeypatch, tmp_path, capsys):
     # One state of the environment is off by a bit, for two workers only.
     state = WorkerPool.simulation_state

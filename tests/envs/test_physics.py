@@ -460,5 +460,7 @@ def test_rates_and_counts_that_mujoco_cannot_hold_are_refused(name, value):
 
 
 def test_an_unknown_gain_set_is_refused_with_those_there_are():
-    with pytest.raises(ValueError, match="no gain set 'soft'; it has real, rotor_"):
+    with pytest.raises(
+        ValueError, match="no gain set 'soft'; it has rotor_inertia, real"
+    ):
         make(1, PhysicsConfig(gains="soft"))

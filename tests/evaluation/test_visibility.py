@@ -166,12 +166,14 @@ def test_warning_is_the_way_left_over_the_speed(
 ):
     body = StandingRobot(ball_robot)
     height = (body.origin[2], body.origin[2])
+    # Heights of release are given for a robot of 1.78 m.
+    release = body.origin[2] * 1.78 / ball_robot.standing_height
     throws = ThrowConfig(
         flight="straight",
         aim="box",
         box_half_width=0.0,
         box_height=height,
-        height=height,
+        height=(release, release),
         azimuth_deg=(0.0, 0.0),
         speed=(5.0, 5.0),
     )

@@ -85,7 +85,7 @@ def test_a_robot_of_ones_own_that_stands_fixed_is_shown(tmp_path):
 @pytest.mark.parametrize(
     ("args", "text"),
     [
-        (["--robot", "nobody"], "--robot must be one of h1_2"),
+        (["--robot", "nobody"], "no robot 'nobody': it must be one of h1_2"),
         (["--skin", "nothing.json"], "nothing.json"),
         (["blind", "--robot", "h1_2"], "leave out --skin and --robot"),
     ],
