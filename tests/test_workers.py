@@ -288,6 +288,7 @@ print("closed")
         assert parent.stdout.read().split() == ["step", "step", "closed"]
 
 
+@pytest.mark.slow
 def test_a_worker_that_hangs_ends_with_a_killed_parent():
     code = f"""
 import sys
@@ -335,6 +336,7 @@ def test_a_script_without_a_guard_is_told_so_in_one_line(tmp_path):
     assert 'called under `if __name__ == "__main__":`' in done.stderr
 
 
+@pytest.mark.slow
 def test_a_pool_that_nobody_closed_ends_with_its_script():
     # Given as text, it is no file that workers could import.
     command = [sys.executable, "-c", UNGUARDED + "print(pool._workers[0].pid)"]
@@ -532,6 +534,7 @@ print(faults())
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     not hasattr(ctypes.CDLL(None), "mallopt"), reason="needs glibc's malloc"
 )

@@ -41,6 +41,7 @@ def test_bench_loop_gives_its_rows(tmp_path: Path):
     assert sum(parts) == pytest.approx(1e6 / by_name["train_field"]["value"])
 
 
+@pytest.mark.slow
 def test_bench_gradients_compares_rollouts_and_leaves_the_run_alone(
     trained: Path, tmp_path: Path
 ):

@@ -84,7 +84,9 @@ def test_bad_input_is_an_error_and_writes_nothing(
     "environment",
     [
         # PyOpenGL bound to another platform, as if EGL were not installed.
-        {"MUJOCO_GL": "", "PYOPENGL_PLATFORM": "osmesa"},
+        pytest.param(
+            {"MUJOCO_GL": "", "PYOPENGL_PLATFORM": "osmesa"}, marks=pytest.mark.slow
+        ),
         {"MUJOCO_GL": "no_such_backend"},
     ],
 )

@@ -252,6 +252,7 @@ def test_success_is_counted_from_the_first_throw():
     assert watcher._failed.tolist() == [True, False, False]
 
 
+@pytest.mark.slow
 def test_balls_after_a_delay_are_those_that_the_environment_counts():
     config = make(throws=replace(BESIDE, first_delay=(0.3, 1.1)))
     skin = config.skin.build(H1_2)

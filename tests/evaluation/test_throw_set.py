@@ -218,7 +218,7 @@ def delayed(delay: tuple[float, float], **throws) -> EnvConfig:
     return EnvConfig(task=DodgeballConfig(throws=throws), sensor=sensor)
 
 
-@pytest.mark.parametrize("num_workers", [1, 2])
+@pytest.mark.parametrize("num_workers", [None, pytest.param(2, marks=pytest.mark.slow)])
 def test_episodes_count_from_the_first_throw_whatever_the_delay(num_workers):
     # The rigid robot stands where it stands, and meets the same throws.
     which = {"throw_set": 3, "episodes": 32, "hold": True, "num_workers": num_workers}

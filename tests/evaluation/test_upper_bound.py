@@ -77,6 +77,7 @@ def test_the_empty_plan_is_the_policy(policy: Policy, bound: UpperBound):
     assert 0 < int(hit.sum()) < THROWS
 
 
+@pytest.mark.slow
 def test_the_second_ball_comes_at_a_robot_that_has_dodged_the_first(policy: Policy):
     config = standard_task(policy.env_config)
     watcher = Watcher(config, 0, THROWS)
@@ -129,6 +130,7 @@ def test_the_step_of_a_hit_is_not_survived(policy: Policy):
     assert not _play(env, policy, start, empty, steps + 1)[0][row]
 
 
+@pytest.mark.slow
 def test_an_age_limit_is_no_fall(policy: Policy, bound: UpperBound):
     # Every plan crosses it: the balls come into reach from about 0.35 to 1 s on.
     long = task(policy)

@@ -443,6 +443,7 @@ def test_the_command_writes_a_picture_and_figures(tmp_path, monkeypatch):
     assert sum(group["hits"] for group in groups) == result["hits"] == 16
 
 
+@pytest.mark.slow
 def test_the_command_has_the_body_in_the_way_if_asked(tmp_path, monkeypatch):
     pytest.importorskip("matplotlib")
     monkeypatch.chdir(tmp_path)

@@ -213,10 +213,8 @@ def test_a_trainer_killed_while_it_writes_a_checkpoint_goes_on(start, tmp_path):
     assert not list(run.rglob("*.partial"))
 
 
-# By default, its whole group is killed while it trains.
-@pytest.mark.parametrize(
-    "whole_group", [False, pytest.param(True, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("whole_group", [False, True])
 def test_a_trainer_killed_while_it_starts_leaves_nothing(
     whole_group, start, tmp_path, temporary
 ):
@@ -240,6 +238,7 @@ def test_ctrl_c_twice_while_workers_start_is_one_line(start, tmp_path, temporary
     training.check_nothing_is_left()
 
 
+@pytest.mark.slow
 def test_a_closed_terminal_leaves_a_checkpoint(tmp_path, temporary):
     run = tmp_path / "run"
     command = [*TRAIN, *SMALL, "--run-dir"]

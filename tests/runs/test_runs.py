@@ -200,6 +200,7 @@ def test_films_are_made_of_policies_on_the_way(config: TrainConfig, capfd):
     assert films == {"000000000128.mp4", "000000000128.png"} or "OpenGL" in told
 
 
+@pytest.mark.slow
 def test_a_film_that_cannot_be_made_is_told_of(tmp_path, capfd):
     (tmp_path / "config.json").write_text("{}")
     with FilmMaker(tmp_path) as maker:

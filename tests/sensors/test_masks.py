@@ -227,6 +227,7 @@ def test_an_oracle_is_masked_as_a_whole():
     assert not masked["signal"].any()
 
 
+@pytest.mark.slow
 def test_workers_mask_as_one_process_does():
     config = EnvConfig(task=TASK, sensor=SensorConfig(**FAR))
     mask, seen = ("torso_link",), []

@@ -216,6 +216,7 @@ def test_a_result_that_was_edited_or_exchanged_is_refused(folder: StudyFolder):
         table(folder)
 
 
+@pytest.mark.slow
 def test_a_study_begun_before_options_changed_goes_on(tmp_path: Path):
     folder = StudyFolder(tmp_path / "study")
     old = dataclasses.replace(SHORT, standard="1", seeds=(0, 1))
