@@ -375,6 +375,7 @@ def test_ctrl_c_while_the_server_imports_is_one_line():
     assert script.returncode == 130
 
 
+@pytest.mark.slow
 def test_a_server_killed_at_the_start_is_reported():
     code = """
 import os, signal, time

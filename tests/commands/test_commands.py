@@ -224,6 +224,7 @@ def test_bad_input_to_an_evaluation_is_one_clear_message(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_an_evaluation_draws_an_operating_map(
     trained: Path, tmp_path: Path, monkeypatch
 ):

@@ -37,6 +37,7 @@ def test_it_writes_a_film_and_a_sheet(tmp_path: Path):
     assert {p.name for p in tmp_path.iterdir()} == {"a.gif", "a.png"}
 
 
+@pytest.mark.slow
 def test_a_film_is_of_the_longest_of_the_episodes_that_are_evaluated(
     skin: Skin, tmp_path: Path
 ):

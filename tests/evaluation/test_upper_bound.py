@@ -170,6 +170,7 @@ def test_corrupted_sensors_are_refused(policy: Policy):
         )
 
 
+@pytest.mark.slow
 def test_a_search_repeats(policy: Policy):
     search = SearchConfig(samples=8, iterations=2, stand_s=0.5)
     one, two = find(policy, search), find(policy, search)

@@ -69,6 +69,7 @@ def test_own_surface_is_at_distance_zero_up_to_point_spacing(own_meshes):
         assert fit.mesh_to_ours.mean() < limit / 2, fit.region
 
 
+@pytest.mark.slow
 def test_distance_on_own_surface_shrinks_with_more_samples(own_meshes):
     coarse, fine = measure(own_meshes, 400), measure(own_meshes, 1600)
     for few, many in zip(coarse, fine, strict=True):

@@ -420,6 +420,7 @@ def in_worker(source: Path, cache: str) -> tuple[bool, str]:
         return is_one(load_anew(source)), said.getvalue()
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_a_killed_compilation_leaves_nothing_in_the_cache(source, cache, tmp_path):
     compiler = tmp_path / "slow"
