@@ -216,12 +216,21 @@ def main(args: list[str]) -> None:
     def on_point(done: int, total: int) -> None:
         line.show(f"map: {done} of {total} points")
 
+    def on_perturbed(done: int, total: int) -> None:
+        line.show(f"perturbed: {done} of {total}")
+
     which: dict[str, Any] = {
         "throw_set": config.throw_set,
         "episodes": config.episodes,
         "num_workers": config.num_workers,
         "mask": config.masked,
         "on_step": on_step,
+    }
+    # What is played many times.
+    quarter: dict[str, Any] = {
+        "throw_set": config.throw_set,
+        "episodes": max(config.episodes // 4, 1),
+        "mask": config.masked,
     }
     behaviour = checked = None
     substeps = config.check_substeps or env_config.task.physics.substeps
@@ -263,31 +272,15 @@ def main(args: list[str]) -> None:
         content["check_substeps"] = config.check_substeps
         content["checked"] = dataclasses.asdict(checked)
     if config.perturbed:
-
-        def on_perturbed(done: int, total: int) -> None:
-            line.show(f"perturbed: {done} of {total}")
-
         rows = perturb(
-            policy,
-            env_config,
-            policy.skin,
-            throw_set=config.throw_set,
-            episodes=max(config.episodes // 4, 1),
-            mask=config.masked,
-            on_point=on_perturbed,
+            policy, env_config, policy.skin, **quarter, on_point=on_perturbed
         )
         line.finish()
         print(perturbed_table(rows, age))
         content["perturbed"] = [dataclasses.asdict(row) for row in rows]
     if config.map is not None:
         lines = operating_map(
-            policy,
-            env_config,
-            policy.skin,
-            throw_set=config.throw_set,
-            episodes=max(config.episodes // 4, 1),
-            mask=config.masked,
-            on_point=on_point,
+            policy, env_config, policy.skin, **quarter, on_point=on_point
         )
         line.finish()
         draw_map(config.map, lines, title.removesuffix(", physics at "))

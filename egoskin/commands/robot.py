@@ -64,7 +64,7 @@ class Check:
         if self.out is not None:
             check_path(self.out, (".png",))
         robot = find_robot(self.robot)
-        if robot.name not in ROBOTS or robot is not ROBOTS[robot.name]:
+        if ROBOTS.get(robot.name) is not robot:
             robot = portable(robot)
         mass = float(robot.model.body_mass.sum())
         print(

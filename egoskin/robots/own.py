@@ -216,11 +216,7 @@ def read_folder(folder: Path) -> RobotConfig:
     content = toml.content
     for key in content:
         if key not in _KEYS:
-            near = difflib.get_close_matches(key, _KEYS, n=1)
-            hint = f", did you mean {near[0]!r}?" if near else ""
-            raise toml.error(
-                f"there is no key {key!r}{hint} (keys: {', '.join(_KEYS)})", key
-            )
+            raise toml.error(f"there is {_no_match(key, _KEYS, 'key')}", key)
     for key in _NEEDED:
         if key not in content:
             raise toml.error(f"{key} is missing")
