@@ -342,8 +342,8 @@ def portable(robot: RobotConfig) -> RobotConfig:
     What only looks, and actuators, sensors, key frames and whatever does not hang on
     the base are left out; masses stay. A cylinder becomes the capsule inside it, as
     long and as wide, or a flat one a box. The base of a URDF floats. Where the file's
-    bits of collision are not this package's (`egoskin/assets/h1_2.xml` explains them),
-    the robot's own shapes meet as there, and balls and floor meet them all.
+    bits of collision are not this package's (``egoskin/assets/h1_2.xml`` explains
+    them), the robot's own shapes meet as there, and balls and floor meet them all.
 
     Args:
         robot: A robot of the task; `RobotConfig.model_path` is read.
