@@ -24,7 +24,7 @@ class WandbLog:
     def __init__(
         self, folder: Path, start: Mapping[str, Any], config: Mapping[str, Any]
     ) -> None:
-        import wandb
+        import wandb  # pyright: ignore[reportMissingImports]
 
         identity = hashlib.sha256(f"{folder.name} {start['time']}".encode())
         try:
