@@ -23,7 +23,6 @@ comparisons are used, which round in one way: compiled code gives the same bits.
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -32,6 +31,7 @@ import mujoco
 import torch
 from torch import Tensor
 
+from egoskin.hints import did_you_mean
 from egoskin.rounding import exact_sqrt
 
 # Keeps 0/0 out as a summand or a least value; any length or its square dwarfs it, and
@@ -372,8 +372,7 @@ def shape_of(kind: str, size: Sequence[float]) -> Shape:
     """
     needed = {"sphere": 1, "capsule": 2, "box": 3, "ellipsoid": 3}
     if kind not in needed:
-        close = difflib.get_close_matches(kind, needed, n=1)
-        hint = f"; did you mean {close[0]!r}?" if close else ""
+        hint = did_you_mean(kind, needed)
         raise ValueError(f"kind must be one of {', '.join(needed)}, got {kind!r}{hint}")
     sizes = [float(value) for value in size][: needed[kind]]
     if len(sizes) < needed[kind]:

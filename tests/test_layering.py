@@ -15,6 +15,7 @@ MODULES = {
 
 # Small tools that many rooms share; the last ones import those before them.
 TOOLS = [
+    "hints",
     "bounds",
     "memory",
     "rounding",

@@ -83,9 +83,17 @@ def begin(name: str) -> None:
 def run(name: str) -> None:
     """Run a command on the arguments of this process, with clear errors."""
     begin(name)
-    command = import_module(f"egoskin.commands.{name.replace('-', '_')}")
-    # Only now: it imports torch.
-    from egoskin.commands.errors import clear_errors
+    try:
+        command = import_module(f"egoskin.commands.{name.replace('-', '_')}")
+        # Only now: it imports torch.
+        from egoskin.commands.errors import clear_errors
+    except (MemoryError, ImportError) as error:
+        # The loader's words for a library that finds no room.
+        if isinstance(error, MemoryError) or "failed to map segment" in str(error):
+            text = "error: too little memory: PyTorch and MuJoCo take about 1 GB"
+            print(text, file=sys.stderr)
+            raise SystemExit(2) from None
+        raise
 
     with clear_errors():
         command.main(sys.argv[1:])

@@ -21,7 +21,6 @@ no file and is the same robot wherever it is loaded.
 
 from __future__ import annotations
 
-import difflib
 import fnmatch
 import re
 import runpy
@@ -34,6 +33,7 @@ from typing import Annotated, Any
 import mujoco
 from tyro.constructors import PrimitiveConstructorSpec
 
+from egoskin.hints import did_you_mean
 from egoskin.robots.chains import body_name
 from egoskin.robots.config import (
     ROBOTS,
@@ -331,8 +331,7 @@ def _links(toml: _Toml, key: str, links: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _no_match(pattern: str, names: Sequence[str], what: str) -> str:
-    near = difflib.get_close_matches(pattern, names, n=1)
-    hint = f", did you mean {near[0]!r}?" if near else ""
+    hint = did_you_mean(pattern, names)
     return f"no {what} {pattern!r}{hint} ({what}s: {', '.join(names)})"
 
 

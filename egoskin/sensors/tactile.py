@@ -12,7 +12,6 @@ the keys they read, as `torchrl.envs.RewardScaling` does.
 
 from __future__ import annotations
 
-import difflib
 import fnmatch
 import math
 from collections.abc import Mapping, Sequence
@@ -24,6 +23,7 @@ from torchrl.data import Binary as BinarySpec
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
+from egoskin.hints import did_you_mean
 from egoskin.transform import RowTransform, StatefulTransform
 
 
@@ -35,10 +35,9 @@ def _matching(links: Sequence[str], patterns: Sequence[str]) -> Tensor:
     """
     for pattern in patterns:
         if not fnmatch.filter(links, pattern):
-            close = difflib.get_close_matches(pattern, links, n=1)
-            hint = f"; did you mean {close[0]!r}?" if close else "."
             raise ValueError(
-                f"{pattern!r} matches no link{hint} The links are {', '.join(links)}"
+                f"{pattern!r} matches no link{did_you_mean(pattern, links)} "
+                f"(links: {', '.join(links)})"
             )
     return torch.tensor(
         [any(fnmatch.fnmatchcase(name, p) for p in patterns) for name in links],

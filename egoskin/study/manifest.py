@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import difflib
 import math
 import re
 from collections.abc import Collection, Mapping
@@ -23,6 +22,7 @@ from typing import Annotated, Any
 
 from egoskin.bounds import COUNT, check_bounds
 from egoskin.envs.standards import Standard, training_task
+from egoskin.hints import did_you_mean
 from egoskin.make import EnvConfig
 from egoskin.rng import check_seed
 from egoskin.runs.config import MACHINE_FIELDS, TrainConfig
@@ -184,7 +184,7 @@ class Manifest:
         """
         named = {run.name: run for run in self.runs}
         if name not in named:
-            raise ValueError(f"no run {name!r}{_closest(name, named)}")
+            raise ValueError(f"no run {name!r}{did_you_mean(name, named)}")
         return named[name]
 
     def overrides(self, cell: Cell) -> dict[str, Any]:
@@ -409,15 +409,10 @@ def _check_key(content: Any, key: str, where: str) -> None:
     if not isinstance(content, dict) or key not in content:
         keys = content if isinstance(content, dict) else ()
         full = f"{where}.{key}".lstrip(".").removeprefix("env.")
-        raise KeyError(f"there is no field {full!r}{_closest(key, keys)}")
+        raise KeyError(f"there is no field {full!r}{did_you_mean(key, keys)}")
 
 
 def _full_name(name: str) -> str:
     """Return a field's name in a stored configuration."""
     parts = {f.name for f in dataclasses.fields(EnvConfig)}
     return f"env.{name}" if name.split(".")[0] in parts else name
-
-
-def _closest(name: str, valid: Collection[str]) -> str:
-    found = difflib.get_close_matches(name, list(valid), n=1)
-    return f"; do you mean {found[0]!r}?" if found else ""

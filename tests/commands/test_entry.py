@@ -201,3 +201,16 @@ def test_the_main_job_is_the_same_code_as_the_command():
     # The script is there to be read and copied, so it holds the code itself.
     script = runpy.run_path(str(SCRIPTS / "ppo.py"))["main"]
     assert inspect.getsource(script) == inspect.getsource(train)
+
+
+@pytest.mark.parametrize("bytes_", [300_000_000, 600_000_000])
+def test_too_little_memory_to_import_is_one_line(bytes_):
+    done = subprocess.run(
+        [sys.executable, "-m", "egoskin", "evaluate", "none"],
+        capture_output=True,
+        text=True,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (bytes_, bytes_)),
+    )
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: too little memory")
+    assert done.stderr.count("\n") == 1

@@ -6,7 +6,6 @@ the top, one sensor on each line.
 
 from __future__ import annotations
 
-import difflib
 import itertools
 import json
 import math
@@ -18,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from egoskin.hints import did_you_mean
 from egoskin.sensors.skin.coverage import KINDS, Coverage, Ray
 from egoskin.storage.files import read_regular
 
@@ -95,8 +95,7 @@ def _coverage(name: str, entry: object) -> Coverage:
 def _check_known(where: str, name: str, known: Sequence[str]) -> None:
     """Raise ValueError for a field that a skin file does not have."""
     if name not in known:
-        close = difflib.get_close_matches(name, known, n=1)
-        hint = f"; did you mean {close[0]!r}?" if close else ""
+        hint = did_you_mean(name, known)
         raise ValueError(f"{where}: unknown field {name!r}{hint}")
 
 
@@ -223,11 +222,9 @@ class Skin:
         """Raise ValueError if a sensor sits on a link the robot does not have."""
         for index, name in enumerate(self.links):
             if name not in known:
-                close = difflib.get_close_matches(name, known, n=1)
-                hint = f"; did you mean {close[0]!r}?" if close else "."
                 raise ValueError(
                     f"sensor {index} sits on {name!r}, which {self.robot} does not "
-                    f"have{hint} Its links are {', '.join(known)}"
+                    f"have{did_you_mean(name, known)} (links: {', '.join(known)})"
                 )
 
     def rotation(self) -> np.ndarray:

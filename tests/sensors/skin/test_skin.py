@@ -195,7 +195,7 @@ def skin_content(*sensors: object) -> dict:
         (skin_content(), "at least one sensor"),
         (
             {**skin_content(SENSOR), "type": {}},
-            "a skin: unknown field 'type'; did you mean 'types'",
+            "a skin: unknown field 'type', did you mean 'types'",
         ),
         (
             skin_content(SENSOR, {**SENSOR, "range": -1}, SENSOR),

@@ -11,6 +11,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from egoskin.hints import did_you_mean
+
 NO_RADIUS = 0.1
 """What GenTact writes for a sensor that has no radius [m]."""
 # Names below a link in GenTact's paths, as Isaac Sim's URDF importer gives them.
@@ -131,8 +133,7 @@ class Links:
         self._needs_parent = False
         for target in (*link_map.values(), *(() if parent is None else (parent,))):
             if target not in self.links:
-                close = difflib.get_close_matches(target, self.links, n=1)
-                hint = f" (did you mean {close[0]!r}?)" if close else ""
+                hint = did_you_mean(target, self.links)
                 raise ValueError(f"no link {target!r}{hint}; {self.known()}")
 
     def known(self) -> str:
@@ -189,11 +190,9 @@ class Links:
         if self._parent is not None:
             self._needs_parent = True
             return self._parent
-        close = difflib.get_close_matches(name, self.links, n=1)
-        hint = f" ({close[0]}?)" if close else ""
         raise SensorError(
             f"{where}: the file does not say on which link its sensors sit; give it "
-            f"as parent (--parent){hint}",
+            f"as parent (--parent){did_you_mean(name, self.links)}",
             self.known(),
         )
 
