@@ -8,6 +8,7 @@ at once.
 from __future__ import annotations
 
 import difflib
+import resource
 import sys
 from collections.abc import Iterable, Mapping
 from importlib import import_module
@@ -43,6 +44,8 @@ _OTHER_NAMES = {
     "--version": "--version",
 }
 
+# Bytes that PyTorch and MuJoCo take when they are imported, with a reserve.
+_ADDRESS_SPACE = 1_000_000_000
 # Commands that draw the robot.
 _PICTURES = ("film", "skin", "robot")
 
@@ -76,6 +79,7 @@ def begin(name: str) -> None:
     elif pages.asked_for(name, args):
         print(pages.page(name))
         raise SystemExit(0)
+    _check_address_space()
     if name in _PICTURES:
         draw_without_display()
 
@@ -83,20 +87,24 @@ def begin(name: str) -> None:
 def run(name: str) -> None:
     """Run a command on the arguments of this process, with clear errors."""
     begin(name)
-    try:
-        command = import_module(f"egoskin.commands.{name.replace('-', '_')}")
-        # Only now: it imports torch.
-        from egoskin.commands.errors import clear_errors
-    except (MemoryError, ImportError) as error:
-        # The loader's words for a library that finds no room.
-        if isinstance(error, MemoryError) or "failed to map segment" in str(error):
-            text = "error: too little memory: PyTorch and MuJoCo take about 1 GB"
-            print(text, file=sys.stderr)
-            raise SystemExit(2) from None
-        raise
+    command = import_module(f"egoskin.commands.{name.replace('-', '_')}")
+    # Only now: it imports torch.
+    from egoskin.commands.errors import clear_errors
 
     with clear_errors():
         command.main(sys.argv[1:])
+
+
+def _check_address_space() -> None:
+    """End if `ulimit -v` leaves no room for libraries; some would try for ever."""
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if limit != resource.RLIM_INFINITY and limit < _ADDRESS_SPACE:
+        print(
+            f"error: too little memory: PyTorch and MuJoCo need {_ADDRESS_SPACE:,} "
+            f"bytes of address space, and the limit (ulimit -v) is {limit:,}",
+            file=sys.stderr,
+        )
+        raise SystemExit(2)
 
 
 def _page() -> str:

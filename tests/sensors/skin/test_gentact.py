@@ -856,7 +856,11 @@ TWO_MACROS = xacro(TAG).replace(
     ("content", "options", "expected"),
     [
         # Line 4, counted with the newline before the declaration.
-        (xacro(TAG), {}, r"export:4: .*give it as parent \(--parent\) \(left_elbow_l"),
+        (
+            xacro(TAG),
+            {},
+            r"export:4: .*(--parent\), did you mean 'left_elbow_l",
+        ),
         (xacro(TAG, TAG), ARM_LINK, "export:1[0-9]: 'xacro:self_cap_sensor 0' is th"),
         (xacro(TAG).replace('xyz="0 0 0"', 'xyz="0 0"'), ARM_LINK, "three numbers"),
         (xacro(TAG).replace("0 0 0", "0 0 ${pi}"), ARM_LINK, "finite .*{pi}"),

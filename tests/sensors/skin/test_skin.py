@@ -311,7 +311,7 @@ def test_an_unknown_link_is_refused_with_the_closest_name():
     skin = make_skin([0, 0, 1], links=("xyz",))
     with pytest.raises(
         ValueError,
-        match=r"sensor 0 sits on 'xyz', which h1_2 does not have\. Its links",
+        match=r"sensor 0 sits on 'xyz', which h1_2 does not have \(links: ",
     ):
         skin.check_links(H1_2.links)
 
