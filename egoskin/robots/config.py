@@ -170,6 +170,10 @@ class RobotConfig:
             # A URDF may leave out masses, and MuJoCo wants them where joints move.
             spec.compiler.boundmass = spec.compiler.boundinertia = 1e-6
             spec.compiler.balanceinertia = True
+        try:
+            _name_all(spec)
+        except ValueError as error:
+            raise self._unreadable(error) from error
         return spec
 
     @property
@@ -392,6 +396,22 @@ def _root_tag(content: bytes) -> str:
 def _mesh_geoms(spec: mujoco.MjSpec) -> list[mujoco.MjsGeom]:
     """Return the geoms that are meshes."""
     return [g for g in spec.geoms if g.type == mujoco.mjtGeom.mjGEOM_MESH]
+
+
+def _name_all(spec: mujoco.MjSpec) -> None:
+    """Give bodies and joints without a name those that the robot's chain has."""
+    bodies = [body for body in spec.bodies if not body.name]
+    joints = [
+        joint
+        for joint in spec.joints
+        if not joint.name and joint.type != mujoco.mjtJoint.mjJNT_FREE
+    ]
+    if bodies or joints:
+        model = spec.compile()
+        for body in bodies:
+            body.name = body_name(model, body.id)
+        for joint in joints:
+            joint.name = joint_name(model, joint.id)
 
 
 def _primitive_kind(model: mujoco.MjModel, geom: int) -> str:

@@ -34,7 +34,7 @@ import mujoco
 from tyro.constructors import PrimitiveConstructorSpec
 
 from egoskin.hints import did_you_mean
-from egoskin.robots.chains import body_name
+from egoskin.robots.chains import body_id
 from egoskin.robots.config import (
     ROBOTS,
     Gain,
@@ -316,7 +316,10 @@ def _gains(toml: _Toml) -> dict[str, dict[str, Gain]]:
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
+    """Whether a value is a finite number; a whole one may have any digits in TOML."""
+    if not isinstance(value, (int, float)) or isinstance(value, bool):
+        return False
+    return abs(value) <= sys.float_info.max
 
 
 def _links(toml: _Toml, key: str, links: tuple[str, ...]) -> tuple[str, ...]:
@@ -415,9 +418,7 @@ def _fix_inertia(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
     for body in spec.bodies:
         if body.name == "world" or body.explicitinertial:
             continue
-        which = next(
-            i for i in range(1, model.nbody) if body_name(model, i) == body.name
-        )
+        which = body_id(model, body.name)
         body.mass = model.body_mass[which]
         body.ipos, body.iquat = model.body_ipos[which], model.body_iquat[which]
         body.inertia = model.body_inertia[which]

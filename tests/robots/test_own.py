@@ -95,9 +95,12 @@ def test_a_variable_of_a_python_file_is_a_robot(tmp_path):
         ('    "*_arm",', '    "*_hand",', 6, "no link '*_hand'"),
         ("left_shoulder = 0.1", "left_shouldr = 0.1", 11, "did you mean"),
         ("left_shoulder = 0.1", "left_shoulder = true", 11, "must be a number"),
+        ("left_shoulder = 0.1", "left_shoulder = nan", 11, "must be a number"),
         ('"*_ankle" = {', '"*_anke" = {', 15, "no joint"),
         ("{ kp = 20, kd = 1 }", "{ kp = 20 }", 16, "'*_shoulder' must be"),
         ("{ kp = 20, kd = 1 }", "{ kp = 0, kd = 1 }", 16, "'*_shoulder' must be"),
+        ("kp = 20, kd = 1", f"kp = {10**400}, kd = 1", 16, "'*_shoulder' must be"),
+        ("kp = 20, kd = 1", "kp = 20, kd = inf", 16, "'*_shoulder' must be"),
         ('"*_shoulder" =', '"*_*" =', 16, "matches '*_hip' and '*_*'"),
         ('"*_shoulder" =', '"left_*er" =', 13, "none of its patterns"),
         ("[gains.stiff]", "[gains]", 14, "table of joints|N m/rad"),
@@ -140,6 +143,19 @@ def test_a_robot_as_data_is_the_same_robot(pip, tmp_path):
 def test_cylinders_become_capsules_as_long_and_as_wide(pip):
     (leg,) = (shape for shape in pip.primitives if shape.link == "left_leg")
     assert (leg.kind, *leg.size[:2]) == ("capsule", 0.05, pytest.approx(0.23))
+
+
+def test_links_and_joints_may_go_without_a_name(tmp_path):
+    model = MODEL.replace('<body name="left_arm"', "<body")
+    model = model.replace('<joint name="left_shoulder"', "<joint")
+    toml = TOML.replace("left_shoulder = 0.1", "joint1 = 0.1")
+    toml = toml.replace('"*_arm"', '"*_arm", "body2"')
+    toml += "joint1 = { kp = 20, kd = 1 }\n"
+    robot = portable(read_folder(write_robot(tmp_path, toml=toml, model=model)))
+    assert robot.links[1] == "body2"
+    assert robot.joints[0] == "joint1"
+    # The scene names them: an actuator for each joint.
+    DodgeballEnv(robot, DodgeballConfig(), num_envs=1, seed=0).check_env_specs()
 
 
 def test_balls_and_floor_meet_a_robot_that_was_not_made_for_them(pip):
