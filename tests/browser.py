@@ -32,7 +32,9 @@ _OPTIONS = (
 @contextmanager
 def browsing(width: int = 1440, height: int = 900) -> Iterator:
     """Yield a browser's context, of windows of a size [px]."""
-    from playwright.sync_api import sync_playwright
+    from playwright.sync_api import (  # pyright: ignore[reportMissingImports]
+        sync_playwright,
+    )
 
     with sync_playwright() as driver, tempfile.TemporaryDirectory() as folder:
         context = driver.chromium.launch_persistent_context(

@@ -25,7 +25,7 @@ from egoskin.agents.rollout import collect
 class CountingEnv(EnvBase):
     """Observes its age; row 0 times out at age 2, row 1 terminates at age 3."""
 
-    batch_locked = True
+    batch_locked = True  # pyright: ignore - a property there, read as this
 
     def __init__(self) -> None:
         super().__init__(batch_size=[2])
@@ -39,7 +39,9 @@ class CountingEnv(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         pass
 
-    def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDict:
+    def _reset(
+        self, tensordict: TensorDictBase | None = None, **_: object
+    ) -> TensorDict:
         mask = torch.ones(2, 1, dtype=torch.bool)
         if tensordict is not None and "_reset" in tensordict:
             mask = tensordict["_reset"]
@@ -65,7 +67,7 @@ class CountingEnv(EnvBase):
 class StillEnv(EnvBase):
     """256 rows in which nothing ever happens."""
 
-    batch_locked = True
+    batch_locked = True  # pyright: ignore - a property there, read as this
 
     def __init__(self) -> None:
         super().__init__(batch_size=[256])
@@ -78,7 +80,9 @@ class StillEnv(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         pass
 
-    def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDict:
+    def _reset(
+        self, tensordict: TensorDictBase | None = None, **_: object
+    ) -> TensorDict:
         return TensorDict({"observation": torch.zeros(256, 3)}, [256])
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:

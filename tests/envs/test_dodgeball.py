@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -51,7 +52,7 @@ def advance(env, root: TensorDict, action=None) -> tuple[TensorDict, TensorDict]
     return step["next"], following
 
 
-def run(env, actions: torch.Tensor, root: TensorDict | None = None) -> TensorDict:
+def run(env, actions: torch.Tensor, root: TensorDict | None = None) -> Any:
     """Steps and roots under given actions, stacked over time."""
     root = env.reset() if root is None else root
     out = []

@@ -121,7 +121,7 @@ def test_an_export_that_is_not_exact_is_refused(monkeypatch):
     content = to_onnx(policy).SerializeToString()
     observations = sample_observations(policy, 10, 1.0)
     assert largest_difference(content, policy, observations) < 1e-5
-    policy.head.body.tail[-1].bias.data += 1e-3
+    policy.head.body.tail[-1].bias.data.add_(1e-3)
     assert largest_difference(content, policy, observations) > 1e-5
     monkeypatch.setattr("egoskin.policies.export.largest_difference", lambda *_: 2e-5)
     with pytest.raises(ValueError, match=r"differs from PyTorch by 2\.0e-05"):

@@ -195,7 +195,7 @@ def test_shapes_that_only_look_are_dropped_and_their_masses_stay(tmp_path):
     for name in ("body_mass", "body_inertia", "body_ipos"):
         own = getattr(before.model, name)[1:]
         np.testing.assert_allclose(getattr(after.model, name)[1:], own, atol=1e-5)
-    assert "mesh" not in after.model_xml
+    assert "mesh" not in (after.model_xml or "mesh")
     touching = text.replace('contype="0" conaffinity="0"', "")
     with pytest.raises(ValueError, match=r"link .trunk. touches with a shape.* mesh"):
         portable(read_folder(write_robot(tmp_path, model=touching)))

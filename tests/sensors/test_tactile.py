@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import mujoco
 import pytest
@@ -162,7 +163,7 @@ def actions(steps: int, rows: int) -> torch.Tensor:
     return size * torch.randn(shape, generator=generator)
 
 
-def run(env, steps: int) -> TensorDict:
+def run(env, steps: int) -> Any:
     """Steps ``[T, rows]`` of an environment under fixed actions, with resets."""
     stored, root = [], env.reset()
     for action in actions(steps, root.numel()):

@@ -30,7 +30,7 @@ __all__ = ["start", "study", "tiny", "undisturbed"]
 @pytest.fixture
 def cluster() -> Iterator[Any]:
     """A cluster of a head without cores and two nodes of one core."""
-    from ray.cluster_utils import Cluster
+    from ray.cluster_utils import Cluster  # pyright: ignore[reportMissingImports]
 
     made = Cluster(initialize_head=True, head_node_args={"num_cpus": 0})
     for _ in range(2):
