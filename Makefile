@@ -3,13 +3,16 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 ARGS ?=
-# The policy of `make demo`.
+# The policy of `make view` and `make demo`.
 POLICY ?= field_proximity
 
-.PHONY: train demo test test-slow test-memory verify check bench docs clean
+.PHONY: train demo view test test-slow test-browser test-memory verify check bench docs clean
 
 train: $(VENV)/run
 	$(BIN)/python scripts/ppo.py $(ARGS)
+
+view: $(VENV)/run
+	$(BIN)/python -m egoskin view $(POLICY) $(ARGS)
 
 demo: $(VENV)/run
 	$(BIN)/python scripts/evaluate.py $(POLICY) --episodes 256
@@ -21,6 +24,11 @@ test: $(VENV)/dev
 
 test-slow: $(VENV)/dev
 	$(BIN)/python -m pytest -m slow $(ARGS)
+
+# The page in a Chromium without a display; -rs says what is missing.
+test-browser: $(VENV)/dev
+	$(BIN)/python -m pip install --quiet --editable ".[browser]"
+	$(BIN)/python -m pytest -m slow -rs tests/viewer/test_web_browser.py $(ARGS)
 
 # Half an hour of training: does it grow?
 test-memory: $(VENV)/dev
@@ -48,7 +56,7 @@ clean:
 $(VENV)/run: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet --editable .
+	$(BIN)/python -m pip install --quiet --editable ".[view,study,export]"
 	touch $@
 
 $(VENV)/dev: pyproject.toml

@@ -34,9 +34,16 @@ class _KeyedTransform(Transform):
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Return the spec with the out keys added."""
         assert isinstance(observation_spec, Composite)
-        for key, spec in zip(
-            self.out_keys, self.out_specs(observation_spec), strict=True
-        ):
+        try:
+            specs = self.out_specs(observation_spec)
+        except KeyError as error:
+            held = sorted(map(str, observation_spec.keys(True)))
+            raise KeyError(
+                f"{type(self).__name__} needs {error}, which nothing before it writes; "
+                f"the observation holds {held}"
+            ) from error
+        self._check_one_each("out_specs", specs)
+        for key, spec in zip(self.out_keys, specs, strict=True):
             observation_spec[key] = spec
         return observation_spec
 
@@ -61,6 +68,20 @@ class _KeyedTransform(Transform):
         batch = tensordict.batch_size
         for key, value in zip(self.out_keys, values, strict=True):
             tensordict.set(key, value.reshape(*batch, *value.shape[1:]))
+
+    def _check_one_each(self, method: str, results: object) -> None:
+        """Raise TypeError for a result that is not one for each out key.
+
+        One tensor, or spec, alone would be taken for its rows.
+        """
+        if isinstance(results, tuple | list) and len(results) == len(self.out_keys):
+            return
+        name = type(results).__name__
+        got = f"{name} of {len(results)}" if isinstance(results, Sequence) else name
+        raise TypeError(
+            f"{type(self).__name__}.{method} must return a tuple, one for each of "
+            f"{self.out_keys}, got {got}"
+        )
 
     def _rows_to_reset(
         self, tensordict: TensorDictBase, total: int
@@ -113,8 +134,13 @@ class RowTransform(_KeyedTransform):
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         inputs = self._read(next_tensordict, self.in_keys)
-        self._write(next_tensordict, self.compute(*inputs))
+        self._write(next_tensordict, self._computed(inputs))
         return next_tensordict
+
+    def _computed(self, inputs: Sequence[Tensor]) -> tuple[Tensor, ...]:
+        values = self.compute(*inputs)
+        self._check_one_each("compute", values)
+        return values
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the out keys into any tensordict that holds the in keys."""
@@ -129,7 +155,7 @@ class RowTransform(_KeyedTransform):
             return self._call(tensordict_reset)
         rows, index = partial
         inputs = self._read(tensordict_reset, self.in_keys)
-        values = self.compute(*(x[index] for x in inputs))
+        values = self._computed([x[index] for x in inputs])
         self._write(tensordict_reset, [_spread(x, rows, total) for x in values])
         return tensordict_reset
 

@@ -32,6 +32,7 @@ from egoskin.sensors import (
     place_sensors,
 )
 from egoskin.sensors.config import SensorConfig
+from egoskin.transform import RowTransform
 from throwing import TASK
 
 SKIN = place_sensors(H1_2, 12, seed=0)
@@ -151,6 +152,48 @@ def test_a_missing_key_is_named(build, full_state):
     state = select(state, transform.in_keys[:-1])
     with pytest.raises(KeyError, match=f"{name} reads '{missing}', which .* lacks"):
         transform(state)
+
+
+@pytest.mark.parametrize("given", ["bare", "two"])
+@pytest.mark.parametrize("method", ["compute", "out_specs"])
+def test_results_that_are_not_one_for_each_key_are_refused(method, given):
+    class Doubled(RowTransform):
+        """As one writes one's first transform: what is alone needs no tuple."""
+
+        def __init__(self) -> None:
+            super().__init__(in_keys=["x"], out_keys=["y"])
+
+        def compute(self, x):
+            return self.wrong("compute", 2 * x)
+
+        def out_specs(self, spec):
+            return self.wrong("out_specs", spec["x"].clone())
+
+        def wrong(self, name, result):
+            if name != method:
+                return (result,)
+            return result if given == "bare" else (result, result)
+
+    got = "tuple of 2" if given == "two" else r"(Tensor|UnboundedContinuous)$"
+    expected = rf"Doubled\.{method} must return a tuple, .* \['y'\], got {got}"
+    asked = {
+        "compute": (Doubled(), TensorDict({"x": torch.ones(1, 3)}, [1])),
+        "out_specs": (
+            Doubled().transform_observation_spec,
+            Composite(x=Unbounded((1, 3)), shape=[1]),
+        ),
+    }
+    ask, given_to_it = asked[method]
+    with pytest.raises(TypeError, match=expected):
+        ask(given_to_it)
+
+
+def test_a_transform_before_what_it_reads_names_the_key():
+    sensor = FieldSensor(SKIN, H1_2.chain, BALLS, 1.0)
+    spec = Composite(base_pose=Unbounded((1, 7)), shape=[1])
+    expected = "Proximity needs 'distance', which nothing before it writes"
+    with pytest.raises(KeyError, match=expected):
+        Proximity(sensor).transform_observation_spec(spec)
 
 
 @every_transform

@@ -93,7 +93,7 @@ Place, import, export and show skins.
                           an export of GenTact's (CSV, xacro, URDF)
   egoskin skin export my.json --out my.csv
                           a skin file as GenTact's CSV
-  egoskin skin show my.json --out my.png
+  egoskin skin show my.json --picture my.png
                           what is in a skin file, and its picture
 
 egoskin skin place --help lists the options of place, and so for each.

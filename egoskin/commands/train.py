@@ -104,7 +104,8 @@ def what_came_out(trainer: Trainer, metrics: Mapping[str, float]) -> str:
     return (
         f"{told}\n"
         f"evaluate it with: egoskin evaluate {path}\n"
-        f"see it with:      egoskin film {path} --longest-of 16"
+        f"film it with:     egoskin film {path} --longest-of 16\n"
+        f"see it in a page: egoskin view {path}"
     )
 
 

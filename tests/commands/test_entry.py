@@ -108,6 +108,18 @@ def test_the_pages_of_commands_with_subcommands_name_them_all():
         assert named == usage.split(",")
 
 
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_examples_of_a_page_have_options_that_there_are(name):
+    found = re.findall(rf"^  egoskin {name} (.*)", PAGES[name], re.MULTILINE)
+    assert found or name == "replay"
+    for example in found:
+        words = example.split(" > ")[0].split()
+        subcommand = words[:1] if name in WITH_SUBCOMMANDS else []
+        described = call(name, *subcommand, "--help").stdout
+        for option in filter(lambda word: word.startswith("--"), words):
+            assert re.search(rf"{option}[ ,\n│]", described), example
+
+
 @pytest.mark.parametrize("args", [(), ("-h",), ("--help",)])
 def test_without_a_command_there_is_help(args, monkeypatch, capsys):
     egoskin(monkeypatch, *args)

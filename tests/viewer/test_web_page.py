@@ -289,3 +289,22 @@ def test_a_port_that_is_taken_is_an_error(page: Page):
 )
 def test_bad_input_is_an_error(args: list, text: str):
     assert text in fail("view", *args)
+
+
+@pytest.mark.parametrize(("width", "height"), [(1440, 900), (800, 900), (400, 800)])
+def test_all_robots_are_seen_beside_the_panel(page: Page, width: int, height: int):
+    camera = page.server.initial_camera
+    page._look(camera, (width, height))
+    forward = np.array(camera.look_at) - camera.position
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0, 0, 1])
+    right /= np.linalg.norm(right)
+    up = np.cross(right, forward)
+    # The head and both sides of the robot, which stands at the origin.
+    for point in ((0, 0, 1.8), (0, 0, 0), (0, -0.4, 1.0), (0, 0.4, 1.0)):
+        way = np.array(point) - camera.position
+        scale = height / 2 / np.tan(camera.fov / 2) / (way @ forward)
+        x, y = width / 2 + scale * (way @ right), height / 2 - scale * (way @ up)
+        assert 0 < y < height
+        # On a narrow screen the panel is folded together.
+        assert 0 < x < (width - 340 if width > 600 else width)

@@ -6,6 +6,7 @@ it as functions in a queue. While nobody watches it waits for that queue.
 
 from __future__ import annotations
 
+import math
 import queue
 import time
 from collections import deque
@@ -23,13 +24,11 @@ from egoskin.policies.policy import (
     policy_file,
     shipped_policies,
 )
-from egoskin.viewer.web.panel import Panel, Wishes
+from egoskin.viewer.web.panel import MEMORY, Panel, Wishes
 from egoskin.viewer.web.scene import RobotScene, set_stage
 from egoskin.viewer.web.server import open_server, stop_server
 from egoskin.viewer.web.session import Frame, Session, Throw
 
-MEMORY = 5.0
-"""What is remembered, replayed and saved [s]."""
 _PAUSE_AFTER_END = 1.2
 """How long the end of an episode is seen before the next begins [s]."""
 _PICTURE_HZ, _LEAST_PICTURE_HZ, _PANEL_HZ = 30.0, 10.0, 6.0
@@ -39,6 +38,12 @@ _TOO_LATE = 0.25
 """So far behind the clock, lost time is not made up for [s]."""
 _SPACING = 2.6
 """Between two robots [m]."""
+_FIELD_OF_VIEW = 0.75
+"""From the lower to the upper edge of what is seen [rad]."""
+_HALF_WIDTH, _HALF_HEIGHT = 1.2, 1.75
+"""What is seen beside the outer robots, and above and below their middle [m]."""
+_PANEL_WIDTH, _USUAL_SIZE = 340, (1440, 900)
+"""Of the panel, and of a window [px]."""
 _PICK_RADIUS = 0.035
 """A click so near to a sensor is meant for it [m]."""
 
@@ -86,13 +91,9 @@ class Page:
                 np.array(event.ray_direction),
             )
         )
-        self.server.on_client_connect(lambda _: self._ask(self._greet))
+        self.server.on_client_connect(self._welcome)
         self.server.on_client_disconnect(lambda _: self._ask(lambda: None))
-        half = _SPACING * (len(sources) - 1) / 2
-        camera = self.server.initial_camera
-        # The robot stands left of the middle: the panel is at the right.
-        camera.position = (4.0 + 1.6 * half, -1.4, 1.8)
-        camera.look_at, camera.fov = (0.0, 0.45, 0.92), 0.75
+        self._look(self.server.initial_camera, _USUAL_SIZE)
         self.is_paused = False
         self.error = ""
         """What went wrong; "" while all is well."""
@@ -115,7 +116,8 @@ class Page:
             session.body,
             session.skin,
             session.config.task.throws.balls,
-            (0.0, _SPACING * ((len(self.sessions) - 1) / 2 - i) * several),
+            # The camera looks along -x, so the first, on the left, has the least y.
+            (0.0, _SPACING * (i - (len(self.sessions) - 1) / 2) * several),
             _short(session.source) if several else "",
         )
 
@@ -239,7 +241,37 @@ class Page:
             ):
                 scene.draw(frame, session.masked)
 
+    def _look(
+        self,
+        camera: viser.InitialCameraConfig | viser.CameraHandle,
+        size: tuple[int, int],
+    ) -> None:
+        """Let a camera see all robots beside the panel.
+
+        Args:
+            camera: The camera.
+            size: Width and height of what it sees [px].
+        """
+        width, height = size
+        free = max(1 - _PANEL_WIDTH / width, 0.4)
+        half = _HALF_WIDTH + _SPACING * (len(self.sessions) - 1) / 2
+        # Half the height that is seen at a distance of 1 m [m].
+        slope = math.tan(_FIELD_OF_VIEW / 2)
+        away = max(_HALF_HEIGHT / slope, half / (slope * free * width / height))
+        # The robots are in the middle of what the panel, at the right, leaves free.
+        beside = (1 - free) * away * slope * width / height
+        camera.fov = _FIELD_OF_VIEW
+        # In this order: a visitor's camera that is moved takes along what it looks at.
+        camera.position = (0.92 * away, beside - 0.35 * away, 0.92 + 0.17 * away)
+        camera.look_at = (0.0, beside, 0.92)
+
     # --- what visitors ask for --------------------------------------------------
+
+    def _welcome(self, client: viser.ClientHandle) -> None:
+        """Show a new visitor all robots, however wide the window is."""
+        camera = client.camera
+        self._look(camera, (camera.image_width, camera.image_height))
+        self._ask(self._greet)
 
     def _greet(self) -> None:
         """Show a new visitor how it stands."""
@@ -428,7 +460,7 @@ class Page:
         """Return how it stands, in Markdown."""
         state = "**Paused.** " if self.is_paused else self._speed
         state = "**Replay.** " if self._replayed else state
-        lines = ["| | avoided | untouched | best |", "|---|---|---|---|"]
+        lines = ["| | avoided&ensp; | untouched&ensp; | best |", "|---|---|---|---|"]
         for i, session in enumerate(self.sessions):
             avoided, came = session.avoided
             if session.frame.ending is not None:
@@ -437,8 +469,9 @@ class Page:
             now = session.frame.survived
             best = max([now, *self._survival[i]])
             lines.append(
-                f"| {_short(session.source)} | **{self._avoided[i] + avoided}** of "
-                f"{self._came[i] + came} | {now:.1f} s | {best:.1f} s |"
+                f"| {_short(session.source)}&ensp; "
+                f"| **{self._avoided[i] + avoided}** of {self._came[i] + came} "
+                f"| {now:.1f} s | {best:.1f} s |"
             )
         return [*lines, "", state] if state else lines
 

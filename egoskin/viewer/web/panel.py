@@ -28,6 +28,13 @@ _KINDS = {
 _SIGNALS = ("proximity", "closeness", "binary", "localization")
 _CORRUPTIONS = ("none", "time_of_flight", "capacitive", "acoustic")
 _COLOURS = ("#e8590c", "#1c7ed6")
+MEMORY = 5.0
+"""What is remembered, plotted, replayed and saved [s]."""
+# A scale that begins at 0 and reaches at least 1, with room above.
+_FROM_ZERO = {
+    "min": {"soft": 0.0, "pad": 0.0, "mode": 1},
+    "max": {"soft": 1.0, "pad": 0.1, "mode": 1},
+}
 _MASK_HELP = "Click a sensor on the robot to mask it, click again to bring it back."
 _HELP = (
     "**Click** the robot: a ball flies at that place from your side. "
@@ -159,23 +166,30 @@ class Panel:
             name = ("left", "right")[i] if len(sessions) > 1 else "robot"
             series.append(uplot.Series(label=name, stroke=_COLOURS[i], width=2))
         axis = uplot.Axis(stroke="#495057", grid={"stroke": "#e9ecef", "width": 1})
+        whole = uplot.Axis({**axis, "incrs": (1, 2, 5, 10, 20, 50, 100, 200, 500)})
+        seconds = uplot.Scale(time=False, range=(-MEMORY, 0.0))
+        episodes = uplot.Scale(time=False)
+        share, upward = uplot.Scale(range=(0.0, 1.05)), uplot.Scale(range=_FROM_ZERO)
 
-        def plot(x: str) -> viser.GuiUplotHandle:
+        def plot(
+            x: str, scale: uplot.Scale, y: uplot.Scale, along: uplot.Axis = axis
+        ) -> viser.GuiUplotHandle:
             return gui.add_uplot(
                 nothing,
                 (uplot.Series(label=x), *series[1:]),
-                scales={"x": uplot.Scale(time=False, auto=True)},
-                axes=(axis, axis),
-                legend=uplot.Legend(show=len(sessions) > 1),
-                height=150 if len(sessions) == 1 else 115,
+                scales={"x": scale, "y": y},
+                axes=(along, axis),
+                # Without what stands at the mouse, which nobody asks for.
+                legend=uplot.Legend(show=len(sessions) > 1, live=False),
+                height=150 if len(sessions) == 1 else 130,
             )
 
         gui.add_markdown("**Strongest reading**, 1: touching; last five seconds [s]")
-        self._nearest = plot("time [s]")
+        self._nearest = plot("time [s]", seconds, share)
         self._value_title = gui.add_markdown("**Value of the state**, by the critic")
-        self._value = plot("time [s]")
+        self._value = plot("time [s]", seconds, uplot.Scale(auto=True))
         gui.add_markdown("**Untouched** [s], episode by episode")
-        self._survival = plot("episode")
+        self._survival = plot("episode", episodes, upward, whole)
 
     def _add_policies(self, sessions: Sequence[Session], names: Sequence[str]) -> None:
         gui, wishes = self._gui, self._wishes

@@ -111,7 +111,11 @@ class RobotScene:
             )
         self._balls = [
             server.scene.add_icosphere(
-                f"{name}/ball_{i}", radius=ball.radius, color=_BALL, visible=False
+                f"{name}/ball_{i}",
+                radius=ball.radius,
+                color=_BALL,
+                subdivisions=4,
+                visible=False,
             )
             for i, ball in enumerate(balls)
         ]
