@@ -35,7 +35,8 @@ Train a robot to dodge balls by what its skin observes.
 Play a policy on a fixed set of throws that no training has seen.
 
   POLICY                  run folder, checkpoint, policy file, or a policy of the
-                          package: field_proximity, field_binary, localization, blind
+                          package: field_proximity, field_binary, localization,
+                          blind, g1_proximity
   --episodes INT          throw sequences (1024)
   --throw-set INT         seed of the throw set (0)
   --standard {2,1,paper,run}
