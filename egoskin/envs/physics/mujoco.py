@@ -27,10 +27,10 @@ from egoskin.robots.chains import body_id
 _BALL_BIT, _FLOOR_BIT = 1, 2
 # Most Newton iterations of a physics step; a fall seldom needs as many.
 _SOLVER_ITERATIONS = 10
-# Inactive objects wait here, far above everything [m].
-_PARKING = np.array([0.0, 0.0, 1000.0])
-# A faster robot than this has left physics behind: the row is reset and counted.
-_MAX_SPEED = 200.0
+PARKING = np.array([0.0, 0.0, 1000.0])
+"""Where inactive objects wait, far above everything [m]."""
+MAX_SPEED = 200.0
+"""A faster robot than this has left physics behind: the row is reset and counted."""
 
 
 def build_scene(scene: Scene) -> mujoco.MjModel:
@@ -143,6 +143,7 @@ class MujocoPhysics(Physics):
         scene: What is simulated.
         num_envs: Number of rows ``B``.
         num_threads: Threads that step the rows; results do not depend on it.
+        device: The CPU.
         model: The compiled scene, by default that of `build_scene`.
     """
 
@@ -152,8 +153,11 @@ class MujocoPhysics(Physics):
         num_envs: int,
         *,
         num_threads: int = 1,
+        device: torch.device | str = "cpu",
         model: mujoco.MjModel | None = None,
     ) -> None:
+        if torch.device(device).type != "cpu":
+            raise ValueError(f"engine mujoco simulates on the CPU, not on {device}")
         robot, config = scene.robot, scene.config
         self.model = build_scene(scene) if model is None else model
         self.scene, self.config = scene, config
@@ -208,7 +212,7 @@ class MujocoPhysics(Physics):
                 self._qvel[:, self._robot_v] = 0.0
         speed = np.abs(self._qvel[:, self._robot_v]).max(1)
         # The comparison is also False for NaN.
-        diverged = errors | (self._failure_count() > warnings) | ~(speed < _MAX_SPEED)
+        diverged = errors | (self._failure_count() > warnings) | ~(speed < MAX_SPEED)
         contact = torch.from_numpy(found)
         by_link = None
         if self.scene.link_contacts:
@@ -268,7 +272,7 @@ class MujocoPhysics(Physics):
     def park(self, objects: Tensor) -> None:
         """Take objects out of play, ``[B, O]`` bool: they wait at rest far above."""
         parked = objects.numpy()
-        self._objects(self._object_q)[parked] = _PARKING
+        self._objects(self._object_q)[parked] = PARKING
         self._objects(self._object_v)[parked] = 0.0
 
     def step_raw(self) -> None:
@@ -281,7 +285,7 @@ class MujocoPhysics(Physics):
         self._batch.reset(which, stage=mujoco.mjtStage.mjSTAGE_NONE)
         robot = torch.cat((base_pose, joint_pos), -1).double().numpy()
         self._qpos[which, self._robot_q] = robot
-        self._qpos[which, self._object_q] = np.tile(_PARKING, self.num_objects)
+        self._qpos[which, self._object_q] = np.tile(PARKING, self.num_objects)
         if self.config.target_velocity == "finite_difference":
             self._last_target[rows] = joint_pos
 
