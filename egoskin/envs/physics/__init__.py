@@ -33,8 +33,8 @@ def engine_of(name: Engine) -> type[Physics]:
         from egoskin.envs.physics.warp import WarpPhysics
     except ModuleNotFoundError as error:
         raise ValueError(
-            f"engine warp needs {error.name}: `pip install 'egoskin[gpu]'` (Python 3.11 "
-            "or later)"
+            f"engine warp needs {error.name}: `pip install 'egoskin[gpu]'` (Python "
+            "3.11 or later)"
         ) from error
     return WarpPhysics
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import mujoco_warp as mjw  # pyright: ignore[reportMissingImports]
 import torch
@@ -254,7 +255,7 @@ class WarpPhysics(Physics):
             links = [body_id(model, link) for link in self.scene.robot.links]
             joints = model.actuator_trnid[:, 0]
 
-            def scale(name: str, factor: Tensor, which: object = slice(None)) -> None:
+            def scale(name: str, factor: Tensor, which: Any = slice(None)) -> None:
                 own = torch.from_numpy(getattr(model, name)[which]).to(factor)
                 factor = factor.reshape(*factor.shape, *[1] * (own.ndim - 1))
                 values = wp.to_torch(getattr(self._model, name))
