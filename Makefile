@@ -6,7 +6,7 @@ ARGS ?=
 # The policy of `make demo`.
 POLICY ?= field_proximity
 
-.PHONY: train demo test test-slow test-memory verify check bench docs clean
+.PHONY: train demo test test-slow test-warp test-memory verify check bench docs clean
 
 train: $(VENV)/run
 	$(BIN)/python scripts/ppo.py $(ARGS)
@@ -21,6 +21,11 @@ test: $(VENV)/dev
 
 test-slow: $(VENV)/dev
 	$(BIN)/python -m pytest -m slow $(ARGS)
+
+# Engine warp against engine mujoco, without a GPU. Warp compiles first, which it keeps.
+test-warp: $(VENV)/dev
+	$(BIN)/python -m pip install --quiet --editable ".[gpu]"
+	$(BIN)/python -m pytest -m warp -s $(ARGS)
 
 # Half an hour of training: does it grow?
 test-memory: $(VENV)/dev

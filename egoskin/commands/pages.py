@@ -23,6 +23,8 @@ Train a robot to dodge balls by what its skin observes.
   --standard {2,1,paper}  version of the throws; see docs/standard-throw.md
   --seed INT              of everything random (0)
   --total-frames INT      environment steps of the whole run (65536000)
+  --engine {mujoco,warp}  MuJoCo on the CPU; MuJoCo Warp, for --device cuda; see
+                          docs/gpu.md (mujoco)
   --run-dir PATH          folder of the run; else a new one under runs/
   --resume PATH           run folder to go on with, exactly
 
@@ -194,6 +196,7 @@ Measure speed and accuracy.
 
   egoskin bench loop      the training loop, layer by layer [steps/s]
   egoskin bench physics   what the choices of the robot's model cost
+  egoskin bench engine    engine warp against the number of worlds
   egoskin bench sensors   the sensor kernels
   egoskin bench accuracy  the physics rate against a finer one
   egoskin bench gradients --run runs/NAME

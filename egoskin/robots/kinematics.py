@@ -235,7 +235,9 @@ class LinkKinematics:
                 matrices=[
                     torch.from_numpy(x)[..., None].to(joint_pos) for x in self.steps[2:]
                 ],
-                unit=torch.eye(3)[..., None].to(joint_pos),
+                unit=torch.eye(3, dtype=joint_pos.dtype, device=joint_pos.device)[
+                    ..., None
+                ],
                 levels=[(index(x), index(self.steps.parent[x])) for x in self._levels],
                 wanted=index(self.frames),
             )
