@@ -16,7 +16,7 @@ from egoskin.envs.physics import (
     StepResult,
     Variation,
 )
-from egoskin.envs.physics.mujoco import build_scene
+from egoskin.envs.physics.model import build_scene
 
 FAR = 1000.0
 WHOLE = mujoco.mjtState.mjSTATE_INTEGRATION

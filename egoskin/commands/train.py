@@ -48,6 +48,8 @@ def open_run(config: TrainConfig) -> Run:
     config.check_machine()
     if config.log == "wandb":
         check_packages("--log wandb", "wandb", "wandb")
+    if config.engine == "warp":
+        print("MuJoCo Warp: the first start compiles for some minutes", flush=True)
     run = Run.create(config) if config.resume is None else Run(config.resume, config)
     print(
         f"run {run.path}: {config.env.robot_config.name}, {config.env.sensor.label()}, "

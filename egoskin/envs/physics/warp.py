@@ -27,12 +27,12 @@ from egoskin.envs.physics.contract import (
     StepResult,
     Variation,
 )
-from egoskin.envs.physics.mujoco import MAX_SPEED, PARKING, build_scene
+from egoskin.envs.physics.model import MAX_SPEED, PARKING, build_scene
 from egoskin.robots.chains import body_id
 
 SETTING = "EGOSKIN_WARP_CONTACTS"
 """Environment variable: contacts of a robot that there is room for."""
-# Twice what was seen of a robot that falls down flailing.
+# Four times what was seen of a robot that flails on the floor.
 _CONTACTS = 48
 # What may not fit: rows that it harms have a simulation that means nothing.
 _LOST = (
@@ -72,7 +72,8 @@ class WarpPhysics(Physics):
         robot, config = scene.robot, scene.config
         self.scene, self.config, self.num_envs = scene, config, num_envs
         self.device = torch.device(device)
-        wp.config.quiet = True
+        # Not a line for each kernel that is loaded.
+        wp.config.log_level = wp.LOG_WARNING
         self._mujoco, contacts = build_scene(scene), self.num_contacts()
         model = self._mujoco
         # Rows of the constraints: of each contact a pyramid's sides, and of limits.
@@ -143,9 +144,9 @@ class WarpPhysics(Physics):
 
     def _substep(self) -> None:
         """Advance one physics step; on a GPU as one graph of all its kernels."""
-        if self.device.type == "cuda" and self._graph is None:
+        device = wp.device_from_torch(self.device)
+        if self._graph is None and device.is_cuda and device.is_mempool_enabled:
             torch.cuda.synchronize(self.device)
-            device = wp.device_from_torch(self.device)
             with wp.ScopedDevice(device), wp.ScopedCapture() as capture:
                 mjw.step(self._model, self._data)
             self._graph = capture.graph
@@ -181,10 +182,12 @@ class WarpPhysics(Physics):
             if held is not None:
                 self._qpos[:, self._robot_q] = held
                 self._qvel[:, self._robot_v] = 0.0
-        lost = (self._overflow & int(_LOST)) != 0
-        self._overflowed |= lost.any()
         speed = self._qvel[:, self._robot_v].abs().amax(1)
-        finite = self._qpos.isfinite().all(1)
+        # The comparison is also False for NaN.
+        sound = (speed < MAX_SPEED) & self._qpos.isfinite().all(1)
+        lost = (self._overflow & int(_LOST)) != 0
+        # Of a robot that has left physics behind any number may touch.
+        self._overflowed |= (lost & sound).any()
         by_link = None
         if self.scene.link_contacts:
             by_link = found[:, links:].unflatten(-1, (-1, 2)).any(-1)
@@ -195,8 +198,7 @@ class WarpPhysics(Physics):
             link_contact=by_link,
             power=power / self.config.substeps,
             torque_saturation=saturation / self.config.substeps,
-            # The comparison is also False for NaN.
-            diverged=~(speed < MAX_SPEED) | ~finite | lost,
+            diverged=~sound | lost,
         )
 
     def _set_target(self, target: Tensor) -> None:
