@@ -6,6 +6,7 @@ measured figures are in docs/gpu.md.
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import fields, replace
 from importlib.util import find_spec
@@ -415,3 +416,14 @@ def test_a_rollout_reads_nothing_but_a_few_numbers_for_each_step(monkeypatch):
         assert numbers <= 16 * 6
         assert indices <= 16 * 12
         assert learned <= 3 * 20 + 20
+
+
+def test_bench_engine_gives_its_rows(tmp_path: Path):
+    file = tmp_path / "rows.json"
+    args = ("--worlds", "4", "--rounds", "1", "--json", file)
+    succeed("bench", "engine", *args)
+    rows = {row["name"]: row["value"] for row in json.loads(file.read_text())["rows"]}
+    layers = ("physics", "sensors_field", "train_field", "sensors_ray", "train_ray")
+    names = [*layers, "memory_field", "memory_ray"]
+    assert list(rows) == [f"{name}_4" for name in names]
+    assert min(rows.values()) > 0

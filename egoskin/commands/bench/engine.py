@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
 import os
 import statistics
 import time
@@ -60,32 +61,31 @@ def engine_rows(config: EngineBench) -> list[Row]:
 def _rows(config: EngineBench, worlds: int) -> list[Row]:
     """Measure one number of worlds."""
     device, times = device_of(config.device), dict[str, list[float]]()
+    steps = TrainConfig().ppo.rollout_steps
 
-    def measure(name: str, work: Callable[[], object]) -> None:
-        show(f"{worlds} worlds: {name}")
-        _synchronize(device)
-        begin = time.perf_counter()
-        work()
-        _synchronize(device)
-        times.setdefault(name, []).append(time.perf_counter() - begin)
-
-    memory = []
-    for coverage in ("field", "ray"):
-        layers, steps = _layers(coverage, worlds, config.device)
+    def measure(coverage: str) -> Row:
+        layers = _layers(coverage, worlds, config.device)
         # A rollout of each first: kernels compile, and robots are no longer at rest.
         for work in layers.values():
             work()
         for _ in range(config.rounds):
             for name, work in layers.items():
-                measure(name, work)
-        memory.append(
-            Row(
-                name=f"memory_{coverage}_{worlds}",
-                value=_memory(device) / 1e9,
-                unit="GB",
-                ratio=1.0,
-            )
-        )
+                show(f"{worlds} worlds: {name}")
+                _synchronize(device)
+                begin = time.perf_counter()
+                work()
+                _synchronize(device)
+                times.setdefault(name, []).append(time.perf_counter() - begin)
+        name, used = f"memory_{coverage}_{worlds}", _memory(device) / 1e9
+        return Row(name=name, value=used, unit="GB", ratio=1.0)
+
+    memory = []
+    for coverage in ("field", "ray"):
+        memory.append(measure(coverage))
+        # What it took is free before the next takes its own.
+        gc.collect()
+        if device.type == "cuda":
+            torch.cuda.empty_cache()
     show("")
     return [
         Row(
@@ -100,10 +100,8 @@ def _rows(config: EngineBench, worlds: int) -> list[Row]:
     ] + memory
 
 
-def _layers(
-    coverage: str, worlds: int, device: str
-) -> tuple[dict[str, Callable[[], object]], int]:
-    """Return what is measured by name, and its control steps."""
+def _layers(coverage: str, worlds: int, device: str) -> dict[str, Callable[[], object]]:
+    """Return what is measured, a rollout of each, by name."""
     sensor = dataclasses.replace(EnvConfig().sensor, coverage=coverage)
     config = TrainConfig(
         env=EnvConfig(sensor=sensor), engine="warp", device=device, num_envs=worlds
@@ -143,7 +141,7 @@ def _layers(
     layers = {f"sensors_{coverage}": sensors, f"train_{coverage}": rollout}
     if coverage == "field":
         layers = {"physics": physics, **layers}
-    return layers, steps
+    return layers
 
 
 def _synchronize(device: torch.device) -> None:
