@@ -23,8 +23,6 @@ Train a robot to dodge balls by what its skin observes.
   --standard {2,1,paper}  version of the throws; see docs/standard-throw.md
   --seed INT              of everything random (0)
   --total-frames INT      environment steps of the whole run (65536000)
-  --engine {mujoco,warp}  MuJoCo on the CPU; MuJoCo Warp, for --device cuda; see
-                          docs/gpu.md (mujoco)
   --run-dir PATH          folder of the run; else a new one under runs/
   --resume PATH           run folder to go on with, exactly
 
@@ -32,6 +30,7 @@ Train a robot to dodge balls by what its skin observes.
   egoskin train --resume runs/NAME --total-frames 100e6
   egoskin train --config runs/NAME/config.json --seed 2
   egoskin train --film-every 5e6 --log wandb
+  egoskin train --engine warp --device cuda
 """,
     "evaluate": """\
 Play a policy on a fixed set of throws that no training has seen.
