@@ -6,7 +6,8 @@ ARGS ?=
 # The policy of `make view` and `make demo`.
 POLICY ?= field_proximity
 
-.PHONY: train demo view test test-slow test-browser test-memory verify check bench docs clean
+.PHONY: train demo view test test-slow test-browser test-warp test-memory verify check
+.PHONY: bench docs clean
 
 train: $(VENV)/run
 	$(BIN)/python scripts/ppo.py $(ARGS)
@@ -29,6 +30,11 @@ test-slow: $(VENV)/dev
 test-browser: $(VENV)/dev
 	$(BIN)/python -m pip install --quiet --editable ".[browser]"
 	$(BIN)/python -m pytest -m slow -rs tests/viewer/test_web_browser.py $(ARGS)
+
+# Engine warp against engine mujoco, without a GPU. Warp compiles first, which it keeps.
+test-warp: $(VENV)/dev
+	$(BIN)/python -m pip install --quiet --editable ".[gpu]"
+	$(BIN)/python -m pytest -m warp -s $(ARGS)
 
 # Half an hour of training: does it grow?
 test-memory: $(VENV)/dev

@@ -22,6 +22,7 @@ from torchrl.envs import (
 from egoskin.bounds import Interval, check_bounds
 from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
 from egoskin.envs.observations import HideObjects, Oracle, Privileged, Proprioception
+from egoskin.envs.physics import Engine, engine_of
 from egoskin.envs.standards import standard_of
 from egoskin.memory import check_memory, check_shared_memory
 from egoskin.parallel import WorkerPool, default_num_workers
@@ -39,6 +40,8 @@ _MOST_AGENTS, _MOST_WORKERS = 2**20, 1024
 # Memory of the simulation of one agent, and what workers share beside the tensors: it
 # is a page for each tensor at least [bytes].
 _SIMULATION, _SHARED_EXTRA = 12_000, 2**20
+Trainable = WorkerPool | TransformedEnv
+"""All rows of a run: in workers, or in this process."""
 # What the networks read of the transforms' results; the others stay as well.
 _NETWORK_KEYS = ("observation", "privileged_observation", "signal")
 
@@ -117,6 +120,8 @@ def make_worker_env(
     bare: bool = False,
     sparse: bool = False,
     mask: Sequence[str] = (),
+    engine: Engine = "mujoco",
+    device: torch.device | str = "cpu",
 ) -> TransformedEnv:
     """Return the batched environment of one process, with its transforms.
 
@@ -134,10 +139,12 @@ def make_worker_env(
         sparse: Whether to give the state that the sensors read, for the agent's own
             sources, instead of the signal.
         mask: Links whose sensors detect nothing, or `egoskin.sensors.MASK_ALL`.
+        engine: What simulates.
+        device: Where it does, and all tensors are.
 
     Raises:
-        ValueError: If the skin does not fit the robot, or ``sparse`` is asked for with
-            a history, which is one of signals.
+        ValueError: If the skin does not fit the robot, ``sparse`` is asked for with a
+            history, which is one of signals, or the engine is not installed.
     """
     if sparse and config.history > 1:
         raise ValueError(
@@ -157,6 +164,8 @@ def make_worker_env(
         hold=hold,
         # Only who keeps the raw state reads it.
         tactile=keep_raw,
+        engine=engine_of(engine),
+        device=device,
     )
     transforms: list[Transform] = []
     if not bare:
@@ -199,7 +208,7 @@ def make_worker_env(
         between = [key for key in written if key not in {*kept, *raw}]
         unread = [key for key in raw if not (sparse and key in STATE_KEYS)]
         transforms.append(ExcludeTransform(*unread, *between))
-    return TransformedEnv(env, Compose(transforms))
+    return TransformedEnv(env, Compose(transforms).to(env.device))
 
 
 def _state_keys(transform: Transform) -> list[NestedKey]:
@@ -325,11 +334,31 @@ def check_num_workers(
     return num_workers
 
 
-def save_env_state(env: WorkerPool, root: TensorDictBase) -> dict[str, Tensor]:
+def device_of(name: str) -> torch.device:
+    """Return a device by name.
+
+    Raises:
+        ValueError: If there is no such device.
+    """
+    valid = ["cpu", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        device = None
+    if device is None or (
+        device.type != "cpu"
+        and not (device.type == "cuda" and (device.index or 0) < len(valid) - 1)
+    ):
+        raise ValueError(f"no device {name!r} here; available: {', '.join(valid)}")
+    return device
+
+
+def save_env_state(env: Trainable, root: TensorDictBase) -> dict[str, Tensor]:
     """Return the state of all rows, to continue from bit for bit.
 
     Args:
-        env: What `make_env` returned, stepped at least once or reset.
+        env: What `make_env` or `make_worker_env` returned, stepped at least once or
+            reset.
         root: The tensordict the next step would start from.
     """
     return {
@@ -338,16 +367,16 @@ def save_env_state(env: WorkerPool, root: TensorDictBase) -> dict[str, Tensor]:
     }
 
 
-def load_env_state(env: WorkerPool, state: dict[str, Tensor]) -> TensorDictBase:
+def load_env_state(env: Trainable, state: dict[str, Tensor]) -> TensorDictBase:
     """Put an environment into a saved state; return the root tensordict to go on with.
 
     Args:
-        env: A fresh environment of `make_env`, of any number of workers.
+        env: A fresh environment of the same rows, in any number of workers.
         state: What `save_env_state` returned.
     """
     root = env.reset()
     env.load_simulation_state(part("simulation", state))
     for key in root.keys():
-        value = state[f"root/{key}"]
-        root.set(key, value.reshape(root[key].shape).clone())
+        value, own = state[f"root/{key}"], root[key]
+        root.set(key, value.reshape(own.shape).to(own.device, copy=True))
     return root

@@ -16,7 +16,7 @@ from egoskin.envs.physics import (
     StepResult,
     Variation,
 )
-from egoskin.envs.physics.mujoco import build_scene
+from egoskin.envs.physics.model import build_scene
 
 FAR = 1000.0
 WHOLE = mujoco.mjtState.mjSTATE_INTEGRATION
@@ -25,7 +25,14 @@ WHOLE = mujoco.mjtState.mjSTATE_INTEGRATION
 class SimplePhysics(Physics):
     """One `MjData` a row, stepped in turn and inspected contact by contact."""
 
-    def __init__(self, scene: Scene, num_envs: int, *, num_threads: int = 1) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        num_envs: int,
+        *,
+        num_threads: int = 1,
+        device: torch.device | str = "cpu",
+    ) -> None:
         self.scene, robot = scene, scene.robot
         self.model = model = build_scene(scene)
         self.models = [copy.copy(model) for _ in range(num_envs)]

@@ -52,6 +52,7 @@ MUJOCO = {
     "robots.config",
     "robots.own",
     "shapes",
+    "envs.physics.model",
     "envs.physics.mujoco",
     "sensors.skin.mesh_surface",
     "viewer.offscreen",
@@ -130,7 +131,8 @@ def test_the_simulator_is_imported_in_few_places():
 
 def test_only_the_room_of_the_engines_names_one():
     engines = {f"egoskin.{m}" for m in MODULES if m.startswith("envs.physics.")}
-    engines -= {"egoskin.envs.physics.contract", "egoskin.envs.physics.__init__"}
+    shared = ("contract", "model", "__init__")
+    engines -= {f"egoskin.envs.physics.{name}" for name in shared}
     # What measures an engine knows which.
     naming = {m for m in MODULES if engines & imports(m) and ".bench." not in m}
     assert naming == {"envs.physics.__init__"}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -163,10 +164,10 @@ def test_results_that_are_not_one_for_each_key_are_refused(method, given):
         def __init__(self) -> None:
             super().__init__(in_keys=["x"], out_keys=["y"])
 
-        def compute(self, x):
-            return self.wrong("compute", 2 * x)
+        def compute(self, *inputs):
+            return self.wrong("compute", 2 * inputs[0])
 
-        def out_specs(self, spec):
+        def out_specs(self, spec) -> Any:
             return self.wrong("out_specs", spec["x"].clone())
 
         def wrong(self, name, result):

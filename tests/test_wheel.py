@@ -155,7 +155,7 @@ def test_the_wheel_says_who_made_it_for_what_and_what_it_needs(wheel: Path):
     assert told["Author"]
     assert told["License-Expression"] == "MIT"
     assert "which skin makes avoidance easy" in told["Summary"]
-    classifiers = told.get_all("Classifier")
+    classifiers = told.get_all("Classifier") or []
     minor = [c.split("3.")[1] for c in classifiers if "Python :: 3." in c]
     assert minor == ["10", "11", "12", "13"]
     assert told["Requires-Python"] == ">=3.10"

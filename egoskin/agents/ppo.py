@@ -251,14 +251,14 @@ class PPO:
         sums: dict[str, Tensor] = {}
         count = 0
         for _ in range(config.ppo_epochs):
-            order = torch.randperm(len(batch)).to(batch.device or "cpu")
+            order = torch.randperm(len(batch), device=batch.device)
             for index in order.chunk(config.num_mini_batches):
                 for name, value in self.step(batch, index).items():
                     sums[name] = sums.get(name, 0.0) + value
                 count += 1
         metrics = {name: float(value) / count for name, value in sums.items()}
         if config.desired_kl is not None:
-            some = torch.randperm(len(batch))[:_KL_FRAMES].to(batch.device or "cpu")
+            some = torch.randperm(len(batch), device=batch.device)[:_KL_FRAMES]
             metrics["kl"] = self._divergence(batch, some)
             self._adapt_learning_rate(metrics["kl"], config.desired_kl)
         for key, norm in self.agent.norms.items():

@@ -46,7 +46,7 @@ def collect(
     """
     device = agent.head.log_std.device
     shape = (num_steps, root.numel(), len(agent.head.log_std))
-    noise = correlated_noise(shape, noise_correlation).to(device)
+    noise = correlated_noise(shape, noise_correlation, device)
     frames, ended, infos = [], [], []
     for now in noise:
         frame = _act(agent, _readable(agent, root), now)
@@ -69,7 +69,9 @@ def collect(
     return rollout, root, infos
 
 
-def correlated_noise(shape: tuple[int, int, int], correlation: float) -> Tensor:
+def correlated_noise(
+    shape: tuple[int, int, int], correlation: float, device: torch.device | None = None
+) -> Tensor:
     """Return standard normal noise, ``[T, N, J]``, that goes on from step to step.
 
     Each step's action is distributed as with white noise, and has that
@@ -78,8 +80,9 @@ def correlated_noise(shape: tuple[int, int, int], correlation: float) -> Tensor:
     Args:
         shape: Steps, rows, actions.
         correlation: With the noise of the step before; 0 is white.
+        device: Device that draws it, with a generator of its own.
     """
-    noise = torch.randn(shape)
+    noise = torch.randn(shape, device=device)
     if correlation:
         # AR(1), whose variance stays 1.
         noise[1:] *= (1 - correlation**2) ** 0.5

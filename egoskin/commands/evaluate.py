@@ -21,11 +21,12 @@ import tyro
 
 from egoskin.bounds import COUNT, check_bounds
 from egoskin.commands.errors import check_packages
+from egoskin.envs.physics import Engine, engine_of
 from egoskin.evaluation.behaviour import Behaviour, Motion, behave
 from egoskin.evaluation.operating_map import check_map, draw_map, operating_map
 from egoskin.evaluation.perturbations import Perturbed, perturb
 from egoskin.evaluation.throw_set import Estimate, Evaluation, evaluate, standard_task
-from egoskin.make import EnvConfig, check_num_workers
+from egoskin.make import EnvConfig, check_num_workers, device_of
 from egoskin.policies.policy import load_policy
 from egoskin.progress import StatusLine, counted
 from egoskin.rng import check_seed
@@ -66,6 +67,10 @@ class EvaluateConfig:
     perturbed: bool = False
     """Also play on robots that are not their model: other masses, friction, gains and
     torque limits, late actions, pushes (a quarter of the episodes each)."""
+    engine: Engine = "mujoco"
+    """What simulates: MuJoCo on the CPU; MuJoCo Warp on the device (extra gpu)."""
+    device: str = "cpu"
+    """Device of engine warp ("cpu", "cuda", "cuda:1")."""
     json: Path | None = None
     """File to write the figures to."""
 
@@ -78,6 +83,13 @@ class EvaluateConfig:
         if self.map is not None:
             check_path(self.map, PICTURE_SUFFIXES)
             check_packages("--map", "plot", "matplotlib")
+        engine_of(self.engine)
+        if self.engine == "mujoco" and device_of(self.device).type != "cpu":
+            raise ValueError("engine mujoco simulates on the CPU: leave out device")
+        if self.engine == "warp" and (self.behaviour or self.map or self.perturbed):
+            raise ValueError(
+                "behaviour, map and perturbed are played by engine mujoco alone"
+            )
 
     @property
     def masked(self) -> tuple[str, ...]:
@@ -226,6 +238,7 @@ def main(args: list[str]) -> None:
         "mask": config.masked,
         "on_step": on_step,
     }
+    engine: dict[str, Any] = {"engine": config.engine, "device": config.device}
     # What is played many times.
     quarter: dict[str, Any] = {
         "throw_set": config.throw_set,
@@ -238,9 +251,9 @@ def main(args: list[str]) -> None:
     if config.behaviour:
         result, behaviour = behave(policy, env_config, policy.skin, **which)
     else:
-        result = evaluate(policy, env_config, policy.skin, **which)
+        result = evaluate(policy, env_config, policy.skin, **which, **engine)
     if config.check_substeps is not None:
-        checked = evaluate(policy, finer, policy.skin, **which)
+        checked = evaluate(policy, finer, policy.skin, **which, **engine)
     line.finish()
     trained = policy.env_config.standard
     played = trained if config.standard == "run" else config.standard
@@ -251,6 +264,8 @@ def main(args: list[str]) -> None:
     )
     if config.masked:
         title += f", sensors masked: {', '.join(config.masked)}"
+    if config.engine != "mujoco":
+        title += f", engine {config.engine}"
     title += ", physics at "
     age = env_config.task.success_s
     print(table(result, title + physics_rate(env_config), age))
@@ -261,6 +276,8 @@ def main(args: list[str]) -> None:
         "throw_set": config.throw_set,
         "frames": policy.policy_spec.frames,
         "mask": config.masked,
+        "engine": config.engine,
+        "trained_by_engine": policy.policy_spec.engine,
     }
     if behaviour is not None:
         print(behaviour_table(behaviour))

@@ -30,6 +30,7 @@ Train a robot to dodge balls by what its skin observes.
   egoskin train --resume runs/NAME --total-frames 100e6
   egoskin train --config runs/NAME/config.json --seed 2
   egoskin train --film-every 5e6 --log wandb
+  egoskin train --engine warp --device cuda
 """,
     "evaluate": """\
 Play a policy on a fixed set of throws that no training has seen.
@@ -195,6 +196,7 @@ Measure speed and accuracy.
 
   egoskin bench loop      the training loop, layer by layer [steps/s]
   egoskin bench physics   what the choices of the robot's model cost
+  egoskin bench engine    engine warp against the number of worlds
   egoskin bench sensors   the sensor kernels
   egoskin bench accuracy  the physics rate against a finer one
   egoskin bench gradients --run runs/NAME

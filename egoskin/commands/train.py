@@ -48,6 +48,8 @@ def open_run(config: TrainConfig) -> Run:
     config.check_machine()
     if config.log == "wandb":
         check_packages("--log wandb", "wandb", "wandb")
+    if config.engine == "warp":
+        print("MuJoCo Warp: the first start compiles for some minutes", flush=True)
     run = Run.create(config) if config.resume is None else Run(config.resume, config)
     print(
         f"run {run.path}: {config.env.robot_config.name}, {config.env.sensor.label()}, "
@@ -62,13 +64,15 @@ def announce(trainer: Trainer) -> None:
     config, done = trainer.config, trainer.frames
     to_do = max(config.total_frames - done, 0)
     workers = check_num_workers(config.num_envs, config.num_workers)
-    time = ""
-    if to_do > _SOON_DONE:
+    where, time = counted(workers, "worker"), ""
+    if config.engine == "warp":
+        where = f"MuJoCo Warp, {config.device}"
+    elif to_do > _SOON_DONE:
         seconds = estimate_seconds(config, trainer.run.load_skin(), to_do)
         time = f"; here about {_rough_time(seconds)}"
     print(
         f"{to_do:,} frames{f' after {done:,}' if done else ''}: "
-        f"{counted(config.num_envs, 'agent')} on {counted(workers, 'worker')}, "
+        f"{counted(config.num_envs, 'agent')} on {where}, "
         f"learner on {config.device} with "
         f"{counted(config.num_learner_threads, 'thread')}{time}\n"
         f"curves while it trains: tensorboard --logdir {trainer.run.path}",

@@ -28,6 +28,7 @@ class Balls:
         objects: Shape of each of the ``O`` objects.
         num_envs: Number of rows ``B``.
         control_hz: Rate of the control steps [Hz].
+        device: Device of all tensors.
     """
 
     def __init__(
@@ -36,12 +37,14 @@ class Balls:
         objects: Sequence[Shape],
         num_envs: int,
         control_hz: float,
+        device: torch.device,
     ) -> None:
         self.thrower = thrower
         self._hz, self._num_objects = control_hz, len(objects)
-        self._half_height = torch.tensor([shape.half_height for shape in objects])
-        zeros = torch.zeros(num_envs, dtype=torch.int64)
-        flags = torch.zeros(num_envs, len(objects), dtype=torch.bool)
+        heights = [shape.half_height for shape in objects]
+        self._half_height = torch.tensor(heights, device=device)
+        zeros = torch.zeros(num_envs, dtype=torch.int64, device=device)
+        flags = torch.zeros(num_envs, len(objects), dtype=torch.bool, device=device)
         self.state = {
             # Throws so far; age at which the next one is due, and the first.
             "throw": zeros,
@@ -52,8 +55,8 @@ class Balls:
             "is_first": flags.clone(),
             "passed": flags.clone(),
             # First ball, later balls: arrived so far, of which without touching.
-            "arrived": torch.zeros(num_envs, 2),
-            "avoided": torch.zeros(num_envs, 2),
+            "arrived": torch.zeros(num_envs, 2, device=device),
+            "avoided": torch.zeros(num_envs, 2, device=device),
         }
         """Everything that is counted, ``[B, ...]`` each, to be saved and put back."""
 

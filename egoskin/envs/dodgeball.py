@@ -29,7 +29,7 @@ from egoskin.envs.state import STATE, state_spec, state_table
 from egoskin.envs.throws import ThrowConfig, Thrower
 from egoskin.rng import Stream, uniform
 from egoskin.robots.config import RobotConfig
-from egoskin.robots.kinematics import pad_rows, rotate_inverse
+from egoskin.robots.kinematics import axis_vectors, pad_rows, rotate_inverse
 from egoskin.shapes import Shape
 
 
@@ -113,6 +113,7 @@ class DodgeballEnv(EnvBase):
         tactile: Whether to tell which links were touched, the key ``tactile``.
         objects: Shape of what is thrown, by default the balls of the configuration.
         engine: What simulates.
+        device: Where it simulates, and all tensors are.
 
     Raises:
         ValueError: If the robot's base does not float, or a joint is no hinge.
@@ -131,9 +132,11 @@ class DodgeballEnv(EnvBase):
         tactile: bool = True,
         objects: Sequence[Shape] | None = None,
         engine: type[Physics] = DEFAULT_ENGINE,
+        device: torch.device | str = "cpu",
     ) -> None:
         robot.check_floating_base()
-        super().__init__(device="cpu", batch_size=torch.Size([num_envs]))
+        super().__init__(device=device, batch_size=torch.Size([num_envs]))
+        device = self.device
         self.robot, self.config = robot, config
         self._seed, self._num_threads, self._engine = seed, num_threads, engine
         throws = config.throws
@@ -145,22 +148,24 @@ class DodgeballEnv(EnvBase):
             link_contacts=tactile,
             hold=hold,
         )
-        self.thrower = Thrower(throws, robot, config.physics.timestep)
+        self.thrower = Thrower(throws, robot, config.physics.timestep, device)
+        control_hz = config.physics.control_hz
         self.balls = Balls(
-            self.thrower, self.scene.objects, num_envs, config.physics.control_hz
+            self.thrower, self.scene.objects, num_envs, control_hz, device
         )
         self._physics: Physics | None = None
         kp, _ = robot.joint_gains(config.physics.gains)
-        self._default = torch.from_numpy(robot.default_joint_pos).float()
+        self._default = torch.from_numpy(robot.default_joint_pos).float().to(device)
         scale = config.action_scale * robot.torque_limit / kp
-        self._action_scale = torch.from_numpy(scale).float()
-        self._rows = torch.arange(num_envs) + row_offset
-        zeros = torch.zeros(num_envs, dtype=torch.int64)
+        self._action_scale = torch.from_numpy(scale).float().to(device)
+        self._rows = torch.arange(num_envs, device=device) + row_offset
+        self._first_row = row_offset
+        zeros = torch.zeros(num_envs, dtype=torch.int64, device=device)
         self._counters = {
             # The first reset starts episode 0.
             "episode": zeros - 1,
             "step": zeros,
-            "previous_action": torch.zeros(num_envs, len(robot.joints)),
+            "previous_action": torch.zeros(num_envs, len(robot.joints), device=device),
         }
         self.state_rows = [key for key in STATE if tactile or key.name != "tactile"]
         """What it tells: rows of the table of the state."""
@@ -175,18 +180,21 @@ class DodgeballEnv(EnvBase):
             num_envs,
             self._sizes["L"],
             self._sizes["J"],
-            config.physics.control_hz,
+            control_hz,
+            device,
         )
         self._make_specs(num_envs)
 
     def _make_specs(self, n: int) -> None:
-        self.observation_spec = state_spec(self.state_rows, n, self._sizes)
-        self.action_spec = Unbounded(shape=torch.Size((n, self._sizes["J"])))
-        self.reward_spec = Unbounded(shape=torch.Size((n, 1)))
+        on = self.device
+        self.observation_spec = state_spec(self.state_rows, n, self._sizes, on)
+        action = torch.Size((n, self._sizes["J"]))
+        self.action_spec = Unbounded(shape=action, device=on)
+        self.reward_spec = Unbounded(shape=torch.Size((n, 1)), device=on)
         ends = ("done", "terminated", "truncated")
+        end = Binary(shape=torch.Size((n, 1)), dtype=torch.bool, device=on)
         self.done_spec = Composite(
-            {key: Binary(shape=torch.Size((n, 1)), dtype=torch.bool) for key in ends},
-            shape=torch.Size([n]),
+            {key: end.clone() for key in ends}, shape=torch.Size([n]), device=on
         )
 
     @property
@@ -194,7 +202,10 @@ class DodgeballEnv(EnvBase):
         """The simulations, built when first needed (a parent process needs none)."""
         if self._physics is None:
             self._physics = self._engine(
-                self.scene, self.batch_size[0], num_threads=self._num_threads
+                self.scene,
+                self.batch_size[0],
+                num_threads=self._num_threads,
+                device=self.device,
             )
         return self._physics
 
@@ -212,7 +223,7 @@ class DodgeballEnv(EnvBase):
     ) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None:
-            mask = torch.ones(self.batch_size[0], dtype=torch.bool)
+            mask = torch.ones(self.batch_size[0], dtype=torch.bool, device=self.device)
         rows = mask.reshape(-1).nonzero()[:, 0]
         if len(rows):
             self._start_episodes(rows)
@@ -220,9 +231,9 @@ class DodgeballEnv(EnvBase):
         out = self._state_td(self.physics.read())
         for key in self.state_rows:
             if key.of_step:
-                out[key.name] = key.zeros(self.batch_size[0], self._sizes)
+                out[key.name] = key.zeros(self.batch_size[0], self._sizes, self.device)
         for key in self.done_keys:
-            out[key] = torch.zeros(self.batch_size[0], 1, dtype=torch.bool)
+            out[key] = torch.zeros_like(mask).reshape(-1, 1)
         return out
 
     def _start_episodes(self, rows: Tensor) -> None:
@@ -237,7 +248,7 @@ class DodgeballEnv(EnvBase):
         joints = len(self.robot.joints)
         u = uniform(seed, Stream.START, ids, episode, zero, 1 + joints)
         half = math.pi * (u[:, 0] - 0.5)
-        pose = torch.zeros(len(padded), 7)
+        pose = u.new_zeros(len(padded), 7)
         pose[:, 2] = self.robot.default_base_height
         pose[:, 3], pose[:, 6] = half.cos(), half.sin()
         noise = self.config.start_joint_noise * (2 * u[:, 1:] - 1)
@@ -288,10 +299,8 @@ class DodgeballEnv(EnvBase):
             state = self.physics.read()
 
         out = self._state_td(state)
-        gravity_b = rotate_inverse(
-            state.base_pose[:, 3:],
-            state.base_pose.new_tensor([0, 0, -1.0]).expand(len(action), 3),
-        )
+        quat = state.base_pose[:, 3:]
+        gravity_b = rotate_inverse(quat, axis_vectors(quat, 2, -1.0))
         terms = reward_terms(
             self.config.reward,
             gravity_b=gravity_b,
@@ -342,6 +351,7 @@ class DodgeballEnv(EnvBase):
                 "first_throw_step": balls["first_throw_step"][:, None].clone(),
             },
             batch_size=self.batch_size,
+            device=self.device,
         )
 
     def simulation_state(self) -> dict[str, Tensor]:
@@ -358,11 +368,11 @@ class DodgeballEnv(EnvBase):
         Args:
             state: The state of *all* rows of the run; this environment takes its own.
         """
-        mine = slice(int(self._rows[0]), int(self._rows[-1]) + 1)
+        mine = slice(self._first_row, self._first_row + len(self._rows))
         for key, value in self._counted().items():
             value.copy_(state[key][mine])
         if self.config.randomization.varies_robot:
-            rows = torch.arange(len(self._rows))
+            rows = self._rows - self._first_row
             own = self.randomization.variation(*self._draws_of(rows))
             self.physics.vary(rows, own)
         self.physics.load_state(state["physics"][mine])

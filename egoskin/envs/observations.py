@@ -10,7 +10,7 @@ from tensordict import NestedKey
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 
-from egoskin.robots.kinematics import rotate_inverse
+from egoskin.robots.kinematics import axis_vectors, rotate_inverse
 from egoskin.transform import RowTransform
 
 # An approach is looked ahead for this long [s], a pass is told up to this far [m], and
@@ -48,8 +48,8 @@ class Proprioception(RowTransform):
     def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Return the observation, ``[B, 6 + 2 J]`` or ``[B, 6 + 3 J]``."""
         base_pose, base_ang_vel_b, joint_pos, joint_vel, *action = inputs
-        down = base_pose.new_tensor([0.0, 0.0, -1.0]).expand_as(base_ang_vel_b)
-        gravity_b = rotate_inverse(base_pose[:, 3:], down)
+        quat = base_pose[:, 3:]
+        gravity_b = rotate_inverse(quat, axis_vectors(quat, 2, -1.0))
         deviation = joint_pos - self._default.to(joint_pos.dtype)
         parts = (base_ang_vel_b, deviation, joint_vel, gravity_b, *action)
         return (torch.cat(parts, -1),)

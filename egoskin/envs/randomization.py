@@ -71,6 +71,7 @@ class Randomization:
         num_links: Number of links ``L``.
         num_joints: Number of joints ``J``.
         control_hz: Rate of the control steps [Hz].
+        device: Device of all tensors.
     """
 
     def __init__(
@@ -80,14 +81,15 @@ class Randomization:
         num_links: int,
         num_joints: int,
         control_hz: float,
+        device: torch.device,
     ) -> None:
         self.config, self._hz = config, control_hz
         self._links, self._joints = num_links, num_joints
-        zeros = torch.zeros(num_envs, dtype=torch.int64)
+        zeros = torch.zeros(num_envs, dtype=torch.int64, device=device)
         self.state: dict[str, Tensor] = {}
         """What is remembered, ``[B, ...]`` each, to be saved and put back."""
         if most := config.delay_steps[1]:
-            late = torch.zeros(num_envs, most, num_joints)
+            late = torch.zeros(num_envs, most, num_joints, device=device)
             self.state |= {"delay": zeros.clone(), "late_actions": late}
         if config.pushes:
             self.state |= {"push": zeros.clone(), "next_push_step": zeros.clone()}
@@ -157,7 +159,7 @@ class Randomization:
         # A cosine's bits depend on where it stands in a row that is no multiple of 32.
         angle = torch.nn.functional.pad(2 * math.pi * u[:, 1], (0, -n % 32))
         way = torch.stack((angle.cos(), angle.sin()), -1)[:n]
-        velocity = torch.cat((speed[:, None] * way, torch.zeros(n, 1)), -1)
+        velocity = torch.nn.functional.pad(speed[:, None] * way, (0, 1))
         physics.push(rows, velocity)
         self.state["push"][rows] += 1
         self._plan_push(rows, seed, ids, episode)
@@ -168,7 +170,8 @@ class Randomization:
             return action
         all_actions = torch.cat((action[:, None], self.state["late_actions"]), 1)
         self.state["late_actions"].copy_(all_actions[:, :-1])
-        return all_actions[torch.arange(len(action)), self.state["delay"]]
+        rows = torch.arange(len(action), device=action.device)
+        return all_actions[rows, self.state["delay"]]
 
 
 def _between(bounds: tuple[float, float], u: Tensor) -> Tensor:

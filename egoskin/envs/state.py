@@ -45,14 +45,20 @@ class StateKey:
         """Whether nobody outside the worker reads it."""
         return not set(_PARENT) & set(self.read_by)
 
-    def zeros(self, num_envs: int, sizes: Mapping[str, int]) -> Tensor:
+    def zeros(
+        self, num_envs: int, sizes: Mapping[str, int], device: torch.device
+    ) -> Tensor:
         """Return zeros, ``[B, ...]``."""
-        return torch.zeros(self._shape(num_envs, sizes), dtype=self.dtype)
+        shape = self._shape(num_envs, sizes)
+        return torch.zeros(shape, dtype=self.dtype, device=device)
 
-    def spec(self, num_envs: int, sizes: Mapping[str, int]) -> TensorSpec:
+    def spec(
+        self, num_envs: int, sizes: Mapping[str, int], device: torch.device
+    ) -> TensorSpec:
         """Return the spec, ``[B, ...]``."""
         kind = Binary if self.dtype == torch.bool else Unbounded
-        return kind(shape=self._shape(num_envs, sizes), dtype=self.dtype)
+        shape = self._shape(num_envs, sizes)
+        return kind(shape=shape, dtype=self.dtype, device=device)
 
     def _shape(self, num_envs: int, sizes: Mapping[str, int]) -> torch.Size:
         own = (sizes[n] if isinstance(n, str) else n for n in self.shape)
@@ -110,7 +116,10 @@ def keys_read_by(*readers: Reader) -> list[str]:
 
 
 def state_spec(
-    keys: Sequence[StateKey], num_envs: int, sizes: Mapping[str, int]
+    keys: Sequence[StateKey],
+    num_envs: int,
+    sizes: Mapping[str, int],
+    device: torch.device,
 ) -> Composite:
     """Return the spec of an output.
 
@@ -118,9 +127,10 @@ def state_spec(
         keys: Rows of the table.
         num_envs: Number of rows ``B``.
         sizes: What each letter of the shapes stands for.
+        device: Device of the output.
     """
-    specs = {key.name: key.spec(num_envs, sizes) for key in keys}
-    return Composite(specs, shape=torch.Size([num_envs]))
+    specs = {key.name: key.spec(num_envs, sizes, device) for key in keys}
+    return Composite(specs, shape=torch.Size([num_envs]), device=device)
 
 
 def state_table() -> str:

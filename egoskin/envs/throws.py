@@ -19,7 +19,7 @@ from torch import Tensor
 from egoskin.bounds import Interval, check_bounds
 from egoskin.rng import Stream, uniform
 from egoskin.robots.config import RobotConfig
-from egoskin.robots.kinematics import LinkKinematics, rotate
+from egoskin.robots.kinematics import LinkKinematics, axis_vectors, rotate
 from egoskin.robots.surface import sample_surface
 from egoskin.shapes import Sphere
 
@@ -147,14 +147,19 @@ class Thrower:
         config: The throws.
         robot: The robot they are aimed at.
         timestep: Physics time step [s].
+        device: Device of the robots it throws at.
     """
 
     def __init__(
-        self, config: ThrowConfig, robot: RobotConfig, timestep: float
+        self,
+        config: ThrowConfig,
+        robot: RobotConfig,
+        timestep: float,
+        device: torch.device | str = "cpu",
     ) -> None:
         self.config = config
         self._timestep = timestep
-        self._robot = robot
+        self._robot, self._device = robot, device
 
     @cached_property
     def _size(self) -> float:
@@ -175,8 +180,8 @@ class Thrower:
         index = [links.index(robot.links[i]) for i in points.link]
         return (
             LinkKinematics(robot.chain, links),
-            torch.tensor(index),
-            torch.from_numpy(points.position).float(),
+            torch.tensor(index, device=self._device),
+            torch.from_numpy(points.position).float().to(self._device),
         )
 
     def aim_link(self, draw: Draw) -> list[str]:
@@ -279,10 +284,8 @@ class Thrower:
         Returns:
             The balls at release.
         """
-        forward = rotate(
-            base_pose[:, 3:],
-            base_pose.new_tensor([1.0, 0, 0]).expand(len(base_pose), 3),
-        )
+        quat = base_pose[:, 3:]
+        forward = rotate(quat, axis_vectors(quat, 0))
         heading = torch.atan2(forward[:, 1], forward[:, 0])
         bearing = heading + draw.azimuth
         side = torch.stack((bearing.cos(), bearing.sin()), -1)
@@ -339,7 +342,7 @@ class Thrower:
         kinematics, link, local = self._aim_points
         index = self._point_index(draw)
         position, rotation = kinematics.poses_b(joint_pos)
-        row = torch.arange(len(joint_pos)).expand(len(index))
+        row = torch.arange(len(joint_pos), device=index.device).expand(len(index))
         turn, shift = rotation[row, link[index]], position[row, link[index]]
         point_b = (turn * local[index][:, None, :]).sum(-1) + shift
         return base_pose[:, :3] + rotate(base_pose[:, 3:], point_b)

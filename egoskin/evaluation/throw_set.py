@@ -9,8 +9,10 @@ No training meets them (`throw_seed`). All times count from the first throw.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -19,8 +21,10 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
+from torchrl.envs import TransformedEnv
 
-from egoskin.envs.dodgeball import DodgeballConfig
+from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
+from egoskin.envs.physics import Engine
 from egoskin.envs.standards import Standard, evaluation_task
 from egoskin.make import (
     EnvConfig,
@@ -147,6 +151,8 @@ def play_throws(
     mask: Sequence[str] = (),
     on_step: Callable[[int, int], None] | None = None,
     watch: Watch | None = None,
+    engine: Engine = "mujoco",
+    device: torch.device | str = "cpu",
 ) -> Episodes:
     """Return how the episodes of a throw set end.
 
@@ -164,6 +170,8 @@ def play_throws(
         on_step: Called with (steps done, episodes still running).
         watch: Sees every step; the throws are then played in this process, with
             threads instead of workers, and come to the same.
+        engine: What simulates.
+        device: Where engine warp does.
     """
     assert first == 0 or watch is not None
     seed = throw_seed(config, throw_set)
@@ -177,7 +185,7 @@ def play_throws(
         "bare": policy is None and watch is None,
     }
     few = num_workers is None and episodes <= _FEW
-    if watch is None and not few:
+    if engine == "mujoco" and watch is None and not few:
         env = make_env(config, skin, num_workers=num_workers, **shared)
     else:
         threads = check_num_workers(episodes, num_workers)
@@ -187,8 +195,12 @@ def play_throws(
             num_threads=threads,
             row_offset=first,
             keep_raw=watch is not None,
+            engine=engine,
+            device=device,
             **shared,
         )
+    if isinstance(policy, nn.Module) and torch.device(device).type != "cpu":
+        policy = copy.deepcopy(policy).to(device)
     steps = torch.zeros(episodes, dtype=torch.int64)
     running = torch.ones(episodes, dtype=torch.bool)
     causes = ("hit", "fallen", "diverged", "terminated")
@@ -196,12 +208,12 @@ def play_throws(
     balls = {k: torch.zeros(episodes, 2) for k in ("balls_arrived", "balls_avoided")}
     try:
         root: TensorDictBase = env.reset()
-        first_throw = root["first_throw_step"].reshape(-1).clone()
+        first_throw = root["first_throw_step"].reshape(-1).cpu().clone()
         last = config.task.delay_steps + config.task.episode_steps
         for step in range(1, last + 1):
             flat = root.reshape(-1)
             if policy is None:
-                action = torch.zeros(episodes, env.action_spec.shape[-1])
+                action = torch.zeros(env.action_spec.shape, device=env.device)
             else:
                 action = policy(flat)["action"]
                 # MuJoCo would take NaN for zero, and the figures would look ordinary.
@@ -214,7 +226,7 @@ def play_throws(
             data, root = env.step_and_maybe_reset(root)
             following = data["next"]
             assert isinstance(following, TensorDictBase)
-            after = following.reshape(-1)
+            after = following.reshape(-1).cpu()
             if watch is not None:
                 watch(data.exclude("next").reshape(-1), after, running)
             steps[running] = step - first_throw[running]
@@ -228,6 +240,10 @@ def play_throws(
                 on_step(step, int(running.sum()))
             if not running.any():
                 break
+        if isinstance(env, TransformedEnv):
+            assert isinstance(env.base_env, DodgeballEnv)
+            if (note := env.base_env.physics.note()) is not None:
+                print(f"note: {note}", file=sys.stderr)
     finally:
         env.close()
     hit, fallen, diverged, terminated = ends.values()
@@ -303,6 +319,8 @@ def evaluate(
     mask: Sequence[str] = (),
     on_step: Callable[[int, int], None] | None = None,
     watch: Watch | None = None,
+    engine: Engine = "mujoco",
+    device: torch.device | str = "cpu",
 ) -> Evaluation:
     """Return how a policy fares on a throw set, beside the rigid robot.
 
@@ -316,6 +334,8 @@ def evaluate(
         mask: Links whose sensors detect nothing, or `egoskin.sensors.MASK_ALL`.
         on_step: Called with (steps done, episodes still running).
         watch: Sees every step of the policy's episodes, see `play_throws`.
+        engine: What simulates.
+        device: Where engine warp does.
     """
 
     def play(who: Any, hold: bool) -> Episodes:
@@ -330,6 +350,8 @@ def evaluate(
             mask=() if hold else mask,
             on_step=None if hold else on_step,
             watch=None if hold else watch,
+            engine=engine,
+            device=device,
         )
 
     return summarize(play(policy, False), play(None, True), config.task)

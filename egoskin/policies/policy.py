@@ -10,7 +10,7 @@ import copy
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import torch
 from tensordict import TensorDictBase
@@ -20,7 +20,7 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from egoskin.agents.networks import Agent, NetworkConfig
-from egoskin.make import EnvConfig
+from egoskin.make import Engine, EnvConfig
 from egoskin.sensors import Skin
 from egoskin.sparse import SparseSource
 from egoskin.storage.serialization import from_plain, to_plain
@@ -51,6 +51,8 @@ class PolicySpec:
     """Number of actions ``J``."""
     frames: int = 0
     """Environment steps it was trained for."""
+    engine: Engine = "mujoco"
+    """What simulated in its training."""
 
     @classmethod
     def of(
@@ -128,6 +130,7 @@ class PolicySpec:
             "sizes": dict(self.sizes),
             "num_actions": self.num_actions,
             "frames": self.frames,
+            "engine": self.engine,
         }
 
     @classmethod
@@ -149,6 +152,8 @@ class PolicySpec:
             raise ValueError(
                 f"{what} holds no policy: sizes, num_actions and frames must be numbers"
             )
+        if header["engine"] not in get_args(Engine):
+            raise ValueError(f"{what} holds no policy: no engine {header['engine']!r}")
         env = from_plain(EnvConfig, header["env"], what)
         if lacking := set(env.critic_keys) - sizes.keys():
             raise ValueError(f"{what} holds no policy: no size of {min(lacking)!r}")
@@ -163,6 +168,7 @@ class PolicySpec:
             sizes=sizes,
             num_actions=header["num_actions"],
             frames=header["frames"],
+            engine=header["engine"],
         )
 
 

@@ -67,6 +67,21 @@ class Steps(NamedTuple):
     """Of a prismatic joint, ``[n, 3]``."""
 
 
+class _Constants(NamedTuple):
+    """What `LinkKinematics` computes with, of one dtype and on one device."""
+
+    joint: Tensor
+    """Joint of each step."""
+    matrices: list[Tensor]
+    """`Steps` from ``constant`` on, with a last dimension for the batch."""
+    unit: Tensor
+    """Rotation of the base."""
+    levels: list[tuple[Tensor, Tensor]]
+    """Steps of each depth and the frames they start from, from the base on."""
+    wanted: Tensor
+    """Frame of each link."""
+
+
 class LinkKinematics:
     """Positions and rotations of links relative to the base, from joint positions.
 
@@ -123,18 +138,16 @@ class LinkKinematics:
                 for i, shape in enumerate(shapes)
             )
         )
-        # What does not turn turns by the 0 that follows the joints.
-        self._joint = torch.from_numpy(self.steps.joint % (self.num_joints + 1))
-        self._matrices = [torch.from_numpy(x)[..., None] for x in self.steps[2:]]
         depth = [0]
         for parent in self.steps.parent:
             depth.append(depth[parent] + 1)
-        # Steps of each depth and the frames they start from, from the base on.
+        # Steps of each depth, from the base on.
         self._levels = [
-            (torch.from_numpy(level), torch.from_numpy(self.steps.parent[level]))
+            level
             for d in range(1, max(depth) + 1)
             for level in np.nonzero(np.array(depth[1:]) == d)
         ]
+        self._constants: dict[tuple[torch.dtype, torch.device], _Constants] = {}
 
     def reach(self) -> list[float]:
         """Return how far each link's origin can be from the base [m], at most.
@@ -183,18 +196,17 @@ class LinkKinematics:
             ValueError: If J is not the chain's number of joints.
         """
         self.check(joint_pos)
+        own = self._constants_like(joint_pos)
         zero = joint_pos.new_zeros(1, len(joint_pos))
-        joints = torch.cat((joint_pos.t(), zero))[self._joint]
+        joints = torch.cat((joint_pos.t(), zero))[own.joint]
         sin, cos = (x[:, None, None] for x in sincos(joints))
-        constant, by_cos, by_sin, shift, slide = (
-            x.to(joint_pos) for x in self._matrices
-        )
+        constant, by_cos, by_sin, shift, slide = own.matrices
         turn = (constant + by_cos * cos) + by_sin * sin
         way = shift + slide * joints[:, None]
         rotation = joint_pos.new_empty(len(turn) + 1, 3, 3, len(joint_pos))
         position = joint_pos.new_zeros(len(turn) + 1, 3, len(joint_pos))
-        rotation[0] = torch.eye(3)[..., None]
-        for steps, parents in self._levels:
+        rotation[0] = own.unit
+        for steps, parents in own.levels:
             # Sums are written out: a library's product may round differently for
             # another batch.
             x, y, z = rotation[parents].unbind(2)
@@ -206,8 +218,30 @@ class LinkKinematics:
             )
             shifted = x * w[:, :1] + y * w[:, 1:2] + z * w[:, 2:]
             position[steps + 1] = position[parents] + shifted
-        wanted = torch.from_numpy(self.frames)
-        return rotation[wanted].permute(1, 2, 0, 3), position[wanted].transpose(0, 1)
+        turned, moved = rotation[own.wanted], position[own.wanted]
+        return turned.permute(1, 2, 0, 3), moved.transpose(0, 1)
+
+    def _constants_like(self, joint_pos: Tensor) -> _Constants:
+        """Return the tables in the dtype and on the device of joint positions."""
+        kind = joint_pos.dtype, joint_pos.device
+        if kind not in self._constants:
+
+            def index(x: np.ndarray) -> Tensor:
+                return torch.from_numpy(x).to(joint_pos.device)
+
+            self._constants[kind] = _Constants(
+                # What does not turn turns by the 0 that follows the joints.
+                joint=index(self.steps.joint % (self.num_joints + 1)),
+                matrices=[
+                    torch.from_numpy(x)[..., None].to(joint_pos) for x in self.steps[2:]
+                ],
+                unit=torch.eye(3, dtype=joint_pos.dtype, device=joint_pos.device)[
+                    ..., None
+                ],
+                levels=[(index(x), index(self.steps.parent[x])) for x in self._levels],
+                wanted=index(self.frames),
+            )
+        return self._constants[kind]
 
 
 def _frames(chain: pk.Chain) -> list[tuple[pk.Frame, int]]:
@@ -297,6 +331,24 @@ def quat_to_entries(quat: Sequence[Tensor]) -> tuple[Tensor, ...]:
         s * (y * z + w * x),
         1 - s * (x * x + y * y),
     )
+
+
+def axis_vectors(quat: Tensor, axis: int, length: float = 1.0) -> Tensor:
+    """Return the same vector along one axis for each of some quaternions.
+
+    Nothing is copied from the host, as a tensor of Python numbers would be.
+
+    Args:
+        quat: ``[*B, 4]``.
+        axis: 0, 1 or 2.
+        length: Length, negative for the other way.
+
+    Returns:
+        ``[*B, 3]``.
+    """
+    vector = quat.new_zeros(*quat.shape[:-1], 3)
+    vector[..., axis] = length
+    return vector
 
 
 def rotate(quat: Tensor, vector: Tensor) -> Tensor:

@@ -13,8 +13,9 @@ import tyro
 from egoskin.agents.ppo import PPOConfig
 from egoskin.bounds import COUNT, POSITIVE, check_bounds
 from egoskin.envs.dodgeball import DodgeballConfig
+from egoskin.envs.physics import Engine, engine_of
 from egoskin.envs.standards import CUSTOM, Standard, training_task
-from egoskin.make import EnvConfig, check_num_workers
+from egoskin.make import EnvConfig, check_num_workers, device_of
 from egoskin.parallel import available_cores
 from egoskin.rng import check_seed
 from egoskin.storage.formats import present_config, read_sealed
@@ -43,9 +44,13 @@ class TrainConfig:
     num_envs: int = 4096
     """Agents simulated in parallel."""
     num_workers: int | None = None
-    """Processes that simulate; None: the largest divisor of num_envs <= cores."""
+    """Processes that simulate; None: the largest divisor of num_envs <= cores. Engine
+    warp needs none."""
+    engine: Engine = "mujoco"
+    """What simulates: MuJoCo on the CPU; MuJoCo Warp on the device, made for a GPU
+    (extra gpu)."""
     device: str = "cpu"
-    """Device of the learner ("cpu", "cuda", "cuda:1")."""
+    """Device of the learner, and of engine warp ("cpu", "cuda", "cuda:1")."""
     learner_threads: Annotated[int | None, COUNT] = None
     """Threads of the learner; None: one for each core."""
     run_dir: Path | None = None
@@ -72,6 +77,11 @@ class TrainConfig:
         check_bounds(self)
         check_seed(self.seed)
         check_num_workers(self.num_envs, self.num_workers)
+        if self.engine == "warp" and self.num_workers not in (None, 1):
+            raise ValueError(
+                "engine warp simulates all agents in one process: leave out "
+                f"num_workers, got {self.num_workers}"
+            )
         if self.standard is not None and self.env.standard not in (
             self.standard,
             CUSTOM,
@@ -99,8 +109,9 @@ class TrainConfig:
         return self.learner_threads or available_cores()
 
     def check_machine(self) -> None:
-        """Raise ValueError for what this machine lacks: the device."""
+        """Raise ValueError for what this machine lacks: the device, the engine."""
         self.learner_device()
+        engine_of(self.engine)
 
     def learner_device(self) -> torch.device:
         """Return the device of the learner.
@@ -108,19 +119,7 @@ class TrainConfig:
         Raises:
             ValueError: If there is no such device.
         """
-        valid = ["cpu", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]
-        try:
-            device = torch.device(self.device)
-        except RuntimeError:
-            device = None
-        if device is None or (
-            device.type != "cpu"
-            and not (device.type == "cuda" and (device.index or 0) < len(valid) - 1)
-        ):
-            raise ValueError(
-                f"no device {self.device!r} here; available: {', '.join(valid)}"
-            )
-        return device
+        return device_of(self.device)
 
 
 CALL_FIELDS = ("run_dir", "resume", "config", "standard")

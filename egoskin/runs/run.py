@@ -82,6 +82,7 @@ T = TypeVar("T")
 
 _PACKAGES = ("egoskin", "torch", "torchrl", "tensordict", "mujoco", "numpy")
 _PACKAGES += ("pytorch-kinematics", "gymnasium")
+_WARP_PACKAGES = ("mujoco-warp", "warp-lang")
 
 
 # Where a checkpoint keeps the metrics.
@@ -218,6 +219,7 @@ class Run:
             self._starts = starts
         except ValueError as error:
             self._put_aside(self._versions_path, str(error))
+        packages = _PACKAGES + _WARP_PACKAGES * (self.config.engine == "warp")
         self._starts.append(
             {
                 "time": datetime.datetime.now(datetime.timezone.utc).isoformat(),
@@ -225,7 +227,7 @@ class Run:
                 "python": platform.python_version(),
                 "machine": f"{platform.system()} {platform.machine()}",
                 "cores": os.cpu_count(),
-                "packages": {p: package_version(p) for p in _PACKAGES},
+                "packages": {p: package_version(p) for p in packages},
                 "git": git_state(Path(__file__)),
             }
         )
@@ -448,7 +450,8 @@ def _check_fits(config: TrainConfig, skin: Skin) -> None:
         * read
         * config.frames_per_batch,
     }
-    check_fits(one, config.num_envs, others)
+    if config.engine == "mujoco":
+        check_fits(one, config.num_envs, others)
 
 
 def _a(kind: type[T], value: Any, name: str, what: str) -> T:

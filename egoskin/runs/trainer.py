@@ -8,6 +8,7 @@ replaces a checkpoint.
 from __future__ import annotations
 
 import dataclasses
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -18,15 +19,23 @@ from typing import Annotated, Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.envs import TransformedEnv
 
 from egoskin.agents.networks import Agent
 from egoskin.agents.ppo import PPO, NonFiniteError
 from egoskin.agents.rollout import collect
 from egoskin.bounds import NOT_NEGATIVE, POSITIVE, check_bounds
+from egoskin.envs.dodgeball import DodgeballEnv
 from egoskin.envs.rewards import TERMS
 from egoskin.envs.state import keys_read_by
-from egoskin.make import load_env_state, make_env, save_env_state
-from egoskin.parallel import WorkerPool, start_server
+from egoskin.make import (
+    Trainable,
+    load_env_state,
+    make_env,
+    make_worker_env,
+    save_env_state,
+)
+from egoskin.parallel import start_server
 from egoskin.policies.policy import (
     PolicySpec,
     agent_tensors,
@@ -37,6 +46,7 @@ from egoskin.policies.policy import (
     save_policy,
     sparse_sources,
 )
+from egoskin.runs.config import TrainConfig
 from egoskin.runs.films import FilmMaker
 from egoskin.runs.run import Run
 from egoskin.runs.survival import SurvivalCurve
@@ -70,7 +80,7 @@ class Trainer:
 
     Args:
         run: The run to train, with its configuration.
-        env: What `make_env` returned for it.
+        env: What `make_training_env` returned for it.
         skin: The run's skin.
         sources: What computes the keys that the environment does not give.
     """
@@ -78,14 +88,15 @@ class Trainer:
     def __init__(
         self,
         run: Run,
-        env: WorkerPool,
+        env: Trainable,
         skin: Skin,
         sources: Mapping[str, SparseSource],
     ) -> None:
         self.config, self.run, self.env = run.config, run, env
         self.device = self.config.learner_device()
         config = self.config
-        self.spec = PolicySpec.of(config.env, skin, config.ppo.network, env, sources)
+        spec = PolicySpec.of(config.env, skin, config.ppo.network, env, sources)
+        self.spec = dataclasses.replace(spec, engine=config.engine)
         torch.manual_seed(self.config.seed)
         self.agent: Agent = self.spec.build_agent(sources).to(self.device)
         self.ppo = PPO(self.agent, config.ppo, config.num_learner_threads)
@@ -123,6 +134,10 @@ class Trainer:
             path = self.dump(error)
             error.args = (f"{error}\nreplay it with: egoskin replay {path}",)
             raise
+        if isinstance(self.env, TransformedEnv):
+            assert isinstance(self.env.base_env, DodgeballEnv)
+            if (note := self.env.base_env.physics.note()) is not None:
+                print(f"note: {note}", file=sys.stderr)
         end = time.perf_counter()
         self.frames += self.config.frames_per_batch
         self.wall_s += end - start
@@ -131,7 +146,8 @@ class Trainer:
             "time/wall_s": self.wall_s,
             "time/steps_per_s": self.config.frames_per_batch / (end - start),
             "time/collect_share": (collected - start) / (end - start),
-            **self._episode_metrics(TensorDict.maybe_dense_stack(infos)),
+            # Once from the device, for all metrics.
+            **self._episode_metrics(TensorDict.maybe_dense_stack(infos).cpu()),
             **{f"ppo/{name}": value for name, value in learned.items()},
         }
 
@@ -207,7 +223,10 @@ class Trainer:
         self.survival.at_risk.copy_(tensors["survival/at_risk"])
         self.survival.ended.copy_(tensors["survival/ended"])
         self.frames, self.wall_s = progress.frames, progress.wall_s
-        torch.set_rng_state(tensors["random_state"])
+        if self.device.type == "cuda":
+            torch.cuda.set_rng_state(tensors["random_state"], self.device)
+        else:
+            torch.set_rng_state(tensors["random_state"])
 
     def dump(self, error: NonFiniteError) -> Path:
         """Write what `egoskin replay` needs to meet an error again; return where."""
@@ -236,12 +255,15 @@ class Trainer:
 
     def _other_tensors(self) -> dict[str, Tensor]:
         """What else a checkpoint holds: environment, survival, random state."""
+        # Noise and minibatches are drawn where the learner is.
+        random_state = torch.get_rng_state()
+        if self.device.type == "cuda":
+            random_state = torch.cuda.get_rng_state(self.device)
         return {
             **prefixed("env", save_env_state(self.env, self.root)),
             "survival/at_risk": self.survival.at_risk,
             "survival/ended": self.survival.ended,
-            # Noise and minibatches are drawn on the CPU, whatever the device.
-            "random_state": torch.get_rng_state(),
+            "random_state": random_state,
         }
 
     def _spec_now(self) -> PolicySpec:
@@ -268,18 +290,11 @@ def open_trainer(run: Run, num_threads: int = 1) -> Iterator[Trainer]:
         # What cannot be read is told of before the workers start.
         skin = run.load_skin()
         checkpoint = None if run.is_new() else run.load_checkpoint()
-        # It imports while the rest is made.
-        start_server()
+        if config.engine == "mujoco":
+            # It imports while the rest is made.
+            start_server()
         sources = sparse_sources(config.env, skin)
-        env = make_env(
-            config.env,
-            skin,
-            num_envs=config.num_envs,
-            seed=config.seed,
-            num_workers=config.num_workers,
-            num_threads=num_threads,
-            sparse=bool(sources),
-        )
+        env = make_training_env(config, skin, bool(sources), num_threads)
         try:
             trainer = Trainer(run, env, skin, sources)
             if checkpoint is None:
@@ -293,6 +308,40 @@ def open_trainer(run: Run, num_threads: int = 1) -> Iterator[Trainer]:
         finally:
             run.close()
             env.close()
+
+
+def make_training_env(
+    config: TrainConfig, skin: Skin, sparse: bool, num_threads: int = 1
+) -> Trainable:
+    """Return the environment of a training: in workers, or here on the device.
+
+    Args:
+        config: The training.
+        skin: Its skin.
+        sparse: Whether it gives the state instead of the signal.
+        num_threads: Physics threads of each worker.
+
+    Raises:
+        ValueError: As `make_env`, or if the engine cannot make the scene.
+    """
+    shared: dict[str, Any] = {
+        "num_envs": config.num_envs,
+        "seed": config.seed,
+        "sparse": sparse,
+        "num_threads": num_threads,
+    }
+    if config.engine == "mujoco":
+        return make_env(config.env, skin, num_workers=config.num_workers, **shared)
+    env = make_worker_env(
+        config.env,
+        skin,
+        engine=config.engine,
+        device=config.learner_device(),
+        **shared,
+    )
+    assert isinstance(env.base_env, DodgeballEnv)
+    env.base_env.check_scene()
+    return env
 
 
 def train(

@@ -137,6 +137,7 @@ class ProximitySensor(RowTransform):
     _offset: Tensor
     _axes: Tensor
     _range: Tensor
+    _farthest: Tensor
 
     def __init__(
         self,
@@ -186,7 +187,8 @@ class ProximitySensor(RowTransform):
         reach = np.array(self._kinematics.reach())[self._link.numpy()]
         reach += np.linalg.norm(skin.position, axis=-1)
         farthest = float((reach + skin.reach()).max()) + _SLACK
-        self._farthest = [farthest + shape.bounding_radius for shape in self.objects]
+        bounds = [farthest + shape.bounding_radius for shape in self.objects]
+        constant("_farthest", bounds, torch.float64)
         self._kernels: Kernels | None = None
 
     def _use_kernels(self, kind: Literal["field", "ray"], **constants: Any) -> None:
@@ -206,7 +208,7 @@ class ProximitySensor(RowTransform):
             "offset": self._offset[..., 0].t().numpy(),
             "axes": self._axes[..., 0].permute(2, 0, 1).numpy(),
             "range": self._range.numpy(),
-            "farthest": np.array(self._farthest),
+            "farthest": self._farthest.numpy(),
         }
         self._kernels = Kernels(kind, self._kinematics, balls, {**own, **constants})
 
@@ -463,7 +465,7 @@ class ProximitySensor(RowTransform):
         active: Tensor,
     ) -> Tensor:
         """Rows with an active object that may be in range, or with NaN, ``[n]``."""
-        limit = object_pose.new_tensor(self._farthest)
+        limit = self._farthest.to(object_pose.dtype)
         away = (object_pose[..., :3] - base_pose[:, None, :3]).square().sum(-1)
         away = away + self._poison(base_pose, joint_pos, object_pose)
         return (~(away > limit * limit) & active).any(1).nonzero()[:, 0]

@@ -274,8 +274,8 @@ class RaySensor(ProximitySensor):
         """
         if self._kernels is not None and self._kernels.can(*inputs[:3]):
             return self._kernels.hits(inputs)
-        places, readings = [torch.empty(0, dtype=torch.int64)], [inputs[0].new_empty(0)]
         rows = self._rows_in_reach(*inputs)
+        places, readings = [rows.new_empty(0)], [inputs[0].new_empty(0)]
         if not len(rows):
             return places[0], readings[0]
         scene = self.scene(*(x[rows] for x in inputs))
@@ -285,14 +285,8 @@ class RaySensor(ProximitySensor):
             beam = hit % self._num_beams
             places.append(place[hit // self._num_beams] * self._num_beams + beam)
             readings.append(reading.flatten()[hit])
-        place, reading = torch.cat(places).numpy(), torch.cat(readings).numpy()
-        # Those of each object are in order already, which a stable sort uses.
-        order = np.argsort(place, kind="stable")
-        place = place[order]
-        first = np.flatnonzero(np.diff(place, prepend=-1))
-        # Of a beam that hits two objects the nearer counts; NaN stays NaN.
-        least = np.minimum.reduceat(reading[order], first) if len(first) else reading
-        return torch.from_numpy(place[first]), torch.from_numpy(least)
+        found = torch.cat(places), torch.cat(readings)
+        return (_nearest_numpy if rows.is_cpu else _nearest)(*found)
 
 
 class SparseRays:
@@ -308,6 +302,7 @@ class SparseRays:
 
     def __init__(self, sensor: RaySensor, reading: Proximity | Binary) -> None:
         self._sensor, self._reading = sensor, reading
+        self._default = float(reading.signal(torch.full((1, 1), torch.inf)))
         self.size = sensor.readings.numel()
         self.in_keys = [str(key) for key in sensor.in_keys]
 
@@ -315,19 +310,39 @@ class SparseRays:
     def __call__(self, tensordict: TensorDictBase) -> SparseRows:
         """Return the signal of each row ``[B]``, on the device of the tensordict."""
         given = [tensordict[key] for key in self.in_keys]
-        device = given[0].device
-        assert device is not None
-        state = [x.cpu() for x in given]
-        place, distance = self._sensor.hits(*state)
-        nothing = self._reading.signal(distance.new_full((1, 1), torch.inf))
-        counts = torch.bincount(place // self.size, minlength=len(state[0]))
+        for part in (self._sensor, self._reading):
+            part.to(given[0].device)
+        place, distance = self._sensor.hits(*given)
+        counts = torch.bincount(place // self.size, minlength=len(given[0]))
         return SparseRows(
             offsets=offsets_of(counts),
             column=place % self.size,
             value=self._reading.signal(distance[None])[0],
             size=self.size,
-            default=float(nothing),
-        ).to(device)
+            default=self._default,
+        )
+
+
+def _nearest(place: Tensor, reading: Tensor) -> tuple[Tensor, Tensor]:
+    """Return each place once, ascending, with the least of its readings; NaN stays NaN.
+
+    Args:
+        place: Places, ``[n]``.
+        reading: Their readings [m], ``[n]``.
+    """
+    place, group = place.unique(return_inverse=True)
+    least = reading.new_full(place.shape, torch.inf)
+    return place, least.scatter_reduce_(0, group, reading, "amin")
+
+
+def _nearest_numpy(place: Tensor, reading: Tensor) -> tuple[Tensor, Tensor]:
+    """Return what `_nearest` does; NumPy's sort uses that most are in order already."""
+    places, readings = place.numpy(), reading.numpy()
+    order = np.argsort(places, kind="stable")
+    places = places[order]
+    first = np.flatnonzero(np.diff(places, prepend=-1))
+    least = np.minimum.reduceat(readings[order], first) if len(first) else readings
+    return torch.from_numpy(places[first]), torch.from_numpy(least)
 
 
 def _padded(directions: np.ndarray) -> np.ndarray:

@@ -29,10 +29,12 @@ from torch import Tensor
 
 from egoskin.storage.serialization import read_json
 
-FORMAT = 4
+FORMAT = 5
 """Number of the format that is written."""
 _SEAL = ("format", "egoskin", "sha256")
 _ANY = object()
+# What simulated before there was a choice.
+_ENGINE = "mujoco"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,6 +107,7 @@ _MIGRATIONS = {
             },
         },
     ),
+    4: Migration(added={"engine": _ENGINE}),
 }
 assert _MIGRATIONS.keys() == set(range(1, FORMAT))
 
@@ -251,7 +254,7 @@ def migrate(
         for name, value in _MIGRATIONS[step].added.items():
             *path, key = name.split(".")
             # A part of a configuration gets what belongs to it.
-            if path[0] in config:
+            if path[0] in config if path else {"env", "ppo"} <= config.keys():
                 inner = _object(config, path, make=True)
                 inner.setdefault(key, copy.copy(value))
     return config, retired
@@ -293,4 +296,6 @@ def present_header(header: Mapping[str, Any], number: int, what: str) -> dict[st
     policy = header.get("policy")
     if isinstance(policy, dict) and "env" in policy:
         policy["env"] = present_config({"env": policy["env"]}, number, what)["env"]
+        if number < 5:
+            policy.setdefault("engine", _ENGINE)
     return header

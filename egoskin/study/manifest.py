@@ -45,7 +45,7 @@ Overrides = Mapping[str, Any]
 """Values by the dotted names of fields, as on the command line: ``sensor.range``."""
 
 # What a study decides by itself, and what all its cells share.
-_NOT_OF_A_STUDY = MACHINE_FIELDS | {"seed", "total_frames", "device"}
+_NOT_OF_A_STUDY = MACHINE_FIELDS | {"seed", "total_frames", "device", "engine"}
 _OF_ALL_CELLS = {"snapshot_frames", "checkpoint_interval"}
 # What names a cell already.
 _LABEL = ("env.sensor.coverage", "env.sensor.signal", "env.sensor.range")

@@ -16,7 +16,7 @@ import egoskin
 from calling import BATCH, SMALL, fail, succeed
 from egoskin.agents.networks import NetworkConfig, input_keys
 from egoskin.envs.physics.contract import Scene
-from egoskin.envs.physics.mujoco import build_scene
+from egoskin.envs.physics.model import build_scene
 from egoskin.make import EnvConfig, make_worker_env
 from egoskin.policies.export import (
     METADATA,

@@ -15,7 +15,7 @@ from tensordict import TensorDict
 
 from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
 from egoskin.envs.physics import PhysicsConfig, Scene
-from egoskin.envs.physics.mujoco import build_scene
+from egoskin.envs.physics.model import build_scene
 from egoskin.robots.config import H1_2, RobotConfig, read_robot
 from egoskin.robots.kinematics import LinkKinematics
 from egoskin.robots.surface import default_frames, distance_to

@@ -320,6 +320,22 @@ def test_a_migration_leaves_alone_what_is_there_and_makes_no_parts():
     assert migrate(now, FORMAT) == (now, {})
 
 
+def test_a_run_of_format_4_was_simulated_by_mujoco(run: Path, monkeypatch):
+    config, checkpoint = run / "config.json", run / "checkpoint.safetensors"
+    content, _ = read_sealed(config)
+    tensors, header = load_tensors(checkpoint)
+    for part in (content, header["config"], header["policy"]):
+        assert part.pop("engine") == "mujoco"
+    with monkeypatch.context() as patch:
+        patch.setattr("egoskin.storage.formats.FORMAT", 4)
+        config.write_bytes(sealed_json(content))
+        save_tensors(checkpoint, tensors, header)
+    assert read_sealed(config)[1] == 4
+    resume(run)
+    assert Run.open(run).config.engine == "mujoco"
+    assert egoskin.load_policy(run).policy_spec.engine == "mujoco"
+
+
 @pytest.mark.parametrize(
     ("name", "gone", "effect"),
     [

@@ -3,6 +3,7 @@
 egoskin bench loop --json loop.json
 egoskin bench sensors
 egoskin bench physics
+egoskin bench engine --device cuda
 egoskin bench accuracy
 egoskin bench gradients --run runs/NAME
 egoskin bench gymnasium
@@ -11,6 +12,7 @@ egoskin bench gymnasium
 from __future__ import annotations
 
 from egoskin.commands.bench.accuracy import AccuracyBench, accuracy_rows
+from egoskin.commands.bench.engine import EngineBench, engine_rows
 from egoskin.commands.bench.gradients import GradientBench, gradient_rows
 from egoskin.commands.bench.gymnasium import GymnasiumBench, gymnasium_rows
 from egoskin.commands.bench.loop import LoopConfig, loop
@@ -26,6 +28,7 @@ def main(args: list[str]) -> None:
     benches = {
         "loop": LoopConfig,
         "physics": PhysicsBench,
+        "engine": EngineBench,
         "sensors": SensorBench,
         "accuracy": AccuracyBench,
         "gradients": GradientBench,
@@ -37,6 +40,8 @@ def main(args: list[str]) -> None:
         rows = loop(config)
     elif isinstance(config, PhysicsBench):
         rows = physics_rows(config)
+    elif isinstance(config, EngineBench):
+        rows = engine_rows(config)
     elif isinstance(config, AccuracyBench):
         rows = accuracy_rows(config)
     elif isinstance(config, GradientBench):

@@ -12,7 +12,7 @@ import torch
 
 from egoskin.commands.bench.report import Row, show
 from egoskin.envs.physics import OBJECT_MASS, PhysicsConfig, Scene
-from egoskin.envs.physics.mujoco import build_scene
+from egoskin.envs.physics.model import build_scene
 from egoskin.envs.throws import Release, ThrowConfig, Thrower
 from egoskin.make import EnvConfig
 from egoskin.robots.config import RobotConfig

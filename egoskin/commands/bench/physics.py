@@ -14,7 +14,8 @@ import torch
 from egoskin.bounds import COUNT, check_bounds
 from egoskin.commands.bench.report import Row, show
 from egoskin.envs.physics import PhysicsConfig, Scene
-from egoskin.envs.physics.mujoco import MujocoPhysics, build_scene
+from egoskin.envs.physics.model import build_scene
+from egoskin.envs.physics.mujoco import MujocoPhysics
 from egoskin.envs.throws import ThrowConfig
 from egoskin.make import EnvConfig
 

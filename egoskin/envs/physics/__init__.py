@@ -1,5 +1,9 @@
 """Physics: what an engine must do (`contract`), and the engines, a file each."""
 
+from __future__ import annotations
+
+from typing import Literal
+
 from egoskin.envs.physics.contract import (
     OBJECT_MASS,
     Physics,
@@ -11,16 +15,39 @@ from egoskin.envs.physics.contract import (
 )
 from egoskin.envs.physics.mujoco import MujocoPhysics
 
+Engine = Literal["mujoco", "warp"]
+"""Engines by name: MuJoCo on the CPU; MuJoCo Warp, on a GPU or, slowly, on the CPU."""
 DEFAULT_ENGINE: type[Physics] = MujocoPhysics
 """What simulates unless another engine is asked for."""
+
+
+def engine_of(name: Engine) -> type[Physics]:
+    """Return an engine.
+
+    Raises:
+        ValueError: If its package is not installed.
+    """
+    if name == "mujoco":
+        return MujocoPhysics
+    try:
+        from egoskin.envs.physics.warp import WarpPhysics
+    except ModuleNotFoundError as error:
+        raise ValueError(
+            f"engine warp needs {error.name}: `pip install 'egoskin[gpu]'` (Python "
+            "3.11 or later)"
+        ) from error
+    return WarpPhysics
+
 
 __all__ = [
     "DEFAULT_ENGINE",
     "OBJECT_MASS",
+    "Engine",
     "Physics",
     "PhysicsConfig",
     "PhysicsState",
     "Scene",
     "StepResult",
     "Variation",
+    "engine_of",
 ]

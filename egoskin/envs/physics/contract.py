@@ -1,10 +1,10 @@
 """What a physics engine must do: a batch of simulations of one robot and some objects.
 
 An engine is one class, `Physics`, in a file of its own. The environment knows this file
-alone. Every tensor is on the CPU; all that an engine returns are copies, float32 unless
-said otherwise, and rows are named by int64 indices. ``B`` rows, ``J`` joints, ``L``
-links, ``O`` objects; quaternions are (w, x, y, z), unit; suffix ``_w`` world, ``_b``
-base frame.
+alone. Every tensor is on the engine's device; all that an engine returns are copies,
+float32 unless said otherwise, and rows are named by int64 indices. ``B`` rows, ``J``
+joints, ``L`` links, ``O`` objects; quaternions are (w, x, y, z), unit; suffix ``_w``
+world, ``_b`` base frame.
 
 The world is a floor at height 0, the robot, and objects that touch the robot alone (not
 the floor, nor each other) and never turn: their quaternion stays (1, 0, 0, 0).
@@ -27,6 +27,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
+import torch
 from torch import Tensor
 
 from egoskin.bounds import Interval, check_bounds
@@ -141,13 +142,22 @@ class Physics(ABC):
         scene: What is simulated.
         num_envs: Number of rows ``B``.
         num_threads: Threads that step the rows; results do not depend on it.
+        device: Where they are simulated, and all tensors are.
 
     Raises:
-        ValueError: If the scene holds what the engine cannot simulate.
+        ValueError: If the scene holds what the engine cannot simulate, or it cannot on
+            this device.
     """
 
     @abstractmethod
-    def __init__(self, scene: Scene, num_envs: int, *, num_threads: int = 1) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        num_envs: int,
+        *,
+        num_threads: int = 1,
+        device: torch.device | str = "cpu",
+    ) -> None:
         """Build the simulations; no row is defined until it is reset."""
 
     @abstractmethod
@@ -203,6 +213,13 @@ class Physics(ABC):
     @abstractmethod
     def read(self, rows: Tensor | None = None) -> PhysicsState:
         """Return the state of some rows ``[n]``, which may repeat, or of all."""
+
+    def note(self) -> str | None:
+        """Say what limited the simulations since this was asked last, and the cure.
+
+        Asked once in a rollout. None if nothing did.
+        """
+        return None
 
     @abstractmethod
     def state(self) -> Tensor:

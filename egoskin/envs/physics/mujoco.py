@@ -13,127 +13,14 @@ import torch
 from torch import Tensor
 
 from egoskin.envs.physics.contract import (
-    OBJECT_MASS,
     Physics,
     PhysicsState,
     Scene,
     StepResult,
     Variation,
 )
+from egoskin.envs.physics.model import MAX_SPEED, PARKING, build_scene
 from egoskin.robots.chains import body_id
-
-# Contact bits of the model files: geoms listen to balls (1) and to the floor (2);
-# every further bit is self-collision. Objects and floor listen to nothing.
-_BALL_BIT, _FLOOR_BIT = 1, 2
-# Most Newton iterations of a physics step; a fall seldom needs as many.
-_SOLVER_ITERATIONS = 10
-# Inactive objects wait here, far above everything [m].
-_PARKING = np.array([0.0, 0.0, 1000.0])
-# A faster robot than this has left physics behind: the row is reset and counted.
-_MAX_SPEED = 200.0
-
-
-def build_scene(scene: Scene) -> mujoco.MjModel:
-    """Return the compiled model of a robot on a floor with objects to throw.
-
-    Position actuators carry the PD law, evaluated in every substep.
-
-    Args:
-        scene: What is in it; the robot's MJCF holds no floor, actuators or sensors.
-
-    Raises:
-        ValueError: If the robot's base does not float, or a joint is no hinge.
-    """
-    robot, config = scene.robot, scene.config
-    robot.check_floating_base()
-    spec = robot.spec()
-    option = spec.option
-    option.timestep = config.timestep
-    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
-    # Dense: MuJoCo 4.0.0's Newton solver can be wrong with a sparse Jacobian.
-    option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
-    option.iterations = _SOLVER_ITERATIONS
-
-    spec.worldbody.add_geom(
-        name="floor",
-        type=mujoco.mjtGeom.mjGEOM_PLANE,
-        size=[0, 0, 1],
-        contype=_FLOOR_BIT,
-        conaffinity=0,
-    )
-    # Slides instead of a free joint: what ends an episode by its touch need not turn,
-    # three degrees of freedom fewer; and one common parent lets a contact sensor name
-    # all objects.
-    shelf = spec.worldbody.add_body(name="objects")
-    axes = ([1, 0, 0], [0, 1, 0], [0, 0, 1])
-    for i, shape in enumerate(scene.objects):
-        body = shelf.add_body(
-            name=f"object_{i}", gravcomp=float(scene.weightless_objects)
-        )
-        for axis, letter in zip(axes, "xyz", strict=True):
-            body.add_joint(
-                name=f"object_{i}_{letter}",
-                type=mujoco.mjtJoint.mjJNT_SLIDE,
-                axis=axis,
-            )
-        shape.add_geom(
-            body,
-            name=f"object_{i}",
-            mass=OBJECT_MASS,
-            contype=_BALL_BIT,
-            conaffinity=0,
-            rgba=[0.9, 0.35, 0.1, 1],
-        )
-
-    kp, kd = robot.joint_gains(config.gains)
-    for name, p, d, limit in zip(robot.joints, kp, kd, robot.torque_limit, strict=True):
-        actuator = spec.add_actuator(
-            name=name,
-            trntype=mujoco.mjtTrn.mjTRN_JOINT,
-            target=name,
-            gaintype=mujoco.mjtGain.mjGAIN_FIXED,
-            biastype=mujoco.mjtBias.mjBIAS_AFFINE,
-            forcelimited=True,
-            forcerange=[-limit, limit],
-        )
-        actuator.gainprm[0] = p
-        actuator.biasprm[1:3] = -p, -d
-    _add_contact_sensors(spec, scene)
-    try:
-        return spec.compile()
-    except (ValueError, mujoco.FatalError) as error:
-        text = " ".join(str(error).split())
-        raise ValueError(f"MuJoCo cannot make the scene: {text}") from error
-
-
-def _add_contact_sensors(spec: mujoco.MjSpec, scene: Scene) -> None:
-    """Add counts of contacts in the order that `MujocoPhysics.step` reads them."""
-    body, subtree = mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_XBODY
-    robot, floor = (subtree, scene.robot.base), (mujoco.mjtObj.mjOBJ_GEOM, "floor")
-    objects = [(body, f"object_{i}") for i in range(len(scene.objects))]
-
-    def add(obj: tuple, ref: tuple) -> None:
-        sensor = spec.add_sensor(
-            type=mujoco.mjtSensor.mjSENS_CONTACT,
-            objtype=obj[0],
-            objname=obj[1],
-            reftype=ref[0],
-            refname=ref[1],
-        )
-        # intprm: data fields (bit 0: found), reduction (0: none), slots.
-        sensor.intprm[:3] = 1, 0, 1
-
-    for thrown in objects:
-        add(robot, thrown)
-    add(robot, robot)
-    add(robot, floor)
-    for foot in scene.robot.feet:
-        add((body, foot), floor)
-    if scene.link_contacts:
-        for link in scene.robot.links:
-            add((body, link), (subtree, "objects"))
-            add((body, link), floor)
 
 
 class MujocoPhysics(Physics):
@@ -143,6 +30,7 @@ class MujocoPhysics(Physics):
         scene: What is simulated.
         num_envs: Number of rows ``B``.
         num_threads: Threads that step the rows; results do not depend on it.
+        device: The CPU.
         model: The compiled scene, by default that of `build_scene`.
     """
 
@@ -152,8 +40,11 @@ class MujocoPhysics(Physics):
         num_envs: int,
         *,
         num_threads: int = 1,
+        device: torch.device | str = "cpu",
         model: mujoco.MjModel | None = None,
     ) -> None:
+        if torch.device(device).type != "cpu":
+            raise ValueError(f"engine mujoco simulates on the CPU, not on {device}")
         robot, config = scene.robot, scene.config
         self.model = build_scene(scene) if model is None else model
         self.scene, self.config = scene, config
@@ -208,7 +99,7 @@ class MujocoPhysics(Physics):
                 self._qvel[:, self._robot_v] = 0.0
         speed = np.abs(self._qvel[:, self._robot_v]).max(1)
         # The comparison is also False for NaN.
-        diverged = errors | (self._failure_count() > warnings) | ~(speed < _MAX_SPEED)
+        diverged = errors | (self._failure_count() > warnings) | ~(speed < MAX_SPEED)
         contact = torch.from_numpy(found)
         by_link = None
         if self.scene.link_contacts:
@@ -268,7 +159,7 @@ class MujocoPhysics(Physics):
     def park(self, objects: Tensor) -> None:
         """Take objects out of play, ``[B, O]`` bool: they wait at rest far above."""
         parked = objects.numpy()
-        self._objects(self._object_q)[parked] = _PARKING
+        self._objects(self._object_q)[parked] = PARKING
         self._objects(self._object_v)[parked] = 0.0
 
     def step_raw(self) -> None:
@@ -281,7 +172,7 @@ class MujocoPhysics(Physics):
         self._batch.reset(which, stage=mujoco.mjtStage.mjSTAGE_NONE)
         robot = torch.cat((base_pose, joint_pos), -1).double().numpy()
         self._qpos[which, self._robot_q] = robot
-        self._qpos[which, self._object_q] = np.tile(_PARKING, self.num_objects)
+        self._qpos[which, self._object_q] = np.tile(PARKING, self.num_objects)
         if self.config.target_velocity == "finite_difference":
             self._last_target[rows] = joint_pos
 

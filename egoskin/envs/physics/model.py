@@ -1,0 +1,121 @@
+"""The MuJoCo model of a scene, which every engine of MuJoCo's family simulates."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from egoskin.envs.physics.contract import OBJECT_MASS, Scene
+
+# Contact bits of the model files: geoms listen to balls (1) and to the floor (2);
+# every further bit is self-collision. Objects and floor listen to nothing.
+_BALL_BIT, _FLOOR_BIT = 1, 2
+# Most Newton iterations of a physics step; a fall seldom needs as many.
+_SOLVER_ITERATIONS = 10
+PARKING = np.array([0.0, 0.0, 1000.0])
+"""Where inactive objects wait, far above everything [m]."""
+MAX_SPEED = 200.0
+"""A faster robot than this has left physics behind: the row is reset and counted."""
+
+
+def build_scene(scene: Scene) -> mujoco.MjModel:
+    """Return the compiled model of a robot on a floor with objects to throw.
+
+    Position actuators carry the PD law, evaluated in every substep.
+
+    Args:
+        scene: What is in it; the robot's MJCF holds no floor, actuators or sensors.
+
+    Raises:
+        ValueError: If the robot's base does not float, or a joint is no hinge.
+    """
+    robot, config = scene.robot, scene.config
+    robot.check_floating_base()
+    spec = robot.spec()
+    option = spec.option
+    option.timestep = config.timestep
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
+    # Dense: MuJoCo 4.0.0's Newton solver can be wrong with a sparse Jacobian.
+    option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    option.iterations = _SOLVER_ITERATIONS
+
+    spec.worldbody.add_geom(
+        name="floor",
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=[0, 0, 1],
+        contype=_FLOOR_BIT,
+        conaffinity=0,
+    )
+    # Slides instead of a free joint: what ends an episode by its touch need not turn,
+    # three degrees of freedom fewer; and one common parent lets a contact sensor name
+    # all objects.
+    shelf = spec.worldbody.add_body(name="objects")
+    axes = ([1, 0, 0], [0, 1, 0], [0, 0, 1])
+    for i, shape in enumerate(scene.objects):
+        body = shelf.add_body(
+            name=f"object_{i}", gravcomp=float(scene.weightless_objects)
+        )
+        for axis, letter in zip(axes, "xyz", strict=True):
+            body.add_joint(
+                name=f"object_{i}_{letter}",
+                type=mujoco.mjtJoint.mjJNT_SLIDE,
+                axis=axis,
+            )
+        shape.add_geom(
+            body,
+            name=f"object_{i}",
+            mass=OBJECT_MASS,
+            contype=_BALL_BIT,
+            conaffinity=0,
+            rgba=[0.9, 0.35, 0.1, 1],
+        )
+
+    kp, kd = robot.joint_gains(config.gains)
+    for name, p, d, limit in zip(robot.joints, kp, kd, robot.torque_limit, strict=True):
+        actuator = spec.add_actuator(
+            name=name,
+            trntype=mujoco.mjtTrn.mjTRN_JOINT,
+            target=name,
+            gaintype=mujoco.mjtGain.mjGAIN_FIXED,
+            biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+            forcelimited=True,
+            forcerange=[-limit, limit],
+        )
+        actuator.gainprm[0] = p
+        actuator.biasprm[1:3] = -p, -d
+    _add_contact_sensors(spec, scene)
+    try:
+        return spec.compile()
+    except (ValueError, mujoco.FatalError) as error:
+        text = " ".join(str(error).split())
+        raise ValueError(f"MuJoCo cannot make the scene: {text}") from error
+
+
+def _add_contact_sensors(spec: mujoco.MjSpec, scene: Scene) -> None:
+    """Add counts of contacts in the order that an engine's step reads them."""
+    body, subtree = mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_XBODY
+    robot, floor = (subtree, scene.robot.base), (mujoco.mjtObj.mjOBJ_GEOM, "floor")
+    objects = [(body, f"object_{i}") for i in range(len(scene.objects))]
+
+    def add(obj: tuple, ref: tuple) -> None:
+        sensor = spec.add_sensor(
+            type=mujoco.mjtSensor.mjSENS_CONTACT,
+            objtype=obj[0],
+            objname=obj[1],
+            reftype=ref[0],
+            refname=ref[1],
+        )
+        # intprm: data fields (bit 0: found), reduction (0: none), slots.
+        sensor.intprm[:3] = 1, 0, 1
+
+    for thrown in objects:
+        add(robot, thrown)
+    add(robot, robot)
+    add(robot, floor)
+    for foot in scene.robot.feet:
+        add((body, foot), floor)
+    if scene.link_contacts:
+        for link in scene.robot.links:
+            add((body, link), (subtree, "objects"))
+            add((body, link), floor)

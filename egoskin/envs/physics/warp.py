@@ -1,0 +1,316 @@
+"""The engine on MuJoCo Warp: all rows on one device, made for an NVIDIA GPU.
+
+Contract: that of `egoskin.envs.physics.contract`, with float32 inside. PyTorch's
+tensors are views of Warp's arrays: nothing is copied to the host. `WarpPhysics.note`
+says that contacts did not fit into Warp's fixed buffers; the rows that may be harmed
+count as diverged.
+
+Warp's CPU device computes the same, slowly: it is there for tests.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import mujoco_warp as mjw  # pyright: ignore[reportMissingImports]
+import torch
+import warp as wp  # pyright: ignore[reportMissingImports]
+from torch import Tensor
+
+from egoskin.envs.physics.contract import (
+    Physics,
+    PhysicsState,
+    Scene,
+    StepResult,
+    Variation,
+)
+from egoskin.envs.physics.model import MAX_SPEED, PARKING, build_scene
+from egoskin.robots.chains import body_id
+
+SETTING = "EGOSKIN_WARP_CONTACTS"
+"""Environment variable: contacts of a robot that there is room for."""
+# Four times what was seen of a robot that flails on the floor.
+_CONTACTS = 48
+# What may not fit: rows that it harms have a simulation that means nothing.
+_LOST = (
+    mjw.OverflowType.NEFC
+    | mjw.OverflowType.NJMAX_NNZ
+    | mjw.OverflowType.BROADPHASE
+    | mjw.OverflowType.NARROWPHASE
+    | mjw.OverflowType.CCD
+    | mjw.OverflowType.CONTACT_MATCH
+)
+# What a variation gives rows of their own, and what MuJoCo works out from it.
+_VARIED = (
+    *("body_mass", "body_inertia", "geom_friction", "jnt_actfrcrange"),
+    *("actuator_gainprm", "actuator_biasprm", "actuator_forcerange"),
+    *("body_subtreemass", "body_invweight0", "dof_invweight0", "actuator_acc0"),
+)
+
+
+class WarpPhysics(Physics):
+    """Simulations of a scene on one device; see `Physics`.
+
+    Args:
+        scene: What is simulated.
+        num_envs: Number of rows ``B``.
+        num_threads: Without effect.
+        device: A CUDA device, or the CPU.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        num_envs: int,
+        *,
+        num_threads: int = 1,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        robot, config = scene.robot, scene.config
+        self.scene, self.config, self.num_envs = scene, config, num_envs
+        self.device = torch.device(device)
+        # Not a line for each kernel that is loaded.
+        wp.config.log_level = wp.LOG_WARNING
+        self._mujoco, contacts = build_scene(scene), self.num_contacts()
+        model = self._mujoco
+        # Rows of the constraints: of each contact a pyramid's sides, and of limits.
+        sides = max(2 * (int(model.geom_condim.max()) - 1), 1)
+        others = int(model.jnt_limited.sum() + (model.dof_frictionloss > 0).sum())
+        others += 6 * model.neq + model.ntendon
+        with self._in_order():
+            try:
+                self._model = self._put_model()
+                self._data = data = mjw.make_data(
+                    model,
+                    nworld=num_envs,
+                    nconmax=contacts,
+                    njmax=sides * contacts + others,
+                )
+            except (NotImplementedError, ValueError) as error:
+                text = " ".join(str(error).split())
+                raise ValueError(
+                    f"MuJoCo Warp cannot make the scene: {text}"
+                ) from error
+        self._qpos, self._qvel = wp.to_torch(data.qpos), wp.to_torch(data.qvel)
+        self._ctrl = wp.to_torch(data.ctrl)
+        self._warmstart = wp.to_torch(data.qacc_warmstart)
+        self._counts = wp.to_torch(data.sensordata)
+        self._torque = wp.to_torch(data.actuator_force)
+        self._overflow = wp.to_torch(data.overflow)
+        self._torque_limit = wp.to_torch(self._model.actuator_forcerange)[..., 1]
+        self._overflowed = torch.zeros((), dtype=torch.bool, device=self.device)
+        self._graph = None
+        num_joints = len(robot.joints)
+        kp, kd = robot.joint_gains(config.gains)
+        self._kd_over_kp = torch.from_numpy(kd / kp).float().to(self.device)
+        self._last_target = torch.zeros_like(self._ctrl)
+        self._robot_q, self._robot_v = slice(0, 7 + num_joints), slice(6 + num_joints)
+        # Views, [B, O, 3].
+        self._object_pos = self._qpos[:, 7 + num_joints :].unflatten(-1, (-1, 3))
+        self._object_vel = self._qvel[:, 6 + num_joints :].unflatten(-1, (-1, 3))
+
+    @staticmethod
+    def num_contacts() -> int:
+        """Return how many contacts of a robot there is room for.
+
+        Raises:
+            ValueError: If the environment variable holds no such number.
+        """
+        text = os.environ.get(SETTING, str(_CONTACTS))
+        if not (text.isdecimal() and int(text)):
+            raise ValueError(f"{SETTING} must be a number of contacts, got {text!r}")
+        return int(text)
+
+    def _put_model(self, **options: object) -> mjw.Model:
+        model = mjw.put_model(self._mujoco, **options)
+        # `note` says so; and more iterations than the model's are none that is lost.
+        model.opt.warn_overflow = 0
+        model.opt.contact_sensor_maxmatch = self.num_contacts()
+        return model
+
+    @contextmanager
+    def _in_order(self) -> Iterator[None]:
+        """Let Warp work on this device, after what PyTorch was told before."""
+        if self.device.type == "cpu":
+            with wp.ScopedDevice("cpu"):
+                yield
+        else:
+            stream = torch.cuda.current_stream(self.device)
+            with wp.ScopedStream(wp.stream_from_torch(stream), sync_enter=False):
+                yield
+
+    def _substep(self) -> None:
+        """Advance one physics step; on a GPU as one graph of all its kernels."""
+        device = wp.device_from_torch(self.device)
+        if self._graph is None and device.is_cuda and device.is_mempool_enabled:
+            torch.cuda.synchronize(self.device)
+            with wp.ScopedDevice(device), wp.ScopedCapture() as capture:
+                mjw.step(self._model, self._data)
+            self._graph = capture.graph
+        with self._in_order():
+            if self._graph is None:
+                mjw.step(self._model, self._data)
+            else:
+                wp.capture_launch(self._graph, wp.get_stream())
+
+    def step(self, target: Tensor, active: Tensor) -> StepResult:
+        """Advance every row by one control step; see `Physics.step`."""
+        self._object_pos.masked_fill_(~active[..., None], 0.0)
+        self._object_pos[..., 2].masked_fill_(~active, PARKING[2])
+        self._object_vel.masked_fill_(~active[..., None], 0.0)
+        self._set_target(target)
+        self._overflow.zero_()
+        held = self._qpos[:, self._robot_q].clone() if self.scene.hold else None
+        found = torch.zeros_like(self._counts, dtype=torch.bool)
+        fallen = torch.zeros_like(found[:, 0])
+        power = torch.zeros_like(self._qpos[:, 0])
+        saturation = torch.zeros_like(power)
+        floor = active.shape[1] + 1
+        links = floor + 1 + len(self.scene.robot.feet)
+        for _ in range(self.config.substeps):
+            self._substep()
+            counts = self._counts
+            found |= counts > 0
+            # What of the robot's contacts with the floor is not a foot's.
+            fallen |= counts[:, floor] > counts[:, floor + 1 : links].sum(1)
+            power += (self._torque * self._qvel[:, self._robot_v][:, 6:]).abs().sum(1)
+            limited = self._torque.abs() >= self._torque_limit
+            saturation += limited.float().mean(1)
+            if held is not None:
+                self._qpos[:, self._robot_q] = held
+                self._qvel[:, self._robot_v] = 0.0
+        speed = self._qvel[:, self._robot_v].abs().amax(1)
+        # The comparison is also False for NaN.
+        sound = (speed < MAX_SPEED) & self._qpos.isfinite().all(1)
+        lost = (self._overflow & int(_LOST)) != 0
+        # Of a robot that has left physics behind any number may touch.
+        self._overflowed |= (lost & sound).any()
+        by_link = None
+        if self.scene.link_contacts:
+            by_link = found[:, links:].unflatten(-1, (-1, 2)).any(-1)
+        return StepResult(
+            object_hit=found[:, : floor - 1],
+            fallen=fallen,
+            self_contact=found[:, floor - 1],
+            link_contact=by_link,
+            power=power / self.config.substeps,
+            torque_saturation=saturation / self.config.substeps,
+            diverged=~sound | lost,
+        )
+
+    def _set_target(self, target: Tensor) -> None:
+        """Set the position targets of the PD law [rad], ``[B, J]``."""
+        if self.config.target_velocity == "zero":
+            self._ctrl.copy_(target)
+            return
+        # kp (q* - q) + kd (qdot* - qdot) = kp ((q* + kd/kp qdot*) - q) - kd qdot
+        velocity = (target - self._last_target) * self.config.control_hz
+        self._ctrl.copy_(target + self._kd_over_kp * velocity)
+        self._last_target.copy_(target)
+
+    def step_raw(self) -> None:
+        """Advance one control step and look at nothing: what physics alone costs."""
+        for _ in range(self.config.substeps):
+            self._substep()
+
+    def note(self) -> str | None:
+        """Say whether contacts did not fit; see `Physics.note`."""
+        overflowed = bool(self._overflowed)
+        self._overflowed.zero_()
+        if not overflowed:
+            return None
+        return (
+            f"more than {self.num_contacts()} contacts of a robot did not fit into "
+            f"MuJoCo Warp's buffers, and the rows count as diverged: set {SETTING} to "
+            "more"
+        )
+
+    def reset(self, rows: Tensor, base_pose: Tensor, joint_pos: Tensor) -> None:
+        """Put the robots of some rows at rest into a pose; see `Physics.reset`."""
+        self._qpos[rows, self._robot_q] = torch.cat((base_pose, joint_pos), -1)
+        self._object_pos[rows] = 0.0
+        self._object_pos[rows, :, 2] = PARKING[2]
+        # All else follows from these.
+        self._qvel[rows] = 0.0
+        self._warmstart[rows] = 0.0
+        self._last_target[rows] = joint_pos
+
+    def throw(
+        self, rows: Tensor, objects: Tensor, position: Tensor, velocity: Tensor
+    ) -> None:
+        """Release one object in each of some rows; see `Physics.throw`."""
+        self._object_pos[rows, objects] = position
+        self._object_vel[rows, objects] = velocity
+
+    def vary(self, rows: Tensor, variation: Variation) -> None:
+        """Give rows model fields of their own; see `Physics.vary`."""
+        model, n = self._mujoco, self.num_envs
+        with self._in_order():
+            if len(self._model.body_mass) < n:
+                self._model = self._put_model(batch_sizes=dict.fromkeys(_VARIED, n))
+                self._graph = None
+                ranges = wp.to_torch(self._model.actuator_forcerange)
+                self._torque_limit = ranges[..., 1]
+            links = [body_id(model, link) for link in self.scene.robot.links]
+            joints = model.actuator_trnid[:, 0]
+
+            def scale(name: str, factor: Tensor, which: Any = slice(None)) -> None:
+                own = torch.from_numpy(getattr(model, name)[which]).to(factor)
+                factor = factor.reshape(*factor.shape, *[1] * (own.ndim - 1))
+                values = wp.to_torch(getattr(self._model, name))
+                places = torch.arange(values.shape[1], device=values.device)[which]
+                values[rows[:, None], places] = factor * own
+
+            scale("body_mass", variation.link_mass, links)
+            scale("body_inertia", variation.link_mass, links)
+            scale("geom_friction", variation.friction[:, None].expand(-1, model.ngeom))
+            scale("actuator_gainprm", variation.gains)
+            scale("actuator_biasprm", variation.gains)
+            scale("actuator_forcerange", variation.torque_limit)
+            # The joints clip once more.
+            scale("jnt_actfrcrange", variation.torque_limit, joints)
+            mjw.set_const(self._model, self._data)
+
+    def push(self, rows: Tensor, velocity: Tensor) -> None:
+        """Change the velocity of the base of some rows; see `Physics.push`."""
+        self._qvel[rows, :3] += velocity
+
+    def read(self, rows: Tensor | None = None) -> PhysicsState:
+        """Return the state of some rows, or of all; see `Physics.read`."""
+        select = slice(None) if rows is None else rows
+        qpos = self._qpos[select].nan_to_num(0.0)
+        qvel = self._qvel[select].nan_to_num(0.0)
+        object_pos = qpos[:, self._robot_q.stop :].unflatten(-1, (-1, 3))
+        upright = torch.nn.functional.pad(torch.ones_like(object_pos[..., :1]), (0, 3))
+        return PhysicsState(
+            base_pose=qpos[:, :7].contiguous(),
+            base_lin_vel_w=qvel[:, :3].contiguous(),
+            base_ang_vel_b=qvel[:, 3:6].contiguous(),
+            joint_pos=qpos[:, 7 : self._robot_q.stop].contiguous(),
+            joint_vel=qvel[:, 6 : self._robot_v.stop].contiguous(),
+            object_pose=torch.cat((object_pos, upright), -1),
+            object_lin_vel_w=qvel[:, self._robot_v.stop :]
+            .unflatten(-1, (-1, 3))
+            .clone(),
+        )
+
+    def state(self) -> Tensor:
+        """Return everything needed to continue, ``[B, n]`` float64."""
+        return torch.cat(self._parts(), -1).double()
+
+    def load_state(self, state: Tensor) -> None:
+        """Continue from a state that `state` returned."""
+        parts = self._parts()
+        sizes = [part.shape[1] for part in parts]
+        for part, value in zip(parts, state.split(sizes, -1), strict=True):
+            part.copy_(value)
+
+    def _parts(self) -> list[Tensor]:
+        """Return all that is remembered, ``[B, ...]`` each: not copies."""
+        parts = [self._qpos, self._qvel, self._warmstart]
+        if self.config.target_velocity == "finite_difference":
+            parts.append(self._last_target)
+        return parts

@@ -1,0 +1,430 @@
+"""MuJoCo Warp against MuJoCo, on Warp's CPU device: `make test-warp`.
+
+Tolerances are some times what was measured, and far below what a policy could feel; the
+measured figures are in docs/gpu.md.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import fields, replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from calling import call, succeed
+from egoskin.agents.ppo import PPO, PPOConfig
+from egoskin.agents.rollout import collect
+from egoskin.commands.verify import run_hash
+from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
+from egoskin.envs.physics import (
+    Physics,
+    PhysicsConfig,
+    PhysicsState,
+    Scene,
+    Variation,
+    engine_of,
+)
+from egoskin.envs.throws import Thrower
+from egoskin.evaluation.throw_set import play_throws, standard_task
+from egoskin.make import EnvConfig, make_worker_env
+from egoskin.policies.policy import PolicySpec, load_policy
+from egoskin.robots.config import H1_2
+from egoskin.runs.config import TrainConfig
+from egoskin.runs.run import Run
+from egoskin.runs.trainer import METRIC_KEYS
+from egoskin.sensors.config import SensorConfig
+from egoskin.shapes import Sphere
+from throwing import TASK
+
+pytestmark = [pytest.mark.slow, pytest.mark.warp]
+if find_spec("mujoco_warp") is None:
+    pytest.skip("mujoco-warp is not installed (extra gpu)", allow_module_level=True)
+
+DEFAULT = torch.from_numpy(H1_2.default_joint_pos).float()
+J = len(DEFAULT)
+
+
+def scene(radius: float = 0.15, **options: Any) -> Scene:
+    """The robot and two balls."""
+    options = {"config": PhysicsConfig(), **options}
+    return Scene(robot=H1_2, objects=(Sphere(radius=radius),) * 2, **options)
+
+
+def engines(num_envs: int, **options: Any) -> list[Physics]:
+    """MuJoCo and Warp with the same scene."""
+    return [engine_of(name)(scene(**options), num_envs) for name in ("mujoco", "warp")]
+
+
+def put(physics: Physics, n: int, height: float = 0.0, noise: float = 0.0) -> None:
+    """Put all robots at rest."""
+    draw = torch.Generator().manual_seed(0)
+    pose = torch.tensor([0, 0, H1_2.default_base_height + height, 1.0, 0, 0, 0])
+    joints = DEFAULT + noise * (2 * torch.rand(n, J, generator=draw) - 1)
+    physics.reset(torch.arange(n), pose.expand(n, 7), joints)
+
+
+def stepping(step: int) -> torch.Tensor:
+    """Targets of a robot that steps on the spot, ``[J]``."""
+    swing, target = math.sin(2 * math.pi * 1.2 * step / 60), DEFAULT.clone()
+    for i, name in enumerate(H1_2.joints):
+        lift = max(swing if name.startswith("left") else -swing, 0.0)
+        for joint, share in (("hip_pitch", -1.0), ("knee", 2.0), ("ankle_pitch", -1.0)):
+            if joint in name:
+                target[i] += 0.2 * share * lift
+    return target
+
+
+def largest_gaps(one: PhysicsState, other: PhysicsState) -> dict[str, float]:
+    return {
+        f.name: float((getattr(one, f.name) - getattr(other, f.name)).abs().max())
+        for f in fields(PhysicsState)
+    }
+
+
+def check(gaps: dict[str, float], **limits: float) -> None:
+    """Show the gaps, and compare them with their limits."""
+    print({name: f"{gap:.1e}" for name, gap in gaps.items()})
+    assert not {name: gaps[name] for name, x in limits.items() if gaps[name] > x}
+
+
+# --- parity -------------------------------------------------------------------------
+
+
+def test_in_free_fall_all_is_as_with_mujoco():
+    n, draw = 8, torch.Generator().manual_seed(1)
+    both = engines(n)
+    targets = DEFAULT + 0.1 * torch.randn(20, n, J, generator=draw)
+    spin = torch.randn(n, 3, generator=draw)
+    for physics in both:
+        put(physics, n, height=1.0, noise=0.05)
+        physics.push(torch.arange(n), spin)
+        for ball in range(2):
+            place = torch.tensor([2.0 + ball, 1.0, 2.0]).expand(n, 3)
+            physics.throw(torch.arange(n), torch.full((n,), ball), place, spin)
+    for target in targets:
+        results = [p.step(target, torch.ones(n, 2, dtype=torch.bool)) for p in both]
+        for result in results:
+            for name in ("object_hit", "fallen", "self_contact", "diverged"):
+                assert not getattr(result, name).any()
+    gap = (results[0].power - results[1].power).abs() / results[0].power
+    assert gap.max() < 1e-3
+    check(
+        largest_gaps(both[0].read(), both[1].read()),
+        base_pose=1e-5,
+        base_lin_vel_w=1e-4,
+        base_ang_vel_b=1e-3,
+        joint_pos=1e-4,
+        joint_vel=1e-2,
+        object_pose=1e-5,
+        object_lin_vel_w=1e-4,
+    )
+
+
+@pytest.mark.parametrize("motion", ["standing", "stepping"])
+def test_for_fifty_steps_a_robot_stands_and_steps_as_with_mujoco(motion):
+    n = 8
+    both = engines(n)
+    for physics in both:
+        put(physics, n, noise=0.05)
+    active = torch.zeros(n, 2, dtype=torch.bool)
+    fallen = []
+    for step in range(50):
+        target = stepping(step) if motion == "stepping" else DEFAULT
+        results = [p.step(target.expand(n, J), active) for p in both]
+        fallen.append(results[0].fallen)
+        assert torch.equal(results[0].fallen, results[1].fallen)
+    assert not torch.stack(fallen).any()
+    check(
+        largest_gaps(both[0].read(), both[1].read()),
+        base_pose=1e-4,
+        base_lin_vel_w=1e-3,
+        joint_pos=1e-4,
+        joint_vel=1e-2,
+    )
+
+
+def test_balls_that_hit_or_miss_by_two_centimetres_do_so_here_as_well():
+    # Balls 2 cm smaller that hit, and 2 cm larger that miss, leave no doubt.
+    n, steps = 96, 50
+    config = EnvConfig().task
+    thrower = Thrower(config.throws, H1_2, config.physics.timestep)
+    rows = torch.arange(n)
+    zero = torch.zeros_like(rows)
+    verdicts = {}
+    for name, radius in (
+        ("mujoco", 0.13),
+        ("mujoco", 0.15),
+        ("mujoco", 0.17),
+        ("warp", 0.15),
+    ):
+        physics = engine_of(name)(
+            scene(radius, hold=True, weightless_objects=True, link_contacts=True), n
+        )
+        put(physics, n)
+        state = physics.read()
+        draw = thrower.draw(5, rows, zero, zero)
+        release = thrower.release(
+            draw, state.base_pose, state.base_lin_vel_w, state.joint_pos
+        )
+        # From nearby, and beside the point aimed at by up to 60 cm.
+        aside = 0.6 * (draw.target[:, :1] - 0.5) * torch.tensor([[0.0, 0.0, 1.0]])
+        aside = aside + 1.2 * (
+            draw.target[:, 1:] - 0.5
+        ) * torch.nn.functional.normalize(
+            torch.linalg.cross(release.velocity, torch.tensor([[0.0, 0, 1]])), dim=-1
+        )
+        place = release.position + aside + 0.35 * release.velocity
+        physics.throw(rows, zero, place, release.velocity)
+        active = torch.tensor([[True, False]]).expand(n, 2)
+        hit = torch.zeros(n, dtype=torch.bool)
+        links = torch.zeros(n, len(H1_2.links), dtype=torch.bool)
+        for _ in range(steps):
+            result = physics.step(DEFAULT.expand(n, J), active)
+            hit |= result.object_hit[:, 0]
+            assert result.link_contact is not None
+            links |= result.link_contact
+        verdicts[name, radius] = hit, links
+    hits, misses = verdicts["mujoco", 0.13][0], ~verdicts["mujoco", 0.17][0]
+    hit, links = verdicts["warp", 0.15]
+    same = hit == verdicts["mujoco", 0.15][0]
+    print(f"{int(hits.sum())} hit, {int(misses.sum())} miss, of {n}; same {same.sum()}")
+    assert min(hits.sum(), misses.sum()) > n // 5
+    assert hit[hits].all()
+    assert not hit[misses].any()
+    by_link = (links == verdicts["mujoco", 0.15][1]).all(1)
+    print(f"the same links were touched in {int(by_link.sum())}")
+    assert by_link.float().mean() > 0.95
+
+
+def test_robots_that_differ_do_so_as_with_mujoco():
+    n, draw = 4, torch.Generator().manual_seed(2)
+
+    def factors(*shape: int) -> torch.Tensor:
+        return 0.6 + 0.8 * torch.rand(shape, generator=draw)
+
+    variation = Variation(
+        link_mass=factors(n, len(H1_2.links)),
+        friction=factors(n),
+        gains=factors(n, J),
+        torque_limit=0.3 * factors(n, J),
+    )
+    both = engines(n)
+    for physics in both:
+        put(physics, n, noise=0.05)
+        physics.vary(torch.arange(n), variation)
+        # A reset leaves it as it is.
+        put(physics, n, noise=0.05)
+    active = torch.zeros(n, 2, dtype=torch.bool)
+    for step in range(20):
+        results = [p.step(stepping(10 + step).expand(n, J), active) for p in both]
+    saturation = [result.torque_saturation for result in results]
+    assert saturation[0].max() > 0
+    torch.testing.assert_close(*saturation, rtol=0, atol=0.03)
+    gaps = largest_gaps(both[0].read(), both[1].read())
+    check(gaps, base_pose=1e-4, joint_pos=1e-3)
+    # It is another robot.
+    plain = engine_of("mujoco")(scene(), n)
+    put(plain, n, noise=0.05)
+    for step in range(20):
+        plain.step(stepping(10 + step).expand(n, J), active)
+    assert largest_gaps(plain.read(), both[0].read())["joint_pos"] > 5e-2
+
+
+def test_a_policy_dodges_as_well_as_with_mujoco():
+    throws, policy = 256, load_policy("field_proximity")
+    config = standard_task(policy.env_config)
+    # Three seconds are what success is read at.
+    task = replace(config.task, episode_length_s=config.task.success_s)
+    config = replace(config, task=task)
+    failed = []
+    for engine in ("mujoco", "warp"):
+        played = play_throws(
+            policy,
+            config,
+            policy.skin,
+            throw_set=0,
+            episodes=throws,
+            # In this process.
+            watch=lambda *step: None,
+            engine=engine,
+        )
+        failed.append(played.hit | played.fallen | played.diverged)
+        ends = {
+            name: int(getattr(played, name).sum())
+            for name in ("hit", "fallen", "diverged")
+        }
+        print(f"{engine}: {throws - int(failed[-1].sum())} of {throws} dodged, {ends}")
+    print(f"the same of both in {int((failed[0] == failed[1]).sum())}")
+    success = [1 - float(x.float().mean()) for x in failed]
+    assert abs(success[0] - success[1]) <= 0.03
+
+
+# --- the contract -------------------------------------------------------------------
+
+
+def flail(physics: Physics, n: int, steps: int, seed: int = 3) -> list:
+    draw = torch.Generator().manual_seed(seed)
+    targets = DEFAULT + 0.5 * torch.randn(steps, 8, J, generator=draw)
+    active = torch.ones(n, 2, dtype=torch.bool)
+    return [physics.step(target[:n], active) for target in targets]
+
+
+@pytest.mark.parametrize("target_velocity", ["zero", "finite_difference"])
+def test_a_loaded_state_continues_bit_for_bit_in_any_number_of_rows(target_velocity):
+    config = PhysicsConfig(target_velocity=target_velocity)
+    whole, other = (engine_of("warp")(scene(config=config), 8) for _ in range(2))
+    for physics in (whole, other):
+        put(physics, 8)
+    flail(whole, 8, 20)
+    # Another past, of which nothing may be left.
+    flail(other, 8, 3, seed=4)
+    saved = whole.state()
+    other.load_state(saved)
+    few = engine_of("warp")(scene(config=config), 3)
+    few.load_state(saved[:3])
+    after = flail(whole, 8, 10)
+    for physics, n in ((other, 8), (few, 3)):
+        for result, expected in zip(flail(physics, n, 10), after, strict=True):
+            assert torch.equal(result.power, expected.power[:n])
+        assert torch.equal(physics.state(), whole.state()[:n])
+
+
+def test_a_diverged_row_is_told_and_finite_harms_no_other_and_starts_anew():
+    broken, sound = (engine_of("warp")(scene(), 4) for _ in range(2))
+    for physics in (broken, sound):
+        put(physics, 4)
+        flail(physics, 4, 5)
+    state = broken.state()
+    state[1, 40] = math.nan
+    state[2, 41] = 1e30
+    broken.load_state(state)
+    result, expected = (flail(physics, 4, 1)[0] for physics in (broken, sound))
+    assert result.diverged.tolist() == [False, True, True, False]
+    assert all(
+        getattr(broken.read(), f.name).isfinite().all() for f in fields(PhysicsState)
+    )
+    kept = torch.tensor([0, 3])
+    assert torch.equal(broken.state()[kept], sound.state()[kept])
+    assert torch.equal(result.power[kept], expected.power[kept])
+    for physics in (broken, sound):
+        put(physics, 4)
+    assert torch.equal(flail(broken, 4, 5)[-1].power, flail(sound, 4, 5)[-1].power)
+    assert torch.equal(broken.state(), sound.state())
+
+
+def test_contacts_that_do_not_fit_are_told_with_the_cure(monkeypatch):
+    monkeypatch.setenv("EGOSKIN_WARP_CONTACTS", "2")
+    physics = engine_of("warp")(scene(), 2)
+    put(physics, 2)
+    assert flail(physics, 2, 1)[0].diverged.all()
+    note = physics.note()
+    assert note is not None
+    assert "2 contacts" in note
+    assert "set EGOSKIN_WARP_CONTACTS to more" in note
+    assert physics.note() is None
+    monkeypatch.setenv("EGOSKIN_WARP_CONTACTS", "many")
+    with pytest.raises(ValueError, match="EGOSKIN_WARP_CONTACTS must be a number"):
+        engine_of("warp")(scene(), 2)
+
+
+def test_what_it_cannot_simulate_is_refused_by_name():
+    many = Scene(robot=H1_2, objects=(Sphere(),) * 20, config=PhysicsConfig())
+    with pytest.raises(ValueError, match="MuJoCo Warp cannot make the scene: Dense"):
+        engine_of("warp")(many, 1)
+
+
+# --- training -----------------------------------------------------------------------
+
+
+def test_a_training_is_repeated_and_gone_on_with_bit_for_bit(tmp_path: Path):
+    options = ["--engine", "warp", "--num-envs", "8", "--sensor.coverage", "ray"]
+    for name, frames in (("whole", 512), ("again", 512), ("half", 256)):
+        succeed(
+            "train", *options, "--run-dir", tmp_path / name, "--total-frames", frames
+        )
+    succeed("train", "--resume", tmp_path / "half", "--total-frames", 512)
+    runs = [Run.open(tmp_path / name) for name in ("whole", "again", "half")]
+    assert len({run_hash(run) for run in runs}) == 1
+    policy = load_policy(tmp_path / "whole")
+    assert policy.policy_spec.engine == runs[0].config.engine == "warp"
+    assert runs[0].starts()[0]["packages"]["mujoco-warp"] is not None
+    done = call("train", "--resume", tmp_path / "half", "--engine", "mujoco")
+    assert done.returncode == 2
+    assert "changed: engine" in done.stderr
+    # It plays on the other engine.
+    done = call("evaluate", tmp_path / "whole", "--episodes", "2")
+    assert done.returncode == 0
+
+
+def test_an_environment_gives_what_its_specs_say():
+    config = EnvConfig(sensor=SensorConfig(coverage="ray", reduce="min"))
+    env = make_worker_env(config, num_envs=4, seed=0, keep_raw=True, engine="warp")
+    assert isinstance(env.base_env, DodgeballEnv)
+    # The same draws: throws and starts.
+    other = DodgeballEnv(H1_2, DodgeballConfig(), num_envs=4, seed=0)
+    starts = [e.reset()["first_throw_step"] for e in (env, other)]
+    assert torch.equal(*starts)
+    assert starts[0].unique().numel() > 1
+    env.check_env_specs()
+
+
+class Reads(TorchDispatchMode):
+    """Counts what makes a device wait for the host: numbers read, and row indices."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.numbers = self.indices = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        name = func.overloadpacket.__name__
+        self.numbers += name == "_local_scalar_dense"
+        masks = args[1] if name in ("index", "index_put_") else ()
+        masked = any(x is not None and x.dtype == torch.bool for x in masks)
+        self.indices += masked or name in ("nonzero", "_unique2", "bincount")
+        return func(*args, **(kwargs or {}))
+
+
+def refuse(self: torch.Tensor, *args: object) -> None:
+    raise AssertionError("a tensor is read by the host")
+
+
+def test_a_rollout_reads_nothing_but_a_few_numbers_for_each_step(monkeypatch):
+    config, counts = EnvConfig(task=TASK), []
+    skin = config.skin.build(config.robot_config)
+    for n in (4, 16):
+        env = make_worker_env(config, skin, num_envs=n, seed=0, engine="warp")
+        network = TrainConfig().ppo.network
+        spec = PolicySpec.of(config, skin, network, env, {})
+        agent = spec.build_agent()
+        ppo = PPO(agent, PPOConfig())
+        root = env.reset()
+        with monkeypatch.context() as patch, Reads() as collecting:
+            for name in ("numpy", "tolist", "cpu"):
+                patch.setattr(torch.Tensor, name, refuse)
+            rollout, _, _ = collect(env, agent, root, 16, METRIC_KEYS)
+        with Reads() as learning:
+            ppo.update(rollout)
+        counts.append((collecting.numbers, collecting.indices, learning.numbers))
+        print(f"{n} robots: numbers, index lists, numbers of an update: {counts[-1]}")
+    # However many robots there are.
+    for numbers, indices, learned in counts:
+        assert numbers <= 16 * 6
+        assert indices <= 16 * 12
+        assert learned <= 3 * 20 + 20
+
+
+def test_bench_engine_gives_its_rows(tmp_path: Path):
+    file = tmp_path / "rows.json"
+    args = ("--worlds", "4", "--rounds", "1", "--json", file)
+    succeed("bench", "engine", *args)
+    rows = {row["name"]: row["value"] for row in json.loads(file.read_text())["rows"]}
+    layers = ("physics", "sensors_field", "train_field", "sensors_ray", "train_ray")
+    names = [*layers, "memory_field", "memory_ray"]
+    assert list(rows) == [f"{name}_4" for name in names]
+    assert min(rows.values()) > 0
