@@ -100,7 +100,7 @@ def _rows(config: EngineBench, worlds: int) -> list[Row]:
     ] + memory
 
 
-def _layers(coverage: str, worlds: int, device: str) -> dict[str, Callable[[], object]]:
+def _layers(coverage: str, worlds: int, device: str) -> dict[str, Callable[[], None]]:
     """Return what is measured, a rollout of each, by name."""
     sensor = dataclasses.replace(EnvConfig().sensor, coverage=coverage)
     config = TrainConfig(
