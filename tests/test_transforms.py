@@ -164,7 +164,7 @@ def test_results_that_are_not_one_for_each_key_are_refused(method, given):
         def __init__(self) -> None:
             super().__init__(in_keys=["x"], out_keys=["y"])
 
-        def compute(self, *inputs):
+        def compute(self, *inputs) -> Any:
             return self.wrong("compute", 2 * inputs[0])
 
         def out_specs(self, spec) -> Any:
