@@ -118,8 +118,11 @@ def test_an_evaluation_has_the_figures_promised(evaluated):
         "throw_set",
         "frames",
         "mask",
+        "engine",
+        "trained_by_engine",
     }
     about = {"standard": "2", "trained_on": "2", "throw_set": 0, "mask": []}
+    about |= {"engine": "mujoco", "trained_by_engine": "mujoco"}
     assert {key: result[key] for key in about} == about
     assert result["frames"] == 4 * BATCH
     assert f"{4 * BATCH:,} frames on standard 2; standard 2, throw set 0" in text

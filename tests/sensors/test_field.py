@@ -449,7 +449,7 @@ def test_a_range_that_is_not_positive_is_refused(skin, max_range):
 
 
 def test_a_skin_of_another_robot_is_refused(small_robot, skin):
-    with pytest.raises(ValueError, match=r"sensor 0 sits on .* Its links are base"):
+    with pytest.raises(ValueError, match=r"sensor 0 sits on .* \(links: base"):
         FieldSensor(skin, small_robot("<geom size='1'/>").chain, BALLS, RANGE)
 
 

@@ -859,7 +859,7 @@ TWO_MACROS = xacro(TAG).replace(
         (
             xacro(TAG),
             {},
-            r"export:4: .*(--parent\), did you mean 'left_elbow_l",
+            r"export:4: .*\(--parent\), did you mean 'left_elbow_l",
         ),
         (xacro(TAG, TAG), ARM_LINK, "export:1[0-9]: 'xacro:self_cap_sensor 0' is th"),
         (xacro(TAG).replace('xyz="0 0 0"', 'xyz="0 0"'), ARM_LINK, "three numbers"),
