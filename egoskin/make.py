@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -351,6 +352,17 @@ def device_of(name: str) -> torch.device:
     ):
         raise ValueError(f"no device {name!r} here; available: {', '.join(valid)}")
     return device
+
+
+def print_note(env: Trainable) -> None:
+    """Print what limited the simulations since the last call; see `Physics.note`.
+
+    Workers simulate with MuJoCo, which nothing limits.
+    """
+    if isinstance(env, TransformedEnv):
+        assert isinstance(env.base_env, DodgeballEnv)
+        if (note := env.base_env.physics.note()) is not None:
+            print(f"note: {note}", file=sys.stderr)
 
 
 def save_env_state(env: Trainable, root: TensorDictBase) -> dict[str, Tensor]:

@@ -12,7 +12,6 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -21,9 +20,8 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
-from torchrl.envs import TransformedEnv
 
-from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
+from egoskin.envs.dodgeball import DodgeballConfig
 from egoskin.envs.physics import Engine
 from egoskin.envs.standards import Standard, evaluation_task
 from egoskin.make import (
@@ -31,6 +29,7 @@ from egoskin.make import (
     check_num_workers,
     make_env,
     make_worker_env,
+    print_note,
 )
 from egoskin.rng import held_out
 from egoskin.sensors import Skin
@@ -240,10 +239,7 @@ def play_throws(
                 on_step(step, int(running.sum()))
             if not running.any():
                 break
-        if isinstance(env, TransformedEnv):
-            assert isinstance(env.base_env, DodgeballEnv)
-            if (note := env.base_env.physics.note()) is not None:
-                print(f"note: {note}", file=sys.stderr)
+        print_note(env)
     finally:
         env.close()
     hit, fallen, diverged, terminated = ends.values()

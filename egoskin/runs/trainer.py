@@ -8,7 +8,6 @@ replaces a checkpoint.
 from __future__ import annotations
 
 import dataclasses
-import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -19,7 +18,6 @@ from typing import Annotated, Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.envs import TransformedEnv
 
 from egoskin.agents.networks import Agent
 from egoskin.agents.ppo import PPO, NonFiniteError
@@ -33,6 +31,7 @@ from egoskin.make import (
     load_env_state,
     make_env,
     make_worker_env,
+    print_note,
     save_env_state,
 )
 from egoskin.parallel import start_server
@@ -134,10 +133,7 @@ class Trainer:
             path = self.dump(error)
             error.args = (f"{error}\nreplay it with: egoskin replay {path}",)
             raise
-        if isinstance(self.env, TransformedEnv):
-            assert isinstance(self.env.base_env, DodgeballEnv)
-            if (note := self.env.base_env.physics.note()) is not None:
-                print(f"note: {note}", file=sys.stderr)
+        print_note(self.env)
         end = time.perf_counter()
         self.frames += self.config.frames_per_batch
         self.wall_s += end - start
