@@ -19,18 +19,18 @@ from egoskin.interrupts import end_quietly
 from egoskin.viewer import draw_without_display
 
 COMMANDS = {
-    "train": "train a robot to dodge, or go on with a run",
-    "evaluate": "play a policy on a fixed set of throws",
+    "train": "train a robot to dodge, or resume a run",
+    "evaluate": "evaluate a policy on a fixed set of throws",
     "view": "see a policy in the browser, and throw balls at it",
     "film": "film an episode, with a contact sheet of its moments",
     "skin": "place, import, export and show skins",
-    "robot": "tell what would go wrong with a robot, and draw it",
-    "visibility": "show what a skin sees, before any training",
-    "upper-bound": "search what the body could still do when a ball is in reach",
+    "robot": "check a robot before training, and draw it",
+    "visibility": "show what a skin sees; no training is needed",
+    "upper-bound": "search for what the body could do when a ball is in reach",
     "replay": "replay an update that was not finite",
-    "study": "plan, run and report many trainings",
+    "study": "plan, run and report trainings over seeds",
     "export": "write a policy as ONNX, for a robot without PyTorch",
-    "verify": "check that training is exact on this machine",
+    "verify": "check that training is reproducible on this machine",
     "bench": "measure speed and accuracy",
 }
 """What each command does, by name."""

@@ -12,7 +12,7 @@ Train a robot to dodge balls by what its skin observes.
 
   --sensor.coverage {field,ray,none,oracle}
                           a sphere around each sensor; an 8x8 grid of beams; no
-                          skin; told where the balls are (field)
+                          skin; the balls' true states (field)
   --sensor.signal {localization,proximity,closeness,binary}
                           where a ball is; distance / range; 1 - that; whether one
                           is in range (proximity)
@@ -24,7 +24,7 @@ Train a robot to dodge balls by what its skin observes.
   --seed INT              of everything random (0)
   --total-frames INT      environment steps of the whole run (65536000)
   --run-dir PATH          folder of the run; else a new one under runs/
-  --resume PATH           run folder to go on with, exactly
+  --resume PATH           run folder to resume, bit for bit
 
   egoskin train --sensor.signal binary --sensor.range 1 --seed 1
   egoskin train --resume runs/NAME --total-frames 100e6
@@ -33,7 +33,7 @@ Train a robot to dodge balls by what its skin observes.
   egoskin train --engine warp --device cuda
 """,
     "evaluate": """\
-Play a policy on a fixed set of throws that no training has seen.
+Evaluate a policy on a fixed set of held-out throws.
 
   POLICY                  run folder, checkpoint, policy file, or a policy of the
                           package: field_proximity, field_binary, localization,
@@ -41,12 +41,12 @@ Play a policy on a fixed set of throws that no training has seen.
   --episodes INT          throw sequences (1024)
   --throw-set INT         seed of the throw set (0)
   --standard {2,1,paper,run}
-                          version of the throws to judge by (2)
+                          version of the throws (2)
   --mask [LINK ...]       links whose sensors detect nothing; alone: all sensors
   --behaviour             also hits by kind of throw, displacement, effort
-  --perturbed             also on robots that are not their model, late, pushed
+  --perturbed             also with other masses, friction, gains, delays, pushes
   --map PATH              picture of success against speed, tempo, height, direction
-  --check-substeps INT    once more with finer physics (8: 480 Hz)
+  --check-substeps INT    also with finer physics (8: 480 Hz)
   --json PATH             file to write the figures to
 
   egoskin evaluate field_proximity --episodes 256
@@ -72,7 +72,7 @@ Film an episode of a policy, with a contact sheet of its moments.
   POLICY                  run folder, checkpoint, policy file, or a policy of the
                           package; none: the robot holds its default pose
   --out PATH              film to write, .mp4 or .gif (episode.mp4)
-  --longest-of INT        of this many episodes the one that lasts longest (1)
+  --longest-of INT        film the longest of this many episodes (1)
   --episode INT           which episode of the throw set (0)
   --throw-set INT         seed of the throw set (0)
   --standard {2,1,paper,run}
@@ -101,17 +101,17 @@ Place, import, export and show skins.
 egoskin skin place --help lists the options of place, and so for each.
 """,
     "robot": """\
-Look at a robot before it is trained; docs/your-robot.md says how to bring yours.
+Check a robot before training; docs/your-robot.md says how to bring your own.
 
   egoskin robot check my_robot --out robot.png
-                          tell what would go wrong: gains, limits, feet, skin, does
-                          it stand? And draw the robot with its skin
+                          check gains, limits, feet and skin, and whether it
+                          stands; draw the robot with its skin
 
 A robot is h1_2, g1, a folder with robot.toml, or my_robot.py:ROBOT. egoskin robot check
 --help lists the options of check.
 """,
     "visibility": """\
-Show what a skin sees of the throws, before any training.
+Show what a skin sees of the throws; no training is needed.
 
   --skin.path PATH        skin file; else 64 random sensors
   --skin.num-sensors INT  number of sensors to place (64)
@@ -129,7 +129,7 @@ Show what a skin sees of the throws, before any training.
   egoskin visibility --ranges 0.5 1 --occlusion
 """,
     "upper-bound": """\
-Search what the body could still do when a ball comes within reach.
+Search for what the body could still do when a ball comes within reach.
 
   POLICY                  run folder, checkpoint, policy file, or a policy of the
                           package: it plays until the search takes over
@@ -152,20 +152,20 @@ Replay an update that was not finite.
   egoskin replay runs/NAME/not-finite-000001048576.safetensors
 """,
     "study": """\
-Run a study: many trainings that differ in a few fields, and what they tell.
+Run a study: trainings that differ in a few fields, over several seeds.
 
   egoskin study plan findings --dir studies/findings
-                          what it will cost; writes the manifest
+                          print its cost; write the manifest
   egoskin study run findings --dir studies/findings
-                          run it, or go on; runners may share a folder
+                          run or resume it; runners may share a folder
   egoskin study status studies/findings
-                          how far it is, from the folder alone
+                          its progress, from the folder alone
   egoskin study report studies/findings
                           report.md, index.html, runs.csv and the figures
   egoskin study slurm studies/findings > study.sh
                           a job array for Slurm
   egoskin study adopt studies/findings runs/NAME
-                          take in a run that was made before
+                          take in an existing run
 
 A study is paper, paper-1000, findings, smoke, or a JSON file. egoskin study run --help
 lists the options of run, and so for each.
@@ -181,8 +181,8 @@ Write a policy as ONNX, for a robot without PyTorch; docs/deploy.md says how to 
   egoskin export field_proximity --out policy.onnx
 """,
     "verify": """\
-Check that training is exact on this machine: a resume, other workers, other threads and
-other kernels give the same bits.
+Check that training is reproducible on this machine: a resume, other numbers of workers
+and threads, and other kernels give the same bits.
 
   --iterations INT        rollouts to train; a resume is tried after half (6)
   --num-envs INT          agents, a multiple of 4 (4096)
@@ -195,10 +195,10 @@ other kernels give the same bits.
 Measure speed and accuracy.
 
   egoskin bench loop      the training loop, layer by layer [steps/s]
-  egoskin bench physics   what the choices of the robot's model cost
+  egoskin bench physics   the cost of the robot's model, choice by choice
   egoskin bench engine    engine warp against the number of worlds
   egoskin bench sensors   the sensor kernels
-  egoskin bench accuracy  the physics rate against a finer one
+  egoskin bench accuracy  the physics against a finer rate
   egoskin bench gradients --run runs/NAME
                           the actor's gradients of several rollouts, compared
   egoskin bench gymnasium Gymnasium's forms of the environment
