@@ -202,7 +202,7 @@ def test_the_metadata_say_what_the_simulated_robot_is():
     limit = model.actuator_forcerange[:, 1]
     np.testing.assert_allclose(data["action_scale"], 0.3 * limit / kp)
     assert data["control_hz"] == 60
-    assert (data["standard"], data["commit"]) == ("1", "abc123")
+    assert (data["standard"], data["commit"]) == ("2", "abc123")
     assert data["egoskin"] is not None
     assert data["sensor"]["signal"] == "proximity"
     sensors = data["skin"]["sensors"]
