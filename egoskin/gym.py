@@ -128,6 +128,8 @@ class DodgeballGym(gymnasium.Env[np.ndarray, np.ndarray]):
     Reward, start and end are `DodgeballEnv`'s.
 
     Args:
+        render_mode: ``rgb_array`` to be drawn, as films and Gymnasium's ``RecordVideo``
+            want it; None for no pictures.
         settings: Fields of `egoskin.EnvConfig`, as its dataclasses or as dictionaries.
 
     Raises:
@@ -135,15 +137,21 @@ class DodgeballGym(gymnasium.Env[np.ndarray, np.ndarray]):
         ValueError: If they make no environment.
     """
 
-    metadata = {"render_modes": []}  # noqa: RUF012 (Gymnasium's)
+    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012 (Gymnasium's)
 
-    def __init__(self, **settings: Any) -> None:
+    def __init__(self, render_mode: str | None = None, **settings: Any) -> None:
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode must be 'rgb_array', got {render_mode!r}")
         self._rows = _Rows(settings)
         self.config = self._rows.config
         """What it is made of."""
         self.observation_space = self._rows.observation_space
         self.action_space = self._rows.action_space
+        self.render_mode = render_mode
+        hz = self.config.task.physics.control_hz
+        self.metadata = {"render_modes": ["rgb_array"], "render_fps": round(hz)}
         self._env: Any = None
+        self._painter: Any = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -158,8 +166,12 @@ class DodgeballGym(gymnasium.Env[np.ndarray, np.ndarray]):
         if seed is not None or self._env is None:
             seed = _seed(seed, self.np_random)
             config, skin = self.config, self._rows.skin
-            self._env = make_worker_env(config, skin, num_envs=1, seed=seed)
-        self._root = self._env.reset()
+            drawn = self.render_mode is not None
+            self._env = make_worker_env(
+                config, skin, num_envs=1, seed=seed, keep_raw=drawn
+            )
+        self._root = self._now = self._env.reset()
+        self._age = 0
         return self._rows.observations(self._root)[0], self._info(self._root)
 
     def step(
@@ -169,6 +181,7 @@ class DodgeballGym(gymnasium.Env[np.ndarray, np.ndarray]):
         self._root["action"] = torch.as_tensor(action, dtype=torch.float32)[None]
         step = self._env.step(self._root)
         self._root, after = self._env.step_mdp(step), step["next"]
+        self._now, self._age = after, self._age + 1
         return (
             self._rows.observations(after)[0],
             float(after["reward"]),
@@ -176,6 +189,32 @@ class DodgeballGym(gymnasium.Env[np.ndarray, np.ndarray]):
             bool(after["truncated"]),
             self._info(after),
         )
+
+    def render(self) -> np.ndarray | None:
+        """Return the picture of now, ``[360, 640, 3]`` uint8; None without a mode.
+
+        Raises:
+            RenderingError: If no OpenGL context can be made.
+        """
+        if self.render_mode is None:
+            return None
+        if self._env is None:
+            raise gymnasium.error.ResetNeeded("call reset before render")
+        if self._painter is None:
+            # Who asks for no pictures needs no OpenGL.
+            from egoskin.viewer.offscreen import painter_of
+
+            self._painter = painter_of(self.config, self._rows.skin, size=(640, 360))
+            self._sensors = self.config.pipeline(self._rows.skin)
+        now, hz = self._now[0], self.config.task.physics.control_hz
+        detecting = self._sensors.detecting(now)
+        return self._painter.draw(now, detecting, time=self._age / hz).image
+
+    def close(self) -> None:
+        """Free what pictures needed."""
+        if self._painter is not None:
+            self._painter.__exit__()
+            self._painter = None
 
     def _info(self, td: TensorDictBase) -> dict[str, Any]:
         info = {key: value[0] for key, value in self._rows.info(td).items()}

@@ -13,7 +13,10 @@ import sys
 from contextlib import redirect_stdout
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
+import gymnasium
+import numpy as np
 import pytest
 
 import egoskin
@@ -71,10 +74,10 @@ class Driver:
 
 
 def test_the_document_has_its_examples():
-    assert len(CODE) == 4
+    assert len(CODE) == 5
 
 
-ALL = [0, *(pytest.param(number, marks=SLOW) for number in (1, 2, 3))]
+ALL = [0, *(pytest.param(number, marks=SLOW) for number in (1, 2, 4))]
 
 
 @pytest.mark.parametrize("number", ALL)
@@ -95,6 +98,35 @@ def test_an_example_runs_as_given(number, tmp_path):
         said = ["the distances of the skin are 0.5 s old", "4 targets"]
     lines = [line.strip() for line in done.stdout.splitlines() if "torchrl" not in line]
     assert lines == [line.strip() for line in said]
+
+
+def test_cleanrl_is_told_of_many_robots_what_it_wants():
+    names: dict[str, Any] = {"__name__": "example"}
+    exec(compile(CODE[3], "deploy", "exec"), names)
+    envs = names["make_envs"]("egoskin.gym:egoskin/Dodgeball-v0", 4, 0.99)
+    plain = gymnasium.make_vec("egoskin.gym:egoskin/Dodgeball-v0", 4, num_workers=1)
+    seen, (raw, _) = [envs.reset(seed=1)[0]], plain.reset(seed=1)
+    told, returns, lengths, infos = [raw], np.zeros(4), np.zeros(4), {}
+    while "final_info" not in infos:
+        action = np.full((4, 21), 100.0, dtype=np.float32)
+        observations, rewards, *_, infos = envs.step(action)
+        raw, unscaled, *_ = plain.step(np.minimum(action, plain.action_space.high))
+        seen.append(observations)
+        told.append(raw)
+        returns, lengths = returns + unscaled, lengths + 1
+        assert (np.abs(rewards) <= 10).all()
+        assert (rewards != unscaled).any()
+    over, episode = infos["final_info"]["_episode"], infos["final_info"]["episode"]
+    assert over.any()
+    np.testing.assert_allclose(episode["r"][over], returns[over])
+    np.testing.assert_array_equal(episode["l"][over], lengths[over])
+    assert np.abs(seen).max() <= 10
+    # Scaled by what was seen of all robots until then.
+    rows = np.concatenate(told)
+    scaled = (told[-1] - rows.mean(0)) / np.sqrt(rows.var(0) + 1e-8)
+    np.testing.assert_allclose(seen[-1], np.clip(scaled, -10, 10), atol=0.02)
+    envs.close()
+    plain.close()
 
 
 # --- Tutorials --------------------------------------------------------------------

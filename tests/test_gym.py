@@ -19,6 +19,7 @@ import egoskin
 from calling import SCRIPTS
 from egoskin.gym import ENV_ID, DodgeballGym, DodgeballVector
 from egoskin.sensors.config import SensorConfig, SkinConfig
+from egoskin.viewer.offscreen import RenderingError
 from throwing import TASK
 
 SOON: dict[str, Any] = {"task": {"throws": {"first_delay": (0.0, 0.0)}}}
@@ -55,7 +56,8 @@ def still(td: TensorDict) -> TensorDict:
 @pytest.mark.parametrize("form", FORMS)
 def test_gymnasiums_own_check_passes(form):
     env = gymnasium.make(ENV_ID, **FORMS[form])
-    check_env(env.unwrapped)
+    # Pictures need OpenGL; they have a test below.
+    check_env(env.unwrapped, skip_render_check=True)
     assert env.observation_space.dtype == np.float32
     env.close()
 
@@ -193,6 +195,50 @@ def test_what_makes_no_environment_is_refused_with_what_would(make):
         make(ENV_ID, sensor={"signal": "loud"})
     with pytest.raises(ValueError, match="seed must be in"):
         make(ENV_ID).reset(seed=2**32)
+
+
+def test_a_robot_that_is_drawn_moves_as_one_that_is_not():
+    seen = []
+    for mode in (None, "rgb_array"):
+        env = gymnasium.make(ENV_ID, render_mode=mode, **SOON)
+        assert env.metadata["render_fps"] == 60
+        rows, _ = env.reset(seed=1)
+        steps = [env.step(np.ones(21, dtype=np.float32)) for _ in range(30)]
+        seen.append([rows, *(step[0] for step in steps)])
+        if mode is None:
+            assert env.render() is None
+            continue
+        try:
+            pictures = [env.render()]
+        except RenderingError as error:
+            pytest.skip(str(error))
+        env.step(np.ones(21, dtype=np.float32))
+        pictures += [env.render(), env.render()]
+        env.reset()
+        pictures.append(env.render())
+        env.close()
+        # After a close, too.
+        env.reset(seed=1)
+        assert env.render().shape == (360, 640, 3)
+        env.close()
+        for picture in pictures:
+            assert picture.dtype == np.uint8
+            assert picture.std() > 10
+        # The same state is the same picture, another is another.
+        moved, same, anew = (
+            (pictures[i] != pictures[j]).mean() for i, j in ((0, 1), (1, 2), (2, 3))
+        )
+        assert same == 0
+        assert moved > 0.001
+        assert anew > 0.01
+    np.testing.assert_array_equal(*seen)
+
+
+def test_what_cannot_be_drawn_is_refused():
+    with pytest.raises(ValueError, match="render_mode must be 'rgb_array', got 'ansi'"):
+        DodgeballGym(render_mode="ansi")
+    with pytest.raises(gymnasium.error.ResetNeeded, match="before render"):
+        DodgeballGym(render_mode="rgb_array").render()
 
 
 # --- TorchRL ------------------------------------------------------------------------

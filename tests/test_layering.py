@@ -38,11 +38,11 @@ ROOMS = {
     "policies": {"storage", "sensors", "agents", "make"},
     "evaluation": {"robots", "transform", "envs", "sensors", "policies", "make"},
     "runs": {"storage", "envs", "sensors", "agents", "make", "policies"},
-    "gym": {"storage", "make"},
     "deploy": set(),
     "viewer": {
         *("storage", "robots", "envs", "sensors", "make", "policies", "evaluation")
     },
+    "gym": {"storage", "make", "viewer"},
 }
 # All but the public face: nothing imports what the command line does.
 TOP = "commands"
