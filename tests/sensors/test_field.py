@@ -115,6 +115,9 @@ def test_distances_are_those_of_mujoco(skin, scene, random_state, seed, dtype):
     edge = np.abs(cosine - np.cos(np.radians(half))) * np.abs(signed)
     unsure |= (half < 180) & (signed > -1e-5) & (edge < 2e-4)
     assert unsure.mean() < 0.02
+    if int(mujoco.__version__.split(".")[0]) < 4:
+        # MuJoCo 3, the last for Python 3.10, is up to 3e-4 m off, whatever is asked.
+        unsure[..., KINDS.index("ellipsoid")] = True
 
     # Constants as exact as the inputs.
     chain = build_chain(H1_2.model, H1_2.base, dtype)
