@@ -88,9 +88,10 @@ def claimed(
 
         def beat() -> None:
             while not ended.wait(heartbeat):
-                if _owners(folder, name)[-1:] != [owner]:
-                    return lost()
+                # A file system that fails may come back: the next beat looks again.
                 with suppress(OSError):
+                    if _owners(folder, name)[-1:] != [owner]:
+                        return lost()
                     os.utime(owner)
 
         thread = threading.Thread(target=beat, daemon=True)

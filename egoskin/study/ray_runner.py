@@ -7,10 +7,12 @@ goes on from its last checkpoint. (Extra `ray`.)
 
 from __future__ import annotations
 
+import signal
 import socket
-import subprocess
+import time
 from collections.abc import Collection
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import ray  # pyright: ignore[reportMissingImports]
@@ -30,6 +32,12 @@ from egoskin.study.store import StudyFolder
 
 # How long the address of a cluster is tried [s].
 _CONNECT_S = 10.0
+# How often a task looks at its job, and a task that is to stop is told so [s].
+_POLL_S, _TELL_S = 0.2, 2.0
+# How long a task may take to say that its job has ended [s].
+_ANSWER_S = 10.0
+# Otherwise a worker that ends, as when the runner is killed, kills its job.
+_LET_LIVE = {"RAY_kill_child_processes_on_worker_exit": "false"}
 
 
 def connect(address: str) -> int:
@@ -41,6 +49,7 @@ def connect(address: str) -> int:
     Raises:
         ValueError: If there is none.
     """
+    handler = signal.getsignal(signal.SIGTERM)
     try:
         if address != "auto":
             # Ray would ask for minutes.
@@ -51,13 +60,16 @@ def connect(address: str) -> int:
             log_to_driver=False,
             logging_level="ERROR",
             # Nodes have egoskin installed: nothing is sent to them.
-            runtime_env={"env_vars": own_settings()},
+            runtime_env={"env_vars": {**own_settings(), **_LET_LIVE}},
         )
     except (OSError, ValueError, RuntimeError) as error:
         raise ValueError(
             f"no Ray cluster at {address!r} ({_lines(error)[0]}); begin one with: "
             "ray start --head"
         ) from None
+    finally:
+        # Ray's own would end this process with another status.
+        signal.signal(signal.SIGTERM, handler)
     return int(ray.cluster_resources().get("CPU", 1))
 
 
@@ -91,13 +103,36 @@ class RayRunner(Runner):
         return found
 
     def _stop(self) -> None:
-        tasks = list(self._tasks.values())
+        left = list(self._tasks.values())
         self._tasks.clear()
-        for task in tasks:
-            # As Ctrl-C there; one that waits for a core never begins.
-            ray.cancel(task)
-        if tasks:
-            ray.wait(tasks, num_returns=len(tasks), timeout=PATIENCE_S)
+        deadline = time.monotonic() + PATIENCE_S + _ANSWER_S
+        while left and time.monotonic() < deadline:
+            for task in left:
+                # One that waits for a core never begins. A worker that still imports
+                # may miss it.
+                ray.cancel(task)
+            _, left = ray.wait(left, num_returns=len(left), timeout=_TELL_S)
+
+
+class _Cancel:
+    """Whether Ray cancels the task that this worker runs, while it is entered.
+
+    Ray sends no signal: it asks Python to call the handler of SIGINT, which Python does
+    between two instructions, and so never while it waits in the system without end.
+    """
+
+    def __init__(self) -> None:
+        self.requested = False
+
+    def __enter__(self) -> _Cancel:
+        self._before = signal.signal(signal.SIGINT, self._note)
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        signal.signal(signal.SIGINT, self._before)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        self.requested = True
 
 
 @ray.remote
@@ -107,15 +142,17 @@ def _work(path: str, name: str, nice: int, cores: int) -> tuple[int, str]:
     if not folder.manifest_path.is_file():
         node = ray.util.get_node_ip_address()
         return FAILED, f"node {node} does not see {path}: all nodes need the folder"
-    job: subprocess.Popen[bytes] = start_job(folder, name, nice, cores)
-    try:
-        status = job.wait()
-    except BaseException:
-        # The runner stops.
-        job.terminate()
-        end_job(job, PATIENCE_S)
-        raise
-    return status, how_it_ended(folder, name, status)
+    with _Cancel() as cancel:
+        job = start_job(folder, name, nice, cores)
+        try:
+            while job.poll() is None and not cancel.requested:
+                time.sleep(_POLL_S)
+        finally:
+            # The runner stops, or this worker has got a SIGTERM.
+            if job.poll() is None:
+                job.terminate()
+                end_job(job, PATIENCE_S)
+        return job.returncode, how_it_ended(folder, name, job.returncode)
 
 
 def _lines(error: BaseException) -> list[str]:

@@ -155,7 +155,10 @@ class Runner(ABC):
             clock = time.monotonic()
             if self._again.get(run.name, clock) > clock:
                 continue
-            if is_claimed(self._folder.claims, run.name):
+            folder = self._folder
+            if is_claimed(folder.claims, run.name) or folder.is_trained_elsewhere(
+                run.name
+            ):
                 self._again[run.name] = clock + _AGAIN
                 continue
             self._begin(run)

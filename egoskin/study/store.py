@@ -173,6 +173,11 @@ class StudyFolder:
         """
         path, config = self.run_path(planned.name), planned.config
         if not path.exists():
+            if path.is_symlink():
+                raise ValueError(
+                    f"{path} is a link to {os.readlink(path)}, which is not there: put "
+                    "it back, or remove the link to train the run anew"
+                )
             # Under its name there is a whole one or none.
             new = path.with_name(f".{planned.name}.new")
             shutil.rmtree(new, ignore_errors=True)
@@ -294,10 +299,10 @@ class StudyFolder:
 
     def failure(self, name: str) -> Failure | None:
         """Return how a run failed, None if it has not."""
-        path = self._failure_path(name)
-        if not path.exists():
+        try:
+            content = read_json(self._failure_path(name))
+        except FileNotFoundError:
             return None
-        content = read_json(path)
         return Failure(tries=content["tries"], error=content["error"])
 
     def note_failure(self, name: str, error: str) -> Failure:
@@ -312,7 +317,8 @@ class StudyFolder:
     def forget_failures(self) -> None:
         """Let runs that failed too often be tried again."""
         for path in (self.path / "failed").glob("*.json"):
-            path.unlink()
+            # A run that finishes forgets its own.
+            path.unlink(missing_ok=True)
 
     def last_words(self, name: str) -> str:
         """Return the last line that a run's last process said, its error first."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import signal
@@ -9,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -103,6 +105,30 @@ def test_a_heart_beats(tmp_path: Path):
         (owner,) = tmp_path.glob("run.owner.*")
         os.utime(owner, (0, 0))
         deadline = time.monotonic() + 10
+        while owner.stat().st_mtime < 1:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+
+
+def test_a_heart_beats_on_after_an_error_of_the_file_system(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    # Such as ESTALE of NFS, once.
+    listing, errors = Path.iterdir, [OSError(errno.ESTALE, "stale")]
+
+    def fail_once(path: Path) -> Iterator[Path]:
+        if errors and threading.current_thread() is not threading.main_thread():
+            raise errors.pop()
+        return listing(path)
+
+    monkeypatch.setattr(Path, "iterdir", fail_once)
+    with claimed(tmp_path, "run", heartbeat=0.02):
+        (owner,) = tmp_path.glob("run.owner.*")
+        deadline = time.monotonic() + 10
+        while errors:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        os.utime(owner, (0, 0))
         while owner.stat().st_mtime < 1:
             assert time.monotonic() < deadline
             time.sleep(0.01)

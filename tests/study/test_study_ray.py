@@ -2,21 +2,30 @@
 
 from __future__ import annotations
 
+import dataclasses
 import signal
+import time
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
 from test_study_runner import (
+    BATCH,
+    STUDY,
     in_the_middle,
     jobs,
     start,
     study,
     table,
-    tiny,
     undisturbed,
     wait_for,
 )
+
+from egoskin.runs.run import Run
+from egoskin.study.claims import is_locked
+from egoskin.study.manifest import Manifest, resolve
+from egoskin.study.runner import PATIENCE_S
+from egoskin.study.store import StudyFolder
 
 ray = pytest.importorskip("ray", reason="extra ray")
 pytestmark = [
@@ -24,7 +33,14 @@ pytestmark = [
     # Of Ray, while it is imported.
     pytest.mark.filterwarnings("ignore"),
 ]
-__all__ = ["start", "study", "tiny", "undisturbed"]
+__all__ = ["start", "study", "undisturbed"]
+
+
+@pytest.fixture(scope="module")
+def tiny() -> Manifest:
+    """A study of two runs, without a checkpoint on the way: each is that of a stop."""
+    base = {**STUDY.base, "checkpoint_interval": 3600.0}
+    return resolve(dataclasses.replace(STUDY, seeds=(0,), frames=16 * BATCH, base=base))
 
 
 @pytest.fixture
@@ -44,6 +60,24 @@ def on(cluster: Any) -> tuple[str, ...]:
     return ("--on", "ray", "--ray-address", cluster.address)
 
 
+def kept(folder: StudyFolder) -> dict[str, int]:
+    """Return the frames of the checkpoints of runs that have stopped, by name.
+
+    No process has them, and nothing they have trained is lost.
+    """
+    assert not jobs(folder)
+    stopped = {}
+    for status in folder.status(folder.manifest()):
+        path = folder.run_path(status.run.name)
+        assert status.state in ("missing", "begun", "done")
+        assert not is_locked(path / "lock")
+        if status.state == "begun" and status.frames:
+            _, header = Run.open(path).load_checkpoint()
+            assert header["frames"] == status.frames
+            stopped[status.run.name] = status.frames
+    return stopped
+
+
 def test_a_node_that_is_lost_costs_no_run(cluster, study, start, undisturbed):
     runner = start(study.path, *on(cluster))
     wait_for(lambda: in_the_middle(study))
@@ -60,6 +94,7 @@ def test_a_runner_that_is_killed_ends_its_tasks(cluster, study, start, undisturb
     runner.process.send_signal(signal.SIGKILL)
     runner.end()
     wait_for(lambda: not jobs(study))
+    assert kept(study)
     again = start(study.path, *on(cluster))
     assert again.end() == 0, again.text()
     assert table(study) == undisturbed
@@ -69,10 +104,20 @@ def test_ctrl_c_ends_all_tasks_with_checkpoints(cluster, study, start, undisturb
     runner = start(study.path, *on(cluster))
     wait_for(lambda: in_the_middle(study))
     runner.process.send_signal(signal.SIGINT)
+    begin = time.monotonic()
     assert runner.end() == 130
+    assert time.monotonic() - begin < PATIENCE_S
     assert "Traceback" not in runner.text()
-    wait_for(lambda: not jobs(study))
-    assert any(s.state == "begun" for s in study.status(study.manifest()))
+    before = kept(study)
+    assert before
+    # A batch system says so otherwise, here before anything has begun.
+    ended = start(study.path, *on(cluster))
+    wait_for(ended.text)
+    ended.process.send_signal(signal.SIGTERM)
+    assert ended.end() == 143, ended.text()
+    assert "Traceback" not in ended.text()
+    after = kept(study)
+    assert all(after.get(name, frames) >= frames for name, frames in before.items())
     again = start(study.path, *on(cluster))
     assert again.end() == 0, again.text()
     assert table(study) == undisturbed

@@ -27,9 +27,9 @@ from egoskin.storage.serialization import to_plain
 from egoskin.study.claims import claimed
 from egoskin.study.cost import cost, measure
 from egoskin.study.job import CLAIMED, STOPPED, Stop, work
-from egoskin.study.manifest import EvaluationPlan, Manifest, Study, resolve
+from egoskin.study.manifest import EvaluationPlan, Manifest, PlannedRun, Study, resolve
 from egoskin.study.metrics import runs_csv
-from egoskin.study.runner import Progress, slurm_script
+from egoskin.study.runner import LocalRunner, Progress, slurm_script
 from egoskin.study.store import Failure, StudyFolder, duration
 from studies import as_format_1
 
@@ -191,6 +191,16 @@ def test_a_run_of_another_study_is_not_adopted(folder: StudyFolder, tmp_path: Pa
         other.results(manifest)
 
 
+def test_an_adopted_run_that_is_gone_is_named(folder: StudyFolder, tmp_path: Path):
+    made = tmp_path / "made"
+    shutil.move(folder.run_path(NAME), made)
+    shutil.rmtree(folder.result_path(NAME))
+    folder.adopt(folder.manifest(), made)
+    made.rename(tmp_path / "elsewhere")
+    with pytest.raises(ValueError, match=f"blind-seed0 is a link to {made}, which is"):
+        work(folder, NAME, Never())
+
+
 def test_a_run_with_another_skin_is_refused(folder: StudyFolder):
     manifest = folder.manifest()
     cell = dataclasses.replace(manifest.cells[0], skin_sha256="0" * 64)
@@ -260,6 +270,19 @@ def test_status_tells_failures_and_what_is_left(folder: StudyFolder):
     assert folder.status(manifest)[1].state == "missing"
 
 
+def test_a_failure_that_is_forgotten_meanwhile_is_none(
+    folder: StudyFolder, monkeypatch: pytest.MonkeyPatch
+):
+    # Another runner's job finishes the run while this one asks.
+    folder.note_failure(NAME, "error")
+    (path,) = folder.path.glob("failed/*.json")
+    path.unlink()
+    monkeypatch.setattr(Path, "exists", lambda path: True)
+    assert folder.failure(NAME) is None
+    monkeypatch.setattr(Path, "glob", lambda folder, pattern: [path])
+    folder.forget_failures()
+
+
 def test_a_study_costs_whole_runs_on_whole_cores(tiny: Manifest):
     total = cost(tiny, per_s=1000)
     # 4 runs of 3.072 s: on three cores the fourth has to wait.
@@ -298,6 +321,24 @@ def test_the_slurm_script_shares_the_folder_among_its_elements():
 
 
 # --- the runner, and faults done to it for real -------------------------------------
+
+
+class Asked(LocalRunner):
+    """Ends when it would begin a run."""
+
+    def _begin(self, run: PlannedRun) -> None:
+        raise InterruptedError(run.name)
+
+
+def test_no_process_is_begun_for_a_run_that_ppo_trains(folder: StudyFolder):
+    shutil.rmtree(folder.result_path(NAME))
+    runner = Asked(folder, parallel=1)
+    (planned,) = folder.manifest().runs
+    with Run.open(folder.run_path(NAME)).locked():
+        # Each would import for seconds, and leave it to it.
+        runner._start([planned])
+    with pytest.raises(InterruptedError, match=NAME):
+        Asked(folder, parallel=1)._start([planned])
 
 
 class Runner:
@@ -358,7 +399,7 @@ def undisturbed(tiny: Manifest, tmp_path_factory) -> list[dict[str, str]]:
     runner = Runner(folder.path)
     assert runner.end() == 0, runner.text()
     rows = table(folder)
-    assert len({row["policy_sha256"] for row in rows}) == len(rows) == 4
+    assert len({row["policy_sha256"] for row in rows}) == len(rows) == len(tiny.runs)
     return rows
 
 
