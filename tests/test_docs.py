@@ -271,7 +271,7 @@ def test_throws_and_ends_are_as_they_say():
         f"scale = {task.action_scale:g} x torque limit / kp",
         f"each joint within {task.start_joint_noise:g} rad",
         f"by time (`truncated`) {task.episode_length_s:g} s after",
-        f"*Success* is to last for {task.success_s:g} s",
+        f"*Success* means surviving for {task.success_s:g} s",
         f"{len(H1_2.joints)} joints, {H1_2.model.body_mass.sum():.0f} kg",
     ):
         assert claim in text, claim

@@ -23,9 +23,13 @@ from egoskin.evaluation.upper_bound import (
 from egoskin.make import EnvConfig, make_worker_env
 from egoskin.policies.policy import Policy, load_policy
 
-STORED = Path(__file__).parents[2].joinpath(
-    "studies/version-1/results/field-proximity-2m-seed0/policies",
-    "000065536000.safetensors",
+STORED = (
+    Path(__file__)
+    .parents[2]
+    .joinpath(
+        "studies/version-1/results/field-proximity-2m-seed0/policies",
+        "000065536000.safetensors",
+    )
 )
 THROWS = 16
 SEARCH = SearchConfig(samples=24, iterations=3, stand_s=0.75)
