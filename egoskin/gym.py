@@ -149,7 +149,7 @@ class DodgeballGym(gymnasium.Env[np.ndarray, np.ndarray]):
         self.action_space = self._rows.action_space
         self.render_mode = render_mode
         hz = self.config.task.physics.control_hz
-        self.metadata = {"render_modes": ["rgb_array"], "render_fps": round(hz)}
+        self.metadata = {**self.metadata, "render_fps": round(hz)}
         self._env: Any = None
         self._painter: Any = None
 

@@ -19,7 +19,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from egoskin.study.claims import is_claimed
 from egoskin.study.job import CLAIMED, STOPPED, command
 from egoskin.study.manifest import Manifest, PlannedRun
 from egoskin.study.store import START, RunStatus, StudyFolder, duration, now
@@ -155,10 +154,7 @@ class Runner(ABC):
             clock = time.monotonic()
             if self._again.get(run.name, clock) > clock:
                 continue
-            folder = self._folder
-            if is_claimed(folder.claims, run.name) or folder.is_trained_elsewhere(
-                run.name
-            ):
+            if self._folder.is_running(run.name):
                 self._again[run.name] = clock + _AGAIN
                 continue
             self._begin(run)

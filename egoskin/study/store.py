@@ -223,6 +223,10 @@ class StudyFolder:
         """Return whether somebody else trains a run, such as ppo.py an adopted one."""
         return is_locked(self.run_path(name) / "lock")
 
+    def is_running(self, name: str) -> bool:
+        """Return whether a process has a run: one of a study, or another."""
+        return is_claimed(self.claims, name) or self.is_trained_elsewhere(name)
+
     def is_finished(self, name: str) -> bool:
         """Return whether a run has been trained and judged."""
         return any(self.result_path(name).glob(_EVALUATION))
@@ -346,7 +350,7 @@ class StudyFolder:
         frames, wall = int(row.get("frames", 0)), row.get("time/wall_s", 0.0)
         failure = self.failure(run.name)
         state: State = "missing"
-        if is_claimed(self.claims, run.name) or self.is_trained_elsewhere(run.name):
+        if self.is_running(run.name):
             state = "running"
         elif failure is not None:
             state = "failed"

@@ -23,14 +23,8 @@ from egoskin.evaluation.upper_bound import (
 from egoskin.make import EnvConfig, make_worker_env
 from egoskin.policies.policy import Policy, load_policy
 
-STORED = (
-    Path(__file__)
-    .parents[2]
-    .joinpath(
-        "studies/version-1/results/field-proximity-2m-seed0/policies",
-        "000065536000.safetensors",
-    )
-)
+ROOT = Path(__file__).parents[2]
+RUN = ROOT / "studies/version-1/results/field-proximity-2m-seed0"
 THROWS = 16
 SEARCH = SearchConfig(samples=24, iterations=3, stand_s=0.75)
 
@@ -38,7 +32,7 @@ SEARCH = SearchConfig(samples=24, iterations=3, stand_s=0.75)
 @pytest.fixture(scope="module")
 def policy() -> Policy:
     # Of the balls of version 1 it leaves the search some to avoid.
-    return load_policy(STORED)
+    return load_policy(RUN / "policies/000065536000.safetensors")
 
 
 def task(policy: Policy) -> EnvConfig:
