@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 import resource
+import signal
 import sys
 from collections.abc import Iterable, Mapping
 from importlib import import_module
@@ -54,7 +55,7 @@ def main() -> None:
     """Run the command that the first argument of this process names."""
     name, *args = sys.argv[1:] or ["--help"]
     if name in ("--help", "-h"):
-        print(_page())
+        _show(_page())
     elif name == "--version":
         print(f"egoskin {__version__}")
     elif name in COMMANDS:
@@ -77,7 +78,7 @@ def begin(name: str) -> None:
     if "--help-all" in args:
         sys.argv[1:] = ["--help" if arg == "--help-all" else arg for arg in args]
     elif pages.asked_for(name, args):
-        print(pages.page(name))
+        _show(pages.page(name))
         raise SystemExit(0)
     _check_address_space()
     if name in _PICTURES:
@@ -93,6 +94,12 @@ def run(name: str) -> None:
 
     with clear_errors():
         command.main(sys.argv[1:])
+
+
+def _show(text: str) -> None:
+    """Print, and end without a word if nobody reads it, as in `| head -1`."""
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+    print(text, flush=True)
 
 
 def _check_address_space() -> None:

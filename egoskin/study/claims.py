@@ -21,6 +21,7 @@ import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import IO
 
 HEARTBEAT_S = 15.0
 """Time between two beats of an owner's heart [s]."""
@@ -110,13 +111,24 @@ def claimed(
 @contextmanager
 def _lock(path: Path, *, create: bool) -> Iterator[bool]:
     """Hold a lock; yield whether nobody else does."""
-    with open(path, "a" if create else "r+") as file:
+    with _open(path, create=create) as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             yield False
             return
         yield True
+
+
+def _open(path: Path, *, create: bool) -> IO[str]:
+    """Open a file to lock; some shared folders lock only what is open to be written."""
+    if create:
+        return open(path, "a")
+    try:
+        return open(path, "r+")
+    except PermissionError:
+        # Who may only read may still look.
+        return open(path)
 
 
 def _owners(folder: Path, name: str) -> list[Path]:

@@ -52,8 +52,10 @@ def connect(address: str) -> int:
     handler = signal.getsignal(signal.SIGTERM)
     try:
         if address != "auto":
-            # Ray would ask for minutes.
             host, _, port = address.rpartition(":")
+            if not host or not port.isdecimal():
+                raise ValueError("host:port, as in 10.0.0.1:6379")
+            # Ray would ask for minutes.
             socket.create_connection((host, int(port)), _CONNECT_S).close()
         ray.init(
             address=address,
@@ -74,11 +76,21 @@ def connect(address: str) -> int:
 
 
 class RayRunner(Runner):
-    """Works on the cluster that `connect` has connected to."""
+    """Works on the cluster that `connect` has connected to.
+
+    Raises:
+        ValueError: If no node has the cores that each run is to have.
+    """
 
     def __init__(self, folder: StudyFolder, **options: Any) -> None:
         # Nodes have other working folders.
         super().__init__(StudyFolder(folder.path.resolve()), **options)
+        cores = [int(n["Resources"].get("CPU", 0)) for n in ray.nodes() if n["Alive"]]
+        if self._cores > max(cores, default=0):
+            raise ValueError(
+                f"--cores-per-run {self._cores}: the nodes of the cluster have "
+                f"{', '.join(map(str, cores))} cores, and a run needs one node"
+            )
         self._tasks: dict[str, ray.ObjectRef] = {}
 
     def _running(self) -> Collection[str]:

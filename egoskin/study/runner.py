@@ -9,6 +9,7 @@ even SIGKILL, ends its runs with a checkpoint, and whoever starts it again goes 
 from __future__ import annotations
 
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -253,6 +254,8 @@ def slurm_script(
         hours: Time limit of each; one that reaches it stops with checkpoints.
     """
     minutes = max(round(60 * hours), 1)
+    logs = shlex.quote(str(folder / "logs" / "slurm-%A-%a.log"))
+    path = shlex.quote(str(folder))
     return f"""#!/bin/bash
 # Study {manifest.study}: {len(manifest.runs)} runs that all elements share.
 # An element that reaches its time limit stops with checkpoints, and one that is lost
@@ -265,6 +268,6 @@ def slurm_script(
 #SBATCH --time={minutes}
 #SBATCH --signal=B:TERM@180
 #SBATCH --requeue
-#SBATCH --output={folder}/logs/slurm-%A-%a.log
-exec egoskin study run --dir {folder} --parallel "$SLURM_CPUS_PER_TASK"
+#SBATCH --output={logs}
+exec egoskin study run --dir {path} --parallel "$SLURM_CPUS_PER_TASK"
 """

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import inspect
+import os
 import re
 import resource
 import runpy
+import signal
 import subprocess
 import sys
 from importlib import import_module
@@ -47,6 +49,16 @@ def test_help_comes_at_once_and_lists_the_commands():
         assert re.search(rf"^  {name} +{text}$", done.stdout, re.MULTILINE)
     assert not heavy(done.stderr)
     assert resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before < 1
+
+
+@pytest.mark.parametrize("args", [("--help",), ("train", "--help")])
+def test_help_that_nobody_reads_is_no_error(args: tuple[str, ...]):
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-m", "egoskin", *args]
+    done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, cwd=ROOT)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (-signal.SIGPIPE, b"")
 
 
 def heavy(import_times: str) -> set[str]:

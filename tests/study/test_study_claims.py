@@ -47,6 +47,26 @@ def elsewhere(folder: Path, age: float, number: int = 1) -> Path:
     return path
 
 
+def test_who_may_only_read_sees_claims(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    folder = tmp_path / "claims"
+    process = hold(folder)
+    (folder / "run.lock").chmod(0o444)
+    tmp_path.chmod(0o755)
+    # Relative: the folders above may be closed to others.
+    monkeypatch.chdir(tmp_path)
+    user = os.geteuid()
+    if user == 0:
+        os.seteuid(65534)
+    try:
+        assert not os.access("claims/run.lock", os.W_OK, effective_ids=True)
+        assert is_claimed(Path("claims"), "run")
+    finally:
+        os.seteuid(user)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    assert not is_claimed(folder, "run")
+
+
 def test_a_claim_is_held_by_one_process_and_freed_by_its_death(tmp_path: Path):
     folder = tmp_path / "claims"
     process = hold(folder)

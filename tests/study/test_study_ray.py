@@ -131,7 +131,16 @@ def test_ctrl_c_ends_all_tasks_with_checkpoints(cluster, study, start, undisturb
 
 
 def test_without_a_cluster_there_is_one_line(study, start):
-    runner = start(study.path, "--on", "ray", "--ray-address", "127.0.0.1:1")
+    for address, text in (("127.0.0.1:1", "refused"), ("127.0.0.1", "host:port")):
+        runner = start(study.path, "--on", "ray", "--ray-address", address)
+        assert runner.end() == 2
+        (line,) = runner.text().splitlines()
+        assert f"no Ray cluster at '{address}'" in line
+        assert text in line
+
+
+def test_runs_that_fit_on_no_node_do_not_wait_for_one(cluster, study, start):
+    runner = start(study.path, *on(cluster), "--cores-per-run", "2")
     assert runner.end() == 2
     (line,) = runner.text().splitlines()
-    assert "no Ray cluster at '127.0.0.1:1'" in line
+    assert "--cores-per-run 2: the nodes of the cluster have 0, 1, 1 cores" in line

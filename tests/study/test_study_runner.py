@@ -318,6 +318,9 @@ def test_the_slurm_script_shares_the_folder_among_its_elements():
     for line in ("--array=0-2", "--cpus-per-task=8", "--time=90", "--signal=B:TERM@"):
         assert f"#SBATCH {line}" in text
     assert '--dir /a/b --parallel "$SLURM_CPUS_PER_TASK"' in text
+    text = slurm_script(manifest, Path("/a/b c"), cores=8, elements=3, hours=1.5)
+    assert "exec egoskin study run --dir '/a/b c' --parallel" in text
+    assert "#SBATCH --output='/a/b c/logs/slurm-%A-%a.log'" in text
 
 
 # --- the runner, and faults done to it for real -------------------------------------
