@@ -92,8 +92,16 @@ def find_robot(name: str) -> RobotConfig:
     )
 
 
-def _by_name_or_portable(name: str) -> str | RobotConfig:
-    """Return a robot as configurations keep it."""
+def kept_robot(name: str) -> str | RobotConfig:
+    """Return a robot as configurations keep it: a name of the package, or data.
+
+    Args:
+        name: What `find_robot` takes.
+
+    Raises:
+        ValueError: If there is no such robot, or its description is wrong.
+        OSError: If a file that it names cannot be read.
+    """
     return name if name in ROBOTS else portable(find_robot(name))
 
 
@@ -107,7 +115,7 @@ Robot = Annotated[
     PrimitiveConstructorSpec(
         nargs=1,
         metavar="NAME|PATH",
-        instance_from_str=lambda texts: _by_name_or_portable(texts[0]),
+        instance_from_str=lambda texts: kept_robot(texts[0]),
         is_instance=lambda value: isinstance(value, (str, RobotConfig)),
         str_from_instance=lambda value: [_name(value)],
     ),

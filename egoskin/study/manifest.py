@@ -25,6 +25,7 @@ from egoskin.envs.standards import Standard, training_task
 from egoskin.hints import did_you_mean
 from egoskin.make import EnvConfig
 from egoskin.rng import check_seed
+from egoskin.robots.own import kept_robot
 from egoskin.runs.config import MACHINE_FIELDS, TrainConfig
 from egoskin.sensors import Skin
 from egoskin.storage.formats import (
@@ -47,6 +48,8 @@ Overrides = Mapping[str, Any]
 # What a study decides by itself, and what all its cells share.
 _NOT_OF_A_STUDY = MACHINE_FIELDS | {"seed", "total_frames", "device", "engine"}
 _OF_ALL_CELLS = {"snapshot_frames", "checkpoint_interval"}
+# It is compared as a whole: one is a name, another is data.
+_ROBOT = "env.robot"
 # What names a cell already.
 _LABEL = ("env.sensor.coverage", "env.sensor.signal", "env.sensor.range")
 
@@ -356,9 +359,13 @@ def override(
         if full.split(".")[0] in fixed:
             raise ValueError(f"{what}: {name} cannot be chosen here")
         try:
+            if full == _ROBOT and isinstance(value, str):
+                value = kept_robot(value)
             _set(plain, full, to_plain(value), known=True)
         except KeyError as error:
             raise ValueError(f"{what}: {error.args[0]}") from None
+        except (ValueError, OSError) as error:
+            raise ValueError(f"{what}: {error}") from error
     try:
         return from_plain(TrainConfig, plain, what)
     except ValueError as error:
@@ -372,9 +379,14 @@ def cell_name(base: TrainConfig, config: TrainConfig) -> str:
     parts = [config.env.sensor.label()]
     for name, value in _differences(base, config).items():
         if name not in _LABEL:
-            words = [name.rpartition(".")[2], str(value)]
+            words = [name.rpartition(".")[2], brief(value)]
             parts += [re.sub(r"[^\w.]+", "-", word).strip("-") for word in words]
     return "-".join(parts)
+
+
+def brief(value: Any) -> str:
+    """Return the value of a field as text: of a robot that is data, its name."""
+    return str(value.get("name", value) if isinstance(value, dict) else value)
 
 
 def _differences(base: TrainConfig, config: TrainConfig) -> dict[str, Any]:
@@ -385,7 +397,11 @@ def _differences(base: TrainConfig, config: TrainConfig) -> dict[str, Any]:
 
 def _plain_differences(base: TrainConfig, config: TrainConfig) -> dict[str, Any]:
     old, new = to_plain(base), to_plain(config)
-    return {name: _get(new, name) for name in changed_fields(old, new)}
+    names = (
+        _ROBOT if name.startswith(f"{_ROBOT}.") else name
+        for name in changed_fields(old, new)
+    )
+    return {name: _get(new, name) for name in dict.fromkeys(names)}
 
 
 def _get(content: Any, name: str) -> Any:

@@ -25,7 +25,7 @@ from egoskin.study.figures import (
     success_by_range,
 )
 from egoskin.study.findings import Judged, Tested, judge_findings
-from egoskin.study.manifest import Manifest
+from egoskin.study.manifest import Manifest, brief
 from egoskin.study.metrics import METRICS, runs_csv, tables
 from egoskin.study.statistics import (
     Table,
@@ -204,7 +204,7 @@ def _blocks(
     yield Text(
         "Not the default in all of them: "
         + (
-            ", ".join(f"{k.removeprefix('env.')} = {v}" for k, v in default)
+            ", ".join(f"{k.removeprefix('env.')} = {brief(v)}" for k, v in default)
             or "nothing"
         )
         + ". All figures in full precision: runs.csv."

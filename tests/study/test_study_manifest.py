@@ -23,6 +23,7 @@ from egoskin.study.manifest import (
 from egoskin.study.metrics import METRICS
 from egoskin.study.shipped import PAPER, SMOKE, STUDIES
 from egoskin.study.store import StudyFolder
+from owning import TOML, write_robot
 from studies import as_format_1
 
 STUDY = Study(
@@ -236,3 +237,24 @@ def test_an_option_that_is_no_more_and_had_an_effect_is_refused(tmp_path: Path):
     )
     with pytest.raises(ValueError, match=r"manifest\.json was made with core_frames="):
         folder.manifest()
+
+
+def test_robots_of_ones_own_are_kept_as_data(tmp_path: Path):
+    one = str(write_robot(tmp_path / "one"))
+    other = str(write_robot(tmp_path / "other", TOML.replace("kp = 150", "kp = 160")))
+    cells = ({}, {"robot": other}, {"robot": "h1_2"})
+    own = changed(base={"robot": one, "skin.num_sensors": 8}, cells=cells)
+    names = [
+        "field-proximity-2m",
+        *(f"field-proximity-2m-robot-{name}" for name in ("other", "h1_2")),
+    ]
+    assert [cell.name for cell in own.cells] == names
+    own.save(tmp_path / "manifest.json")
+    for name in ("one", "other"):
+        (tmp_path / name / "robot.toml").unlink()
+    loaded = Manifest.load(tmp_path / "manifest.json")
+    assert loaded == own
+    gains = [cell.config.env.robot_config.gains for cell in loaded.cells[:2]]
+    assert [each["stiff"]["*_hip"].kp for each in gains] == [150, 160]
+    with pytest.raises(ValueError, match=r"small, cell 1: .*robot.toml"):
+        changed(cells=({"robot": one},))
