@@ -1,1 +1,1 @@
-"""What a policy does on throws that no training has seen; what a skin can know."""
+"""Evaluation of policies on held-out throws, and of the visibility of a skin."""

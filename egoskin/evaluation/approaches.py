@@ -1,10 +1,10 @@
-"""Balls that come to a standing robot, and which sensors see them.
+"""Balls that approach a standing robot, and the sensors that detect them.
 
-The robot stands still in its default pose and a ball comes along given paths. A path
-ends where the ball first touches the body; what is under the floor does not count. The
-ball is *seen* from the first moment at which any sensor detects it.
+The robot stands still in its default pose and a ball moves along a given path. A path
+ends where the ball first touches the body; positions below the floor are ignored. The
+ball is *seen* from the first step at which any sensor detects it.
 
-Contract: a path is followed in steps, so times and clearances are exact to one step.
+Contract: paths are followed in steps, so times and clearances are exact to one step.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from egoskin.shapes import Sphere
 from egoskin.transform import RowTransform
 
 THROW_STEP = 0.002
-"""Time step in which throws are followed [s]."""
+"""Time step of throw paths [s]."""
 _STEP = 0.01
-"""Step in which straight approaches are followed [m]."""
+"""Step length of straight approach paths [m]."""
 _GRID_DEG = 5.0
-"""Spacing of the map's directions [deg]."""
+"""Spacing of the directions of the map [deg]."""
 _NUM_SURFACE_POINTS = 1000
-# Positions worked on at a time: temporaries then stay below 100 MB.
+# Positions processed at a time; keeps temporaries below 100 MB.
 _CHUNK, _BODY_CHUNK = 4096, 2**17
 
 Progress = Callable[[str, float], None]
-"""Called with what is in work, and the share of it that is done."""
+"""Called with the name of the current task and the share of it that is done."""
 
 
 class StandingRobot:
@@ -55,7 +55,7 @@ class StandingRobot:
         self.base_pose = torch.tensor([*self.origin, 1.0, 0.0, 0.0, 0.0]).float()
         position, self.link_rotation = default_frames(robot)
         self.link_position = position + self.origin
-        # Their "link frame" is now the world.
+        # The shapes, with the world as their link frame.
         self._shapes = []
         for shape in robot.primitives:
             i = robot.links.index(shape.link)
@@ -67,19 +67,19 @@ class StandingRobot:
                     rotation=turn @ shape.rotation,
                 )
             )
-        # A capsule's end is its radius and its half length away.
+        # A capsule's end is at most its radius plus half length from its centre.
         self.reach = max(
             float(np.linalg.norm(s.position - self.origin) + s.size.sum())
             for s in self._shapes
         )
-        """No point of the body is farther from the base than this [m]."""
+        """Upper bound on the distance of the body's points from the base [m]."""
 
     def distance(self, points: np.ndarray, within: float = math.inf) -> np.ndarray:
         """Signed distance from points to the body, negative inside.
 
         Args:
             points: Points in the world [m], ``[n, 3]``.
-            within: Farther points may get a lower bound that is above this [m].
+            within: Beyond this distance, a lower bound above it may be returned [m].
 
         Returns:
             Distance [m], ``[n]``.
@@ -91,7 +91,7 @@ class StandingRobot:
         return distance
 
     def standoff(self, skin: Skin) -> float:
-        """Return how far off the body a skin's outermost sensor is [m], at least 0."""
+        """Return the largest distance of a sensor from the body [m], at least 0."""
         link = [self.config.links.index(name) for name in skin.links]
         turned = (self.link_rotation[link] @ skin.position[..., None])[..., 0]
         return max(0.0, float(self.distance(turned + self.link_position[link]).max()))
@@ -99,25 +99,26 @@ class StandingRobot:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Trace:
-    """When the ball of each of ``n`` paths of ``T`` steps is seen, in ``C`` cells."""
+    """Contacts and detections along ``n`` paths of ``T`` steps, in ``C`` cells."""
 
     gap: Tensor
-    """From the ball's surface to the body [m], ``[n, T]``; far away a lower bound."""
+    """Distance from ball surface to body [m], ``[n, T]``; far away a lower bound."""
     contact: Tensor
-    """Step of the contact, ``[n]``; T for a path that misses or meets the floor."""
+    """Step of the contact, ``[n]``; T without one, or if it is below the floor."""
     runway: Tensor
-    """Gap from which on the ball is above the floor [m], ``[n]``; infinite: always."""
+    """Gap below which the ball is above the floor [m], ``[n]``; infinite if always."""
     num_sensors: Tensor
-    """Sensors that detect the ball at each step before, ``[C, n, T]``."""
+    """Number of sensors that detect the ball at each step before contact,
+    ``[C, n, T]``."""
 
     @property
     def touches(self) -> Tensor:
-        """Whether the path ends at the body, ``[n]``."""
+        """Whether the ball touches the body, ``[n]``."""
         return self.contact < self.gap.shape[1]
 
     @cached_property
     def first_seen(self) -> Tensor:
-        """Step of the first detection, ``[C, n]``; that of the contact if never."""
+        """Step of the first detection, ``[C, n]``; the contact step if never seen."""
         first = (self.num_sensors > 0).to(torch.uint8).argmax(-1)
         return torch.where(self.seen, first, self.contact)
 
@@ -128,7 +129,7 @@ class Trace:
 
     @property
     def clearance(self) -> Tensor:
-        """Gap at the first detection [m], ``[C, n]``; 0 if never."""
+        """Gap at the first detection [m], ``[C, n]``; 0 if never seen."""
         last = self.gap.shape[1] - 1
         at_first = self.gap.gather(1, self.first_seen.clamp(max=last).t()).t()
         return torch.where(self.seen, at_first, 0.0)
@@ -140,13 +141,13 @@ def pipelines(
     sensors: Mapping[str, SensorConfig],
     max_range: float,
 ) -> dict[str, SensorPipeline]:
-    """Return ideal sensors that give one distance each, by name.
+    """Return ideal sensors, by name, that give one distance each.
 
     Args:
         robot: The robot.
         skin: The sensors.
-        sensors: What they measure, by name: coverage and occlusion count.
-        max_range: For sensors without a range of their own [m].
+        sensors: Sensor configurations by name; only coverage and occlusion are used.
+        max_range: Range of sensors that have none of their own [m].
     """
     made = {}
     for name, config in sensors.items():
@@ -165,14 +166,14 @@ def pipelines(
 
 
 def farthest(sensors: Mapping[str, SensorPipeline]) -> float:
-    """Return how far any sensor of any of the pipelines sees [m]."""
+    """Return the largest reach of all sensors of all pipelines [m]."""
     return max(float(each.skin.reach().max()) for each in sensors.values())
 
 
 def _measure(
     body: StandingRobot, sensors: Sequence[RowTransform], centre: Tensor
 ) -> Tensor:
-    """Return what sensors read of a ball [m], ``[m, S]``, for centres ``[m, 3]``."""
+    """Return sensor readings [m], ``[m, S]``, for ball centres [m], ``[m, 3]``."""
     m = len(centre)
     upright = centre.new_tensor([1.0, 0.0, 0.0, 0.0]).expand(m, 4)
     state = TensorDict(
@@ -195,22 +196,22 @@ def trace(
     *,
     progress: Progress = lambda what, share: None,
 ) -> Trace:
-    """Return when balls on given paths touch the body and who detects them before.
+    """Return when balls on given paths touch the body and which sensors detect them.
 
     Args:
         body: The robot.
         position: Centres of the balls along the paths [m], ``[n, T, 3]``.
         skin: The sensors.
-        sensors: What `pipelines` made of them, for the longest of the ranges.
-        ranges: Ranges, for sensors without one of their own [m].
+        sensors: Result of `pipelines` for the longest of the ranges.
+        ranges: Ranges of sensors that have none of their own [m].
         ball: The ball.
-        progress: Called with the name of the pipeline in work.
+        progress: Called with the name of the current pipeline.
 
     Returns:
-        The traces; cells in the order of pipelines and, within one, of ranges.
+        The traces; cells are ordered by pipeline and, within one, by range.
     """
     n, steps, _ = position.shape
-    # A sensor that stands off the body sees as much farther than the body is near.
+    # The standoff of a sensor adds to its range, as seen from the body.
     near = farthest(sensors) + body.standoff(skin)
     flat = position.reshape(-1, 3)
     distance = [
@@ -279,7 +280,7 @@ def direction_paths(body: StandingRobot, ball: Sphere, distance: float) -> Tenso
     Args:
         body: The robot.
         ball: The ball.
-        distance: Clearance that the paths start with, at least [m].
+        distance: Least clearance at the start of the paths [m].
 
     Returns:
         Centres of the ball [m], ``[n, T, 3]``.
@@ -294,17 +295,17 @@ def direction_paths(body: StandingRobot, ball: Sphere, distance: float) -> Tenso
 def surface_paths(
     body: StandingRobot, ball: Sphere, distance: float, seed: int
 ) -> tuple[Tensor, np.ndarray]:
-    """Return straight paths along the normals of points spread over the body.
+    """Return straight paths along the normals of points sampled on the body.
 
     Args:
         body: The robot.
         ball: The ball.
-        distance: Clearance that the paths start with [m].
+        distance: Clearance at the start of the paths [m].
         seed: Seed of the points.
 
     Returns:
-        Centres of the ball [m], ``[n, T, 3]``, the last where it touches the point;
-        and the index of each point's link, ``[n]``.
+        Centres of the ball [m], ``[n, T, 3]``, the last at contact with the point; and
+        the index of each point's link, ``[n]``.
     """
     links = list(dict.fromkeys(s.link for s in body.config.primitives))
     points = sample_surface(body.config, links, _NUM_SURFACE_POINTS, seed)
@@ -320,18 +321,18 @@ def surface_paths(
 def throw_paths(
     body: StandingRobot, config: ThrowConfig, num_throws: int, seed: int, dt: float
 ) -> tuple[Tensor, Tensor]:
-    """Return the flights of the first throws of some episodes.
+    """Return the flight paths of the first throws of some episodes.
 
     Args:
-        body: The robot they are aimed at.
+        body: The robot that is aimed at.
         config: The throws.
-        num_throws: How many, ``n``.
+        num_throws: Number of throws, ``n``.
         seed: Seed of the run or of the throw set.
-        dt: Time step of the simulation that they are thrown in [s].
+        dt: Physics time step [s].
 
     Returns:
-        Centres of the ball [m], ``[n, T, 3]``, and the azimuth that each comes from
-        [rad], ``[n]``.
+        Centres of the ball [m], ``[n, T, 3]``, and the azimuth of each throw [rad],
+        ``[n]``.
     """
     thrower = Thrower(config, body.config, dt)
     row, zero = torch.arange(num_throws), torch.zeros(num_throws, dtype=torch.int64)
@@ -342,12 +343,12 @@ def throw_paths(
         torch.zeros(num_throws, 3),
         body.joint_pos.expand(num_throws, -1),
     )
-    # Until the slowest is past the body.
+    # Until the slowest ball is past the body.
     way = draw.distance + body.reach + config.radius
     longest = (way / release.velocity[:, :2].norm(dim=-1)).max()
     time = torch.arange(0.0, float(longest), THROW_STEP)[:, None]
     paths = release.position[:, None] + release.velocity[:, None] * time
     if config.flight == "ballistic":
-        # z(t) = z0 + vz t - g t (t + dt) / 2, as the integrator makes it.
+        # z(t) = z0 + vz t - g t (t + dt) / 2, as the integrator computes it.
         paths[..., 2] -= (0.5 * GRAVITY * time * (time + dt))[:, 0]
     return paths, draw.azimuth

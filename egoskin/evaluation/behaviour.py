@@ -1,7 +1,8 @@
-"""A throw set -> what a policy does: which it dodges, where it goes, how hard.
+"""Behaviour of a policy on a throw set: throws dodged, displacement and motion.
 
-Everything comes from the environment's state. Throws are sorted by what they are at a
-robot that stands in its default pose, so a throw is in the same group for every policy.
+Everything is computed from the environment's state. Throws are grouped by how they
+arrive at a robot standing in its default pose, so a throw is in the same group for
+every policy.
 """
 
 from __future__ import annotations
@@ -31,66 +32,66 @@ from egoskin.robots.config import RobotConfig
 from egoskin.robots.kinematics import LinkKinematics, rotate
 from egoskin.sensors import Skin
 
-# Ages at which it is read where the base is [s].
+# Ages at which the displacement of the base is recorded [s].
 _AGES = (1.0, 2.0, 3.0, 5.0)
 _NUMBERS = ("first", "second", "third", "later")
 # Bounds of the groups by height aimed at [m], by speed at arrival [m/s] and by time
-# since the throw before [s]: about a third of the standard throws in each.
+# since the previous throw [s]; each group has about a third of the standard throws.
 _HEIGHTS, _SPEEDS, _GAPS = (0.9, 1.2), (5.3, 6.7), (1.33, 1.67)
-# When a robot has settled from its start [s].
+# Time a robot needs to settle after its start [s].
 _SETTLED = 0.5
-# A point of a foot this close to the floor stands on it [m] (contacts give way a
-# little, so zero is too strict).
+# A point of a foot this close to the floor counts as in contact [m] (contacts are
+# compliant, so zero is too strict).
 _ON_FLOOR = 0.005
 
 
 @dataclass(frozen=True, kw_only=True)
 class Group:
-    """How the throws of one kind fare."""
+    """Results for the throws of one kind."""
 
     name: str
-    """What they have in common."""
+    """The property that they share."""
     success: Estimate | None
-    """Share of the episodes whose first ball is one of them that succeed, as in
-    `Evaluation`; None if there are none."""
+    """Success, as in `Evaluation`, of the episodes whose first ball is of this kind;
+    None if there are none."""
     episodes: int
     """Number of these episodes."""
     first_hits: float | None
-    """Share of the first balls that hit, of those that arrived."""
+    """Share of hits among the first balls that arrived."""
     later_hits: float | None
-    """Share of the later balls that hit, of those that arrived."""
+    """Share of hits among the later balls that arrived."""
     later_balls: int
     """Number of later balls that arrived."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Displacement:
-    """Where the base is in the episodes that last to an age."""
+    """Position of the base in the episodes that last to an age."""
 
     age: float
-    """Age, from the first throw on [s]."""
+    """Time since the first throw [s]."""
     episodes: int
     """Number of these episodes."""
     mean: float | None
-    """Mean planar way from the start [m]."""
+    """Mean planar distance from the start [m]."""
     largest_tenth: float | None
-    """The way that a tenth of them exceeds [m]."""
+    """90th percentile of the planar distance [m]."""
     height: float | None
     """Mean height of the base above ground [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Motion:
-    """How a robot moves: means over all steps but those that end an episode."""
+    """Motion: means over all steps except those that terminate an episode."""
 
     power: float
     """Mechanical power of the joints, sum |torque x velocity| [W]."""
     joint_acceleration: float
-    """Root mean square of the joints' accelerations, from step to step [rad/s^2]."""
+    """Root mean square joint acceleration, by differences of steps [rad/s^2]."""
     torque_saturation: float
-    """Share of the joints' torques that are at their limit."""
+    """Share of joint torques at their limit."""
     foot_slip: float
-    """Speed at which the lowest corner of a foot slides while on the floor [m/s]."""
+    """Sliding speed of the lowest corner of a foot while on the floor [m/s]."""
     airborne: float
     """Share of the steps in which no link touches the floor."""
     self_contact: float
@@ -99,7 +100,7 @@ class Motion:
 
 @dataclass(frozen=True, kw_only=True)
 class Waiting:
-    """How a robot waits for the first throw: means over all steps from 0.5 s on."""
+    """Motion before the first throw: means over all steps from 0.5 s on."""
 
     base_speed: float
     """Planar speed of the base [m/s]."""
@@ -111,19 +112,19 @@ class Waiting:
 
 @dataclass(frozen=True, kw_only=True)
 class Behaviour:
-    """What a policy does with a throw set, within 10 s."""
+    """Behaviour of a policy on a throw set, within 10 s."""
 
     throws: dict[str, list[Group]]
     """Groups by number of the ball, direction, height aimed at, speed at arrival, time
-    since the throw before, link aimed at."""
+    since the previous throw, link aimed at."""
     waiting: Waiting | None
-    """Before the first throw; None where that is at the start."""
+    """Motion before the first throw; None if that is at the start."""
     displacement: list[Displacement]
-    """Way from the start."""
+    """Distance from the start."""
     motion: Motion
-    """How it moves."""
+    """Motion of the policy."""
     motion_zero_action: Motion
-    """The same of the zero action, which asks for the default pose."""
+    """Motion of the zero action, whose target is the default pose."""
 
 
 def behave(
@@ -137,7 +138,7 @@ def behave(
     mask: Sequence[str] = (),
     on_step: Callable[[int, int], None] | None = None,
 ) -> tuple[Evaluation, Behaviour]:
-    """Return how a policy fares on a throw set, and what it does there.
+    """Return the evaluation and the behaviour of a policy on a throw set.
 
     Args:
         policy: Writes ``action`` into a TensorDict; None is the zero action.
@@ -169,10 +170,10 @@ def behave(
 
 
 class Watcher:
-    """Sees every step of a throw set (`throw_set.Watch`) and sums up.
+    """Collects statistics over the steps of a throw set (a `throw_set.Watch`).
 
     Args:
-        config: What the environment is made of.
+        config: Environment configuration.
         throw_set: Seed of the throw set.
         episodes: Size of the throw set, ``N``.
     """
@@ -193,12 +194,12 @@ class Watcher:
         gap = (self._draw.interval * self._hz).round().long().clamp(min=1)
         gap = gap.reshape(episodes, count)
         delay = self._thrower.first_delay(seed, row, row * 0).reshape(episodes, count)
-        # Step at the end of which each ball is thrown, [N, K]: the draws' alone.
+        # Step at the end of which each ball is thrown, [N, K]; a function of the draws.
         self._thrown = gap.cumsum(1) - gap + (delay * self._hz).round().long()
         self._arrived = torch.zeros(episodes, count, dtype=torch.bool)
         self._hit = self._arrived.clone()
         self._failed = torch.zeros(episodes, dtype=torch.bool)
-        # Way and height at each age, of the episodes that last, [2, n].
+        # Distance and height at each age, of the episodes that last, [2, n].
         self._base: dict[float, list[Tensor]] = {moment: [] for moment in _AGES}
         self._waited = self._fallen_waiting = 0
         self._waiting_speed = self._waiting_power = 0.0
@@ -210,7 +211,7 @@ class Watcher:
     def __call__(
         self, before: TensorDictBase, after: TensorDictBase, running: Tensor
     ) -> None:
-        """See one step; the arguments are those of `throw_set.Watch`."""
+        """Record one step; the arguments are those of `throw_set.Watch`."""
         self._step += 1
         ended = running & after["terminated"][:, 0]
         age = self._step - after["first_throw_step"][:, 0]
@@ -224,14 +225,14 @@ class Watcher:
             way = after["displacement_w"][now].square().sum(-1).sqrt()
             self._base[moment].append(torch.stack((way, after["base_pose"][now, 2])))
         self._see_balls(after, running)
-        # A blow, a fall or a failed simulation is not how the policy moves.
+        # A hit, a fall or a failed simulation does not count as motion of the policy.
         self._see_motion(before[going], after[going])
 
     def _see_balls(self, after: TensorDictBase, running: Tensor) -> None:
         newest = (self._thrown < self._step).sum(1) - 1
         rows = running.nonzero()[:, 0]
         for ball in range(self._balls):
-            # The last throw so far of this ball: they are thrown in turn.
+            # The latest throw of this ball; balls are thrown in turn.
             throw = (newest - (newest - ball) % self._balls)[rows]
             flown, throw = rows[throw >= 0], throw[throw >= 0]
             self._arrived[flown, throw] |= after["object_arrived"][flown, ball]
@@ -244,7 +245,7 @@ class Watcher:
         self._waiting_power += float(after["power"].double().sum())
 
     def waiting(self) -> Waiting | None:
-        """Return how the robot waited for the first throw."""
+        """Return the motion before the first throw; None if there was no such step."""
         if not self._waited:
             return None
         return Waiting(
@@ -270,7 +271,7 @@ class Watcher:
             self._counts[name] = self._counts.get(name, 0) + value.numel()
 
     def motion(self) -> Motion:
-        """Return how the robot moved."""
+        """Return the motion of the robot."""
         mean = {
             name: total / max(self._counts[name], 1)
             for name, total in self._sums.items()
@@ -279,7 +280,7 @@ class Watcher:
         return Motion(**mean)
 
     def displacement(self) -> list[Displacement]:
-        """Return where the base was at each age."""
+        """Return the displacement of the base at each age."""
         result = []
         for age in _AGES:
             way, height = torch.cat([torch.zeros(2, 0), *self._base[age]], 1)
@@ -296,7 +297,7 @@ class Watcher:
         return result
 
     def groups(self) -> dict[str, list[Group]]:
-        """Return how the throws of each kind fared."""
+        """Return the results for the throws of each kind, by property."""
         height, speed = self._thrower.at_standing_robot(self._draw)
         number = torch.arange(self._arrived.shape[1]).clamp(max=len(_NUMBERS) - 1)
         result = {
@@ -319,19 +320,19 @@ class Watcher:
         return result
 
     def _gaps(self) -> tuple[Tensor, list[str]]:
-        """Return the band of the time since the throw before; first balls are one."""
+        """Return the band of the time since the previous throw; 0 for first balls."""
         gap = (self._thrown[:, 1:] - self._thrown[:, :-1]) / self._hz
         band, names = _bands(gap, _GAPS, "s")
         first = torch.zeros_like(band[:, :1])
         return torch.cat((first, band + 1), 1), ["first ball", *names]
 
     def _split(self, kind: Tensor, names: Sequence[str]) -> list[Group]:
-        """Return the groups of throws of the same kind, ``[N * K]`` int64."""
+        """Return a group for each kind of throw; ``kind`` is ``[N * K]`` int64."""
         kind = kind.reshape(self._arrived.shape)
         return [self._group(kind == i, name) for i, name in enumerate(names)]
 
     def _group(self, member: Tensor, name: str) -> Group:
-        """Return how some of the throws, ``[N, K]`` bool, fared."""
+        """Return the results for the throws in ``member``, ``[N, K]`` bool."""
         first = member[:, 0]
         episodes = int(first.sum())
         failed = int((self._failed & first).sum())
@@ -379,7 +380,7 @@ class _Feet:
         return pose[..., :3] + rotate(pose[..., 3:], points_b)
 
     def slip(self, before: TensorDictBase, after: TensorDictBase) -> Tensor:
-        """Return how far the lowest corner of each foot slides in a step [m].
+        """Return the distance that the lowest corner of each foot slides in a step [m].
 
         Args:
             before: State of ``B`` rows at the start of the step.
@@ -387,7 +388,7 @@ class _Feet:
 
         Returns:
             Planar distance, ``[B, F]``; NaN where that corner does not stay on the
-            floor. A foot that rolls over an edge does not slide.
+            floor. A foot that rolls over an edge is not counted as sliding.
         """
         start, end = self.corners_w(before), self.corners_w(after)
         lowest = start[..., 2:].argmin(2, keepdim=True).expand(-1, -1, 1, 3)
@@ -400,7 +401,7 @@ class _Feet:
 def _bands(
     values: Tensor, bounds: Sequence[float], unit: str
 ) -> tuple[Tensor, list[str]]:
-    """Return which band each value is in, ``[n]`` int64, and the bands' names."""
+    """Return the band index of each value, ``[n]`` int64, and the bands' names."""
     between = [
         f"{a:g} to {b:g} {unit}" for a, b in zip(bounds, bounds[1:], strict=False)
     ]

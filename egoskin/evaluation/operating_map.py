@@ -1,7 +1,7 @@
-"""What a skin is good for: success against speed, tempo, height and direction.
+"""Operating map: success against speed, interval, height and direction of throws.
 
-Each is varied alone, beyond what is trained on, and speed with tempo. All else is the
-task's.
+Each property is varied alone, beyond its training range; speed and interval are also
+varied together. Everything else is as in the task.
 """
 
 from __future__ import annotations
@@ -32,34 +32,34 @@ _HEIGHTS = (0.3, 0.5, 0.7, 0.9, 1.1, 1.3, 1.5)
 _DIRECTIONS = (-180.0, -135.0, -90.0, -45.0, 0.0, 45.0, 90.0, 135.0)
 _GRID_SPEEDS = (3.0, 4.0, 6.0, 8.0, 10.0)
 _GRID_INTERVALS = (0.5, 1.0, 1.5, 2.0, 3.0)
-# Balls aimed at one height come within this of the middle of the body [m].
+# Half width of the box aimed at when the height is fixed [m].
 _HALF_WIDTH = 0.15
-# Half the width of a direction [deg].
+# Half width of the sector around each direction [deg].
 _SECTOR = 22.5
 
 
 @dataclass(frozen=True, kw_only=True)
 class Point:
-    """How a policy fares on throws that differ from the task's in one or two values."""
+    """Results for throws that differ from the task's in one or two properties."""
 
     values: tuple[float, ...]
-    """The values."""
+    """Values of these properties."""
     success: Estimate
     """Share of episodes without contact, see `throw_set.Evaluation`."""
     avoided: float | None
-    """Balls avoided per ball that arrived, first and later ones; None if none did."""
+    """Balls avoided per ball that arrived, over all balls; None if none arrived."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Line:
-    """Success against one property of the throws, or two."""
+    """Success against one or two properties of the throws."""
 
     names: tuple[str, ...]
-    """What is varied, with its unit."""
+    """Names of the properties, with units."""
     trained: tuple[tuple[float, float] | None, ...]
-    """The range that is trained on, of each; None if it says nothing."""
+    """Training range of each property; None if there is none to show."""
     points: list[Point]
-    """Points, those of the second property fastest."""
+    """Points; the second property varies fastest."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,7 +122,7 @@ _MAPS = (
 
 
 def check_map(config: EnvConfig) -> None:
-    """Raise ValueError if the actor observes each ball: a map takes more of them."""
+    """Raise ValueError for an oracle actor, whose observation fixes the ball count."""
     if config.sensor.coverage == "oracle":
         raise ValueError(
             f"a map takes more balls than the {config.task.throws.num_balls} that an "
@@ -131,8 +131,8 @@ def check_map(config: EnvConfig) -> None:
 
 
 def _with_enough_balls(throws: ThrowConfig) -> ThrowConfig:
-    """Return throws none of whose balls is thrown again before it has passed."""
-    # To the base, and on until the environment says that it has passed.
+    """Return throws with enough balls that each has passed before its next throw."""
+    # Distance to the base, and from there to where the ball counts as passed.
     way = math.hypot(throws.distance[1], throws.height[1]) + PASSED_DISTANCE
     number = math.ceil(way / throws.speed[0] / throws.interval[0])
     return dataclasses.replace(throws, num_balls=max(throws.num_balls, number))
@@ -149,20 +149,20 @@ def operating_map(
     mask: Sequence[str] = (),
     on_point: Callable[[int, int], None] | None = None,
 ) -> list[Line]:
-    """Return how a policy fares on throws within and beyond what it was trained on.
+    """Return the results of a policy on throws within and beyond its training range.
 
     Args:
         policy: Writes ``action`` into a TensorDict; None is the zero action.
         config: Robot, task, sensors.
         skin: The skin.
         throw_set: Seed of the throws.
-        episodes: Episodes of each point.
+        episodes: Episodes per point.
         num_workers: Processes; the result does not depend on it.
         mask: Links whose sensors detect nothing, or `egoskin.sensors.MASK_ALL`.
-        on_point: Called with (points done, points in all).
+        on_point: Called with (points done, total points).
 
     Returns:
-        Success against speed, tempo, height and direction, and against speed and tempo.
+        Success against speed, interval, height, direction, and speed with interval.
 
     Raises:
         ValueError: If the policy's observation depends on the number of balls.
@@ -210,7 +210,7 @@ def operating_map(
 
 
 def _grid(properties: Sequence[_Property]) -> list[tuple[float, ...]]:
-    """Return all combinations of the values, those of the last property fastest."""
+    """Return all combinations of the values; the last property varies fastest."""
     grid: list[tuple[float, ...]] = [()]
     for what in properties:
         grid = [(*values, value) for values in grid for value in what.values]
@@ -222,8 +222,8 @@ def draw_map(path: Path, lines: Sequence[Line], title: str) -> None:
 
     Args:
         path: Picture to write.
-        lines: What `operating_map` returned.
-        title: Whose it is.
+        lines: Result of `operating_map`.
+        title: Title of the figure.
     """
     from matplotlib.figure import Figure
 

@@ -1,6 +1,6 @@
-"""What a policy bears: its success on a robot that is not its model.
+"""Robustness: success of a policy on robots that differ from the model.
 
-Every policy meets the same robots, delays and pushes, drawn for the throw set.
+Every policy gets the same robots, delays and pushes, drawn with the throw set's seed.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ PERTURBATIONS = {
         **{**_TOGETHER, "delay_steps": (0, 2)}
     ),
 }
-"""What a robot is perturbed by, by name; factors of each link, joint, robot."""
+"""Perturbations by name; factors are drawn for each link, joint or robot."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Perturbed:
-    """How a policy fares under one perturbation."""
+    """Results of a policy under one perturbation."""
 
     name: str
     """Key of `PERTURBATIONS`."""
@@ -60,14 +60,14 @@ def perturb(
     on_point: Callable[[int, int], None] | None = None,
     **which: Any,
 ) -> list[Perturbed]:
-    """Return how a policy fares under each perturbation.
+    """Return the results of a policy under each perturbation.
 
     Args:
         policy: Writes ``action`` into a TensorDict; None is the zero action.
         config: Robot, task, sensors; its own randomization is replaced.
         skin: The skin.
-        on_point: Called with (perturbations done, all of them).
-        which: Throw set, episodes, workers and mask, as `play_throws` takes them.
+        on_point: Called with (perturbations done, total perturbations).
+        which: Throw set, episodes, workers and mask; passed to `play_throws`.
     """
     found = []
     for number, (name, ranges) in enumerate(PERTURBATIONS.items(), 1):

@@ -1,10 +1,10 @@
-"""A fixed throw set -> how well a policy dodges, with intervals.
+"""Evaluation of a policy on a fixed throw set, with 95 % intervals.
 
 The throw set of seed ``s`` is the draws of episode 0 of rows 0 to ``episodes - 1``:
 azimuth, distance, height, speed, interval, link and point aimed at. Draws are
-counter-based, so nothing is stored, and every policy, skin and number of workers meets
-the same throws.
-No training meets them (`throw_seed`). All times count from the first throw.
+counter-based, so nothing is stored, and every policy, skin and number of workers gets
+the same throws. They are held out from training, see `throw_seed`. All times count from
+the first throw.
 """
 
 from __future__ import annotations
@@ -36,11 +36,12 @@ from egoskin.sensors import Skin
 
 Watch = Callable[[TensorDictBase, TensorDictBase, Tensor], None]
 """Called after each step with the state before it and the action, the state after it
-(``[N]`` rows, raw keys kept) and the rows whose episode it belongs to, ``[N]`` bool."""
+(``[N]`` rows, raw keys kept) and the rows whose episode is still running, ``[N]``
+bool."""
 
-# Success is read once more at this age [s].
+# Success is also reported at this age [s].
 _LATER = 5.0
-# Up to so many episodes take less time than workers take to start.
+# Up to this many episodes take less time than starting workers.
 _FEW = 64
 # Two-sided 95 % quantile of the normal distribution.
 _Z = 1.959964
@@ -63,23 +64,23 @@ class Avoided:
     """Balls avoided per ball that arrived; None if none arrived."""
 
     first_ball: float | None
-    """The first, thrown while the robot still stands."""
+    """First ball, thrown while the robot still stands."""
     later_balls: float | None
-    """All others, as long as the episode lasts."""
+    """All later balls of the episode."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """How a policy fares on a throw set.
+    """Results of a policy on a throw set.
 
-    Success is read at the task's ``success_s``, 3 s of the standard task; success and
-    the shares of the ends up to then add up to 1. Times count from the first throw.
+    Success is evaluated at the task's ``success_s``, 3 s in the standard task; success
+    and the shares of endings up to then add up to 1. Times count from the first throw.
     """
 
     success: Estimate
     """Share of episodes without contact, fall or divergence up to then (Wilson)."""
     success_5s: Estimate
-    """The same up to 5 s, where what is learnt from a skin tells cells apart better."""
+    """The same up to 5 s, where trained policies with different skins differ more."""
     survival_time: Estimate
     """Mean survival time [s], restricted to 10 s."""
     ended_by_ball: float
@@ -87,11 +88,11 @@ class Evaluation:
     ended_by_fall: float
     """Share ended by a fall."""
     ended_by_self_contact: float
-    """Share ended because the robot touched itself, where that ends it."""
+    """Share ended by self-contact, if the task ends episodes at it."""
     diverged: float
     """Share whose simulation failed."""
     rigid_success: float
-    """Success on the same throw set of the robot held rigid in its default pose."""
+    """Success on the same throw set with the robot held rigid in its default pose."""
     avoided: Avoided
     """Balls avoided per ball that arrived, within 10 s."""
     episodes: int
@@ -103,20 +104,20 @@ class Episodes:
     """How each episode of a throw set ended, ``[N]`` each."""
 
     steps: Tensor
-    """Length from the first throw on [control steps]; not positive if it was not thrown
-    before the end."""
+    """Length from the first throw [control steps]; not positive if the episode ended
+    before it."""
     hit: Tensor
     """Ended by a ball, bool."""
     fallen: Tensor
-    """Ended by a fall (and no ball), bool."""
+    """Ended by a fall, and not by a ball, bool."""
     diverged: Tensor
-    """Ended by a failed simulation (and neither), bool."""
+    """Ended by a failed simulation, and not by a ball or a fall, bool."""
     self_contact: Tensor
     """Ended by self-contact alone, bool."""
     arrived: Tensor
-    """Balls that arrived: the first, later ones, ``[N, 2]``."""
+    """Number of balls that arrived: first and later ones, ``[N, 2]``."""
     avoided: Tensor
-    """Of these without a touch, ``[N, 2]``."""
+    """How many of these did not touch the robot, ``[N, 2]``."""
 
 
 def wilson(successes: int, n: int) -> Estimate:
@@ -161,16 +162,16 @@ def play_throws(
         skin: The skin.
         throw_set: Seed of the throw set.
         episodes: Number of episodes, all played side by side.
-        first: Row of the first of them; with ``watch`` alone.
-        num_workers: Processes; the result does not depend on it. None: as many as fill
-            the cores, or of few episodes threads of this process, which start at once.
+        first: Row of the first episode; must be 0 without ``watch``.
+        num_workers: Processes; the result does not depend on it. None: enough to use
+            all cores, or threads of this process for few episodes, to start faster.
         hold: Whether the robot is held rigid in its default pose.
         mask: Links whose sensors detect nothing, or `egoskin.sensors.MASK_ALL`.
         on_step: Called with (steps done, episodes still running).
-        watch: Sees every step; the throws are then played in this process, with
-            threads instead of workers, and come to the same.
-        engine: What simulates.
-        device: Where engine warp does.
+        watch: Called after every step; the throws are then played in this process,
+            with threads instead of workers and the same result.
+        engine: Physics engine.
+        device: Device of engine warp.
     """
     assert first == 0 or watch is not None
     seed = throw_seed(config, throw_set)
@@ -180,7 +181,7 @@ def play_throws(
         "seed": seed,
         "hold": hold,
         "mask": mask,
-        # Nobody reads what sensors give.
+        # The sensor signals are not needed.
         "bare": policy is None and watch is None,
     }
     few = num_workers is None and episodes <= _FEW
@@ -215,7 +216,7 @@ def play_throws(
                 action = torch.zeros(env.action_spec.shape, device=env.device)
             else:
                 action = policy(flat)["action"]
-                # MuJoCo would take NaN for zero, and the figures would look ordinary.
+                # MuJoCo treats NaN as zero, so the results would look normal.
                 if not action.isfinite().all():
                     raise ValueError(
                         f"the policy's action is not finite at step {step}: its "
@@ -256,26 +257,26 @@ def play_throws(
 
 
 def standard_task(config: EnvConfig, version: Standard = "2") -> EnvConfig:
-    """Return the configuration with the throws and ends a standard judges by."""
+    """Return the configuration with the evaluation throws and ends of a standard."""
     return dataclasses.replace(config, task=evaluation_task(version, config.task))
 
 
 def throw_seed(config: EnvConfig, throw_set: int) -> int:
     """Return the seed of a throw set's draws.
 
-    It is one that no training uses. Version 1 of the standard throw alone keeps the
-    draws it had, which are those of the first episodes of a training with that seed.
+    Training never uses this seed. The exception is version 1 of the standard throw: its
+    draws are those of the first episodes of a training with seed ``throw_set``.
     """
     return throw_set if config.standard == "1" else held_out(throw_set)
 
 
 def summarize(played: Episodes, rigid: Episodes, task: DodgeballConfig) -> Evaluation:
-    """Return the figures of a throw set from how its episodes ended.
+    """Return the results of a throw set from the ends of its episodes.
 
     Args:
         played: Episodes of the policy.
         rigid: Episodes of the rigid robot on the same throw set.
-        task: The task, for its control rate and the age of success.
+        task: The task; its control rate and ``success_s`` are used.
     """
     control_hz = task.physics.control_hz
     n, limit = len(played.steps), round(task.success_s * control_hz)
@@ -318,7 +319,7 @@ def evaluate(
     engine: Engine = "mujoco",
     device: torch.device | str = "cpu",
 ) -> Evaluation:
-    """Return how a policy fares on a throw set, beside the rigid robot.
+    """Return the results of a policy on a throw set, with those of the rigid robot.
 
     Args:
         policy: Writes ``action`` into a TensorDict; None is the zero action.
@@ -329,9 +330,9 @@ def evaluate(
         num_workers: Processes; the result does not depend on it.
         mask: Links whose sensors detect nothing, or `egoskin.sensors.MASK_ALL`.
         on_step: Called with (steps done, episodes still running).
-        watch: Sees every step of the policy's episodes, see `play_throws`.
-        engine: What simulates.
-        device: Where engine warp does.
+        watch: Called after every step of the policy's episodes, see `play_throws`.
+        engine: Physics engine.
+        device: Device of engine warp.
     """
 
     def play(who: Any, hold: bool) -> Episodes:

@@ -1,7 +1,7 @@
-"""A policy and a ball in reach -> what the body could still do about it.
+"""Upper bound on dodging: the best actions once a ball is within reach of a sensor.
 
-A search over actions, not a policy: what it finds no policy need ever find, but the
-body and the time that was left allow it.
+This is a search over actions, not a policy. A policy may never find these actions, but
+they are feasible for the body in the time that is left.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from egoskin.sensors import Skin
 from egoskin.sensors.config import SensorConfig
 from egoskin.sensors.pipeline import SensorPipeline
 
-# Share of the plans that the next ones are drawn around, and how much of their mean and
-# deviation stays from one iteration to the next.
+# Share of elite plans, and weight of the previous mean and standard deviation in each
+# update.
 _ELITE, _KEPT = 0.1, 0.25
-# Below this deviation of the entries nothing new would be tried.
+# Lower bound on the standard deviation of the entries, to keep exploring.
 _LEAST_SPREAD = 0.1
-# Of two plans that end alike the smaller one is better.
+# Cost of a plan's size: of two plans with the same outcome, the smaller is better.
 _SIZE_COST = 1e-3
 # A step that no episode reaches.
 _NEVER = 2**31
@@ -36,26 +36,26 @@ _NEVER = 2**31
 
 @dataclass(frozen=True, kw_only=True)
 class SearchConfig:
-    """Plans, and the search for the best of them."""
+    """Form of the plans, and settings of the search."""
 
     samples: int = 128
-    """Plans tried for each throw in each iteration."""
+    """Plans per throw and iteration."""
     iterations: int = 20
     """Iterations of the search."""
     entries: int = 8
-    """Entries of a plan, one after the other."""
+    """Number of consecutive entries of a plan."""
     hold: int = 4
-    """Control steps that each entry lasts."""
+    """Control steps for which each entry is held."""
     spread: float = 1.2
-    """Standard deviation of the entries at first, in units of the action."""
+    """Initial standard deviation of the entries, in units of the action."""
     stand_s: float = 1.25
-    """Time after the start of the plan that is watched: longer than the ball takes, and
-    the robot must not fall [s]."""
+    """Time simulated from the start of a plan [s]: longer than the ball takes to pass;
+    the robot must not fall."""
     seed: int = 0
-    """Seed of the plans drawn."""
+    """Seed of the random plans."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for values with which nothing can be searched."""
+        """Raise ValueError for invalid values."""
         for name in ("iterations", "entries", "hold", "spread", "stand_s"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
@@ -65,29 +65,29 @@ class SearchConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """How throws end, ``[N]`` bool each."""
+    """Outcomes of throws, ``[N]`` bool each."""
 
     avoided: Tensor
     """The ball does not touch the robot within `SearchConfig.stand_s`."""
     stood: Tensor
-    """Nor does the robot fall."""
+    """Nor does the robot fall in that time."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class UpperBound:
-    """What a policy makes of some balls, and what could be made of them."""
+    """Outcomes of some throws with the policy, and with the best plan found."""
 
     height: Tensor
     """Height aimed at, at the standing robot [m], ``[N]``."""
     policy: Outcome
     """The policy alone."""
     best: Outcome
-    """The policy, with the best plan that was found added to its actions."""
+    """The policy with the best plan added to its actions."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Start:
-    """Where plans start, rows ``[N]``."""
+    """States in which plans start, rows ``[N]``."""
 
     throw: Tensor
     simulation: dict[str, Tensor]
@@ -115,18 +115,18 @@ def find_upper_bound(
     ball: int = 1,
     on_iteration: Callable[[int, Outcome], None] | None = None,
 ) -> UpperBound:
-    """Search the actions with which the balls of a throw set would be avoided.
+    """Search for actions that avoid the balls of a throw set.
 
-    The policy plays until the ball is within reach of a sensor. From there on a plan, a
-    few vectors of actions that last some control steps each, is added to its actions:
-    it keeps the balance meanwhile and takes over again afterwards. Plans are improved
-    by the cross-entropy method (Rubinstein, 1999) with independent Gaussians. The empty
-    plan is among those tried, so the best is never worse than the policy.
+    The policy acts alone until the ball is within reach of a sensor. From then on a
+    plan, a sequence of action vectors each held for some control steps, is added to its
+    actions; the policy keeps the balance meanwhile and acts alone again afterwards.
+    Plans are improved by the cross-entropy method (Rubinstein, 1999) with independent
+    Gaussians. The zero plan is always tried: the best is never worse than the policy.
 
     Args:
         policy: Writes the mean action.
         config: Robot, task (its throws are those of the throw set), sensors.
-        search: Plans and search.
+        search: Settings of plans and search.
         throw_set: Seed of the throw set.
         throws: Number of episodes of the throw set.
         reach: Distance from a sensor to the ball's surface at which plans start [m].
@@ -134,11 +134,11 @@ def find_upper_bound(
         on_iteration: Called with (iterations done, the best outcome so far).
 
     Returns:
-        What becomes of the balls that came within reach before the episode ended.
+        Outcomes for the balls that came within reach before the episode ended.
 
     Raises:
-        ValueError: If there is no such throw, or the sensors are corrupted: each copy
-            of a throw would wear other ones.
+        ValueError: If no ball comes within reach, ``stand_s`` is below a control step,
+            or the sensors are corrupted (each copy of a throw would have other ones).
     """
     if config.sensor.corruption != "none":
         raise ValueError(
@@ -150,7 +150,7 @@ def find_upper_bound(
         raise ValueError(
             f"stand_s must be at least one control step, got {search.stand_s}"
         )
-    # No plan is cut short by the age limit.
+    # The time limit must not cut a plan short.
     task = config.task
     length = task.episode_length_s + search.stand_s
     longer = replace(config, task=replace(task, episode_length_s=length))
@@ -215,19 +215,19 @@ def find_upper_bound(
 def _until_in_reach(
     env: TransformedEnv, policy: Policy, config: EnvConfig, reach: float, ball: int = 1
 ) -> _Start:
-    """Play a throw set; return each episode's state when its n-th ball is in reach."""
+    """Play a throw set; return the states at which the given ball comes in reach."""
     throws = env.batch_size[0]
     sensor = SensorConfig(coverage="field", signal="binary", range=reach)
     balls = config.task.throws.balls
     skin = policy.skin
-    # Where the sensors are, not what each of them sees.
+    # The sensors' places, without their own coverage and range.
     bare = Skin(
         robot=skin.robot, links=skin.links, position=skin.position, normal=skin.normal
     )
     pipeline = SensorPipeline(sensor, config.robot_config, bare)
     dt = 1 / config.task.physics.control_hz
     sense = Compose(pipeline.transforms(balls, dt=dt))
-    # Balls are thrown in turn: that of the others is not sensed.
+    # Balls are thrown in turn; only the one of this throw is sensed.
     mine = torch.arange(len(balls)) == (ball - 1) % len(balls)
     root = env.reset()
     kept = root.clone()
@@ -238,7 +238,7 @@ def _until_in_reach(
         now = _task(env).simulation_state()
         last = now["throw"] == ball
         if (now["next_throw_step"][last] < _NEVER).any():
-            # Nothing is thrown after it.
+            # No ball is thrown after it.
             now["next_throw_step"][last] = _NEVER
             _task(env).load_simulation_state(now)
         seen = root.clone(recurse=False)
@@ -266,10 +266,10 @@ def _until_in_reach(
 def _play(
     env: TransformedEnv, policy: Policy, start: _Start, plan: Tensor, steps: int
 ) -> tuple[Tensor, Tensor]:
-    """Play rows from their starts with a plan ``[M, T, J]`` added to the actions.
+    """Play from the start states with plans ``[M, T, J]`` added to the actions.
 
     Returns:
-        Whether no ball hit, ``[M]`` bool, and steps survived, ``[M]``.
+        Whether no ball hit, ``[M]`` bool, and number of steps survived, ``[M]``.
     """
     _task(env).load_simulation_state(start.simulation)
     root = start.root.clone()

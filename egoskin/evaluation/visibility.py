@@ -1,7 +1,7 @@
-"""What a skin sees before any training: directions, surface, seconds of warning.
+"""Visibility of a skin, without training: directions, surface, warning time.
 
-A *cell* is a coverage at a range, as in a table of ablations;
-`egoskin.evaluation.approaches` says what balls come and when they count as seen.
+A *cell* is a coverage with a range, as in an ablation table. The balls, and when they
+count as seen, are defined in `egoskin.evaluation.approaches`.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ from egoskin.sensors.config import SensorConfig
 from egoskin.shapes import Sphere
 
 CLEARANCES = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
-"""Clearances at which the share of directions seen by then is reported [m]."""
+"""Clearances for which the share of directions seen by then is reported [m]."""
 BANDS = (0.0, 0.8, 1.2, 1.6, math.inf)
-"""Heights of contact above ground that are distinguished [m]: legs to head."""
+"""Bounds of the bands of contact height above ground [m], from legs to head."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Cell:
-    """A coverage at a range."""
+    """A coverage with a range."""
 
     coverage: str
     """Name of the coverage."""
@@ -60,20 +60,20 @@ class Cell:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Analysis:
-    """What a skin sees, for every cell ``C``."""
+    """Visibility of a skin, for every cell ``C``."""
 
     cells: tuple[Cell, ...]
     """Coverages and ranges."""
     directions: Trace
     """Straight approaches to the base, in the order of `direction_grid`."""
     surface: Trace
-    """Straight approaches along the body's normals."""
+    """Straight approaches along normals of the body's surface."""
     surface_link: tuple[str, ...]
-    """Link of each of the latter."""
+    """Link of each approach in `surface`."""
     throws: Trace
     """Throws."""
     throw_azimuth: Tensor
-    """Where each comes from, relative to the heading [rad], ``[n]``."""
+    """Azimuth that each throw comes from, relative to the heading [rad], ``[n]``."""
     contact_height: Tensor
     """Height of the ball's centre at contact [m], ``[n]``."""
     control_period: float
@@ -86,40 +86,40 @@ class Analysis:
         return THROW_STEP * steps[:, self.throws.touches].double()
 
     def comes(self, cell: int) -> Tensor:
-        """Return from which directions of the map a ball can come, ``[n]`` bool.
+        """Return the map's directions from which a ball can come, ``[n]`` bool.
 
-        It must be above the floor all the way from the cell's range to the contact.
+        The ball must be above the floor from the cell's range until contact.
         """
         return self.directions.runway >= self.cells[cell].range
 
     def clearance_map(self, cell: int) -> np.ndarray:
         """Return the clearance at which a ball is first seen [m], ``[E, A]``.
 
-        0 where never, NaN where no ball can come from.
+        0 if never seen, NaN where no ball can come from.
         """
         return _on_grid(self.directions.clearance[cell], self.comes(cell))
 
     @property
     def reached(self) -> Tensor:
-        """Whether a ball gets to the surface point along its normal, ``[n]`` bool."""
+        """Whether a ball can reach the surface point along its normal, ``[n]`` bool."""
         # Rounding may put the contact a step before the last.
         last = self.surface.gap.shape[1] - 1
         return self.surface.touches & (self.surface.contact >= last - 1)
 
     def differing_share(self) -> np.ndarray:
-        """Return the share of hits whose warning differs by a control step, ``[C, C]``.
+        """Return the share of hits whose warnings differ by a control step, ``[C, C]``.
 
-        Cells of (almost) no difference give a policy the same time to act: only what
-        the signal says of the ball can set them apart.
+        Cells that (almost) never differ give a policy the same time to act; they can
+        then differ only in the information that the signal holds about the ball.
         """
         warning = self.warning
         apart = (warning[:, None] - warning).abs() > self.control_period
         return apart.double().mean(-1).numpy()
 
     def blind_cone(self, cell: int) -> dict[str, float]:
-        """Return the widest cone about a blind direction that holds no seen one [deg].
+        """Return the widest cone around a blind direction without a seen one [deg].
 
-        Directions from which no ball can come may lie in it.
+        It may contain directions from which no ball can come.
         """
         azimuth, elevation = (angle.ravel() for angle in direction_grid())
         vectors = unit_vectors(azimuth, elevation)
@@ -137,9 +137,9 @@ class Analysis:
         }
 
     def report(self) -> dict[str, Any]:
-        """Return all figures as JSON values (shares in [0, 1], SI units).
+        """Return all results as JSON values (shares in [0, 1], SI units).
 
-        None stands for a share or a time of nothing.
+        None stands for a share or a time of an empty set.
         """
         hits = int(self.throws.touches.sum())
         return {
@@ -174,13 +174,13 @@ class Analysis:
         }
 
     def _solid_angle_seen(self, i: int, clearance: float) -> float | None:
-        """Share of the directions in which a ball is seen by a clearance [m].
+        """Return the share of directions in which a ball is seen by a clearance [m].
 
-        Of those from which one `comes`: the longer the range, the fewer lead over the
-        floor.
+        Only directions of `comes` count; the longer the range, the fewer stay above
+        the floor.
         """
         comes = self.comes(i)
-        # A cell of an equirectangular map has an area in proportion to cos(elevation).
+        # The solid angle of a map cell is proportional to cos(elevation).
         solid = torch.from_numpy(np.cos(direction_grid()[1])).reshape(-1)[comes]
         if not len(solid):
             return None
@@ -218,10 +218,10 @@ class Analysis:
         }
 
     def _sensors_at_once(self, i: int) -> dict[str, float | None]:
-        """How many sensors detect a thrown ball at once, while any does.
+        """Return how many sensors detect a thrown ball at once, while any does.
 
-        One alone says where the ball is as finely as sensors stand; all at once say
-        nothing of it unless they also give the distance.
+        A single one locates the ball to within the sensor spacing; if all detect it,
+        the ball can only be located from their distances.
         """
         count = self.throws.num_sensors[i][self.throws.touches]
         count = count[count > 0].float()
@@ -232,7 +232,7 @@ class Analysis:
 
 
 def _on_grid(clearance: Tensor, comes: Tensor) -> np.ndarray:
-    """Return clearances by direction, NaN where no ball comes from, ``[E, A]``."""
+    """Return clearances by direction, ``[E, A]``, NaN where no ball can come from."""
     values = torch.where(comes, clearance, torch.nan)
     return values.reshape(direction_grid()[0].shape).numpy()
 
@@ -247,21 +247,21 @@ def see_directions(
 ) -> np.ndarray:
     """Return the clearance at which a ball from each direction is first seen [m].
 
-    As `Analysis.clearance_map`, of one cell, in the default pose.
+    This is `Analysis.clearance_map` for a single cell, in the default pose.
 
     Args:
         robot: The robot.
         skin: The sensors.
-        sensor: What they measure: coverage, range and occlusion count.
+        sensor: Sensor configuration; only coverage, range and occlusion are used.
         ball: The ball.
-        progress: Called with what is in work, and how much of it is done.
+        progress: Called with the name of the current task and its share done.
 
     Returns:
-        In the order of `direction_grid`, ``[E, A]``; 0 where never, NaN where no ball
-        can come from.
+        Clearance in the order of `direction_grid`, ``[E, A]``; 0 if never seen, NaN
+        where no ball can come from.
 
     Raises:
-        ValueError: If the body has shapes to which no distance is known.
+        ValueError: If the body has shapes without a distance function.
     """
     body = StandingRobot(robot)
     cells = pipelines(robot, skin, {sensor.coverage: sensor}, sensor.range)
@@ -271,7 +271,7 @@ def see_directions(
 
 
 def _share(flags: Tensor, among: Tensor) -> float | None:
-    """Return the share of true flags, None among nothing (JSON has no NaN)."""
+    """Return the share of true flags, None for an empty set (JSON has no NaN)."""
     return float(flags[among].double().mean()) if among.any() else None
 
 
@@ -288,23 +288,23 @@ def analyse(
     control_period: float = 1 / 60,
     progress: Progress = lambda what, share: None,
 ) -> Analysis:
-    """Return what a skin sees of balls that come to a standing robot.
+    """Return the visibility of balls that approach a standing robot.
 
     Args:
         robot: The robot.
         skin: The sensors.
-        sensors: What they measure, by name: coverage and occlusion count.
-        ranges: Ranges, for sensors without one of their own [m].
+        sensors: Sensor configurations by name; only coverage and occlusion are used.
+        ranges: Ranges of sensors that have none of their own [m].
         throws: The throws.
-        num_throws: How many throws are followed.
+        num_throws: Number of throws.
         seed: Seed of the throws and of the points on the surface.
         timestep: Physics time step of the task [s].
         control_period: Time between two actions of a policy [s].
-        progress: Called with what is in work, and how much of it is done.
+        progress: Called with the name of the current task and its share done.
 
     Raises:
-        ValueError: If there is no coverage, range or throw, a range is not positive
-            and finite, or the seed is none.
+        ValueError: If there is no coverage, range or throw, a range is repeated or not
+            positive and finite, or the seed is invalid.
     """
     if not sensors or not ranges:
         raise ValueError("an analysis needs at least one coverage and one range")
