@@ -9,10 +9,10 @@ from contextlib import suppress
 
 
 def draw_without_display() -> None:
-    """Let MuJoCo draw by EGL, on Linux, unless ``MUJOCO_GL`` asks for another way.
+    """Make MuJoCo render with EGL on Linux, unless ``MUJOCO_GL`` is set.
 
-    Call this before mujoco is first imported, which is when it chooses. Where EGL is
-    not installed nothing is asked for: mujoco could not be imported.
+    Call this before the first import of mujoco, which selects the backend. Nothing is
+    set if EGL is not installed, because mujoco could then not be imported.
     """
     if sys.platform == "linux" and not os.environ.get("MUJOCO_GL"):
         with suppress(OSError):

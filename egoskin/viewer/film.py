@@ -15,7 +15,7 @@ from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from egoskin.storage.files import check_output
 
-# The last picture stands for this long [s].
+# Time for which the last picture is held [s].
 _LAST_PICTURE = 1.0
 # One palette of 256 colours for the whole film: without it a GIF flickers.
 _GIF_PALETTE = (
@@ -23,19 +23,19 @@ _GIF_PALETTE = (
     ":bayer_scale=4:diff_mode=rectangle"
 )
 FILM_SUFFIXES = (".mp4", ".gif")
-"""Kinds of film that can be written."""
+"""Supported suffixes of film files."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Frame:
-    """One picture of an episode and what there is to say about it."""
+    """One picture of an episode with its figures."""
 
     image: np.ndarray
     """Picture without text, ``[height, width, 3]`` uint8."""
     time: float
     """Age of the episode [s]."""
     gap: float
-    """From the robot's surface to that of the nearest ball in play [m], or inf."""
+    """Distance from the robot to the surface of the nearest active ball [m], or inf."""
     num_detecting: int
     """Number of sensors that detect something."""
     num_sensors: int
@@ -51,8 +51,8 @@ def annotate(frame: Frame, size: tuple[int, int] | None = None) -> np.ndarray:
 
     Args:
         frame: The frame.
-        size: Width and height to fill [px], what sticks out being cut off; None for
-            the picture's own.
+        size: Width and height to scale and crop to [px]; None for those of the
+            picture.
 
     Returns:
         Picture, ``[height, width, 3]`` uint8.
@@ -93,11 +93,11 @@ def _write(
 
 
 def pick_moments(frames: Sequence[Frame], count: int) -> list[int]:
-    """Return the indices of the frames that tell the episode best, in order.
+    """Return the indices of the most informative frames, in order.
 
-    The first and the last, the closest approaches (at most half of them), and then
-    always the frame that is farthest from those picked already, on a clock that runs
-    the faster the nearer a ball is.
+    These are the first and the last, the closest approaches (at most half of
+    ``count``), and then repeatedly the frame farthest from those already picked, on a
+    clock that runs faster the nearer a ball is.
 
     Args:
         frames: Frames in order of time.
@@ -109,7 +109,7 @@ def pick_moments(frames: Sequence[Frame], count: int) -> list[int]:
     minima = np.flatnonzero(is_minimum)
     closest = minima[inner[minima].argsort()][: count // 2]
     picked = list(dict.fromkeys([0, len(frames) - 1, *closest.tolist()]))[:count]
-    # d clock / dt = 1 / (gap + 0.5 m), and not quite 0 with no ball in play
+    # d clock / dt = 1 / (gap + 0.5 m); above 0 without a ball, as gaps are clipped
     clock = (1.0 / (np.clip(inner, 0.0, 10.0) + 0.5)).cumsum()
     while len(picked) < min(count, len(frames)):
         away = np.abs(clock[:, None] - clock[picked]).min(1)
@@ -124,17 +124,17 @@ def contact_sheet(
     columns: int = 4,
     size: tuple[int, int] = (560, 420),
 ) -> np.ndarray:
-    """Return a grid of the moments that tell an episode best.
+    """Return a grid of the most informative frames of an episode.
 
     Args:
         frames: Frames in order of time.
         count: Number of pictures.
-        columns: Pictures in each line.
+        columns: Pictures per line.
         size: Width and height of each picture [px].
 
     Returns:
-        Picture, ``[rows * height, columns * width, 3]`` uint8, white where no picture
-        is.
+        Picture, ``[rows * height, columns * width, 3]`` uint8; empty cells are
+        white.
     """
     cells = [annotate(frames[i], size) for i in pick_moments(frames, count)]
     while len(cells) % columns:
@@ -144,24 +144,24 @@ def contact_sheet(
 
 
 def check_path(path: Path, suffixes: Sequence[str]) -> None:
-    """Raise ValueError if no such file can be written: its folder or its ending."""
+    """Raise ValueError for a wrong suffix or a path that cannot be written."""
     if path.suffix.lower() not in suffixes:
         raise ValueError(f"{path} must end in {' or '.join(suffixes)}")
     check_output(path, str(path))
 
 
 def save_film(path: Path, frames: Sequence[Frame], fps: float) -> None:
-    """Write annotated frames to an MP4 (H.264) or GIF file; the last one stands.
+    """Write annotated frames to an MP4 (H.264) or GIF file; the last one is held.
 
-    What the file held before is replaced only once the film is complete.
+    An existing file is replaced only once the film is complete.
 
     Args:
         path: File, ``.mp4`` or ``.gif``.
         frames: Frames in order of time.
-        fps: Pictures for each second.
+        fps: Pictures per second.
 
     Raises:
-        ValueError: If the ending is another, or there is no such folder.
+        ValueError: If the suffix is wrong, or the folder does not exist.
     """
     check_path(path, FILM_SUFFIXES)
     if path.suffix.lower() == ".gif":
@@ -185,7 +185,7 @@ def save_film(path: Path, frames: Sequence[Frame], fps: float) -> None:
     )
     try:
         with closing(writer):
-            # A generator: it takes pictures from its first yield on.
+            # Start the generator; it accepts pictures from its first yield on.
             writer.send(None)
             for frame in frames:
                 writer.send(annotate(frame).tobytes())
@@ -197,10 +197,10 @@ def save_film(path: Path, frames: Sequence[Frame], fps: float) -> None:
 
 
 def save_picture(path: Path, image: np.ndarray) -> None:
-    """Write a picture ``[height, width, 3]`` uint8 to a PNG file, whole or not at all.
+    """Write a picture ``[height, width, 3]`` uint8 to a PNG file, atomically.
 
     Raises:
-        ValueError: If the ending is another, or there is no such folder.
+        ValueError: If the suffix is wrong, or the folder does not exist.
     """
     check_path(path, (".png",))
     part = path.with_name(f".{path.stem}.part{path.suffix}")

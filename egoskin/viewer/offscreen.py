@@ -1,9 +1,9 @@
-"""Pictures of an episode: the robot, its sensors, the balls, and what is detected.
+"""Pictures of an episode: the robot, its sensors, the balls, and the detections.
 
-MuJoCo chooses its OpenGL when it is first imported: where there is no display, call
+MuJoCo selects its OpenGL backend when first imported. Without a display, call
 `egoskin.viewer.draw_without_display` before, or set ``MUJOCO_GL`` to egl or osmesa.
 
-Contract: the picture is drawn from the keys of the environment alone (``base_pose``,
+Contract: pictures are drawn only from keys of the environment (``base_pose``,
 ``joint_pos``, ``object_pose``, ``object_active``, ``distance``, ``balls_avoided``),
 never from live simulation; a stored tensordict with these keys can be drawn as well.
 """
@@ -30,36 +30,36 @@ from egoskin.sensors import Ray, Skin
 from egoskin.shapes import Shape
 from egoskin.viewer.film import Frame
 
-# Colours (r, g, b, a). A line has the colour of the kind of sensor that detects: blue
-# for fields; yellow, (1, 0.8, 0.1), is kept for rays.
+# Colours (r, g, b, a). A line is coloured by the kind of the detecting sensor: blue for
+# fields, yellow for rays.
 _IDLE_RGBA = (0.16, 0.2, 0.3, 1.0)
 _LIT_RGBA = (0.1, 0.95, 1.0, 1.0)
 _FIELD_LINE_RGB = (0.1, 0.35, 1.0)
 _RAY_LINE_RGB = (1.0, 0.8, 0.0)
 _BALL_RGBA = (0.95, 0.35, 0.08, 1.0)
-# Drawn radii [m]: a sensor at rest, one that detects, a line.
+# Drawn radii [m]: an idle sensor, a detecting sensor, a line.
 _IDLE_RADIUS, _LIT_RADIUS, _LINE_RADIUS = 0.017, 0.03, 0.006
-# Lines fade with their length, from opaque at 0 to the faintest at this [m].
+# Opacity of lines falls linearly with length, to 0 at this [m], but not below this.
 _FADE_LENGTH, _FAINTEST = 2.5, 0.25
-# The camera's point of attention follows the base with this time constant [s] and
-# stays at this height, of a robot as tall as the H1-2 (1.78 m) [m].
+# The camera's look-at point follows the base with this time constant [s]; its height,
+# for a robot as tall as the H1-2 (1.78 m) [m].
 _FOLLOW_TIME, _LOOK_HEIGHT, _REFERENCE_HEIGHT = 0.4, 1.0, 1.78
 _IS_LINUX = sys.platform == "linux"
 
 
 class RenderingError(ValueError):
-    """No OpenGL context can be made; the text says how to get one."""
+    """No OpenGL context can be created; the text says how to get one."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CameraConfig:
-    """Where the camera is, relative to the robot that it follows."""
+    """Placement of the camera relative to the robot that it follows."""
 
     distance: float = 3.4
-    """Distance to the robot [m], to one as tall as the H1-2 (1.78 m): to another it is
-    scaled with the robot's height."""
+    """Distance to a robot as tall as the H1-2 (1.78 m) [m]; it is scaled with the
+    robot's height."""
     azimuth_deg: float = 30.0
-    """Bearing of the camera, from the robot's heading at the start [deg]."""
+    """Azimuth of the camera, relative to the robot's initial heading [deg]."""
     elevation_deg: float = 10.0
     """Angle by which the camera looks down [deg]."""
 
@@ -89,14 +89,14 @@ def record_episodes(
 ) -> list[Recording]:
     """Return recordings of some episodes of a throw set.
 
-    The starts and the throws are those of the throw set's rows. (The motion is too, but
-    for rounding: a network's result depends on the batch size in its last bits.)
+    Starts and throws are those of the throw set's rows. The motion is the same up to
+    rounding: the last bits of a network's output depend on the batch size.
 
     Args:
-        config: What the environment is made of.
+        config: Environment configuration.
         skin: The sensors.
-        policy: Writes ``action``; None for action 0, the default pose as position
-            target.
+        policy: Writes ``action``; None for the zero action, whose position target is
+            the default pose.
         throw_set: Seed of the throw set.
         first: Row of the first episode.
         episodes: Number of episodes.
@@ -137,16 +137,16 @@ def painter_of(
     size: tuple[int, int] = (960, 540),
     camera: CameraConfig | None = None,
 ) -> Painter:
-    """Return what draws the states of an environment, to be used in a ``with``.
+    """Return a painter of an environment's states, to be used in a ``with`` block.
 
     Args:
-        config: What the environment is made of.
+        config: Environment configuration.
         skin: The sensors.
         size: Width and height of the pictures [px].
-        camera: Where the camera is.
+        camera: Placement of the camera.
 
     Raises:
-        RenderingError: If no OpenGL context can be made.
+        RenderingError: If no OpenGL context can be created.
         ValueError: If the size is odd or below 16.
     """
     sensors = config.pipeline(skin)
@@ -172,20 +172,20 @@ def render_recording(
     """Return the pictures of one episode.
 
     Args:
-        painter: What `painter_of` returned.
-        config: What the environment was made of.
+        painter: Result of `painter_of`.
+        config: Environment configuration of the recording.
         skin: The sensors.
         recording: The episode.
-        max_seconds: Stop at this age at the latest [s]; None for the whole episode.
-        fps: Pictures for each second of simulated time, at most the control rate.
-        on_picture: Called with (pictures done, pictures in all).
+        max_seconds: Longest age shown [s]; None for the whole episode.
+        fps: Pictures per second of simulated time, at most the control rate.
+        on_picture: Called with (pictures done, total pictures).
 
     Returns:
-        Frames in order of time: the start, then ``fps`` for each second, and always the
-        step that ends the episode.
+        Frames in order of time: the start, then ``fps`` per second, and always the last
+        step shown.
 
     Raises:
-        ValueError: If a number is out of range.
+        ValueError: If ``fps`` or ``max_seconds`` is out of range.
     """
     hz = config.task.physics.control_hz
     check_film(hz, fps, max_seconds)
@@ -213,11 +213,11 @@ def render_recording(
 
 
 def check_film(hz: float, fps: float, max_seconds: float | None) -> None:
-    """Raise ValueError for a film that cannot be made.
+    """Raise ValueError for an invalid frame rate or duration of a film.
 
     Args:
         hz: Control rate [Hz].
-        fps: Pictures for each second.
+        fps: Pictures per second.
         max_seconds: Longest age shown [s]; None for all.
     """
     if not 0 < fps <= hz:
@@ -230,7 +230,7 @@ def check_film(hz: float, fps: float, max_seconds: float | None) -> None:
 
 
 def ending_of(state: TensorDictBase) -> str | None:
-    """Return why the episode of a row is over; None if it is not."""
+    """Return why the episode of a row has ended; None if it has not."""
     if state["truncated"].item():
         return "time limit"
     names = {"hit": "hit", "fallen": "fall", "diverged": "diverged"}
@@ -243,17 +243,17 @@ def ending_of(state: TensorDictBase) -> str | None:
 class Painter:
     """Draws states of one robot with its sensors and balls.
 
-    A context manager: it holds an OpenGL context.
+    It is a context manager, because it holds an OpenGL context.
 
     Args:
         robot: The robot.
         skin: Sensors to draw; None for none.
-        objects: Shape of each object, ``O`` of them.
+        objects: Shape of each of the ``O`` objects.
         size: Width and height of the pictures [px].
-        camera: Where the camera is.
+        camera: Placement of the camera.
 
     Raises:
-        RenderingError: If no OpenGL context can be made.
+        RenderingError: If no OpenGL context can be created.
         ValueError: If the size is odd or below 16.
     """
 
@@ -310,8 +310,8 @@ class Painter:
             state: One row with ``base_pose [7]``, ``joint_pos [J]``,
                 ``object_pose [O, 7]`` and ``object_active [O]``.
             detecting: Whether each sensor detects something, ``[S]`` bool.
-            time: Age of the episode [s]; the camera follows the base with time and
-                starts anew when time goes back.
+            time: Age of the episode [s]; the camera follows the base over time and is
+                reset when time decreases.
             num_avoided: Balls avoided so far, for the frame.
             ending: Why the episode ends here, for the frame.
         """
@@ -339,13 +339,13 @@ class Painter:
     def draw_line(
         self, start: np.ndarray, end: np.ndarray, radius: float, rgba: Sequence[float]
     ) -> None:
-        """Add a line to the state drawn last; it lasts until the next.
+        """Add a line to the state drawn last; the next `draw` removes it.
 
         Args:
             start: One end in the world [m], ``[3]``.
             end: The other.
             radius: Radius of the line [m].
-            rgba: Its colour and opacity.
+            rgba: Colour and opacity.
         """
         kind = mujoco.mjtGeom.mjGEOM_CAPSULE
         geom = self._add(kind, rgba, glows=True)
@@ -356,7 +356,7 @@ class Painter:
         return self._renderer.render()
 
     def _place(self, state: TensorDictBase, active: np.ndarray) -> None:
-        """Put the robot and the balls of the visual model where the state says."""
+        """Move the robot and the balls of the visual model to the poses of a state."""
         self._data.qpos[:] = np.concatenate((state["base_pose"], state["joint_pos"]))
         pose = np.asarray(state["object_pose"], float)
         lamp = np.array([*self._camera.lookat[:2], 0.0])
@@ -364,19 +364,19 @@ class Painter:
         turn = np.array([math.cos(half), 0.0, 0.0, math.sin(half)])
         self._data.mocap_pos[:] = [*pose[:, :3], lamp]
         self._data.mocap_quat[:] = [*pose[:, 3:], turn]
-        # What is transparent is not drawn.
+        # Fully transparent geoms are not drawn.
         self._model.geom_rgba[self._object_geoms, 3] = active
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_comPos(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
 
     def _follow(self, base_pose: np.ndarray, time: float) -> None:
-        """Move the camera's point of attention towards the base."""
+        """Move the camera's look-at point towards the base."""
         camera, config = self._camera, self._camera_config
         goal = np.array([*base_pose[:2], self._size * _LOOK_HEIGHT])
         if self._last_time is None or time < self._last_time:
             w, _, _, z = base_pose[3:]
-            # An upright base: its heading is twice the angle of (w, z).
+            # The heading of an upright base is twice the angle of (w, z).
             heading = math.degrees(2 * math.atan2(z, w))
             camera.lookat[:] = goal
             camera.distance = self._size * config.distance
@@ -419,7 +419,7 @@ class Painter:
     def _add(
         self, kind: mujoco.mjtGeom, rgba: Sequence[float], *, glows: bool
     ) -> mujoco.MjvGeom:
-        """Add a shape to the scene, of no size and at the origin."""
+        """Add a geom to the scene, with zero size and at the origin."""
         scene = self._renderer.scene
         assert scene.ngeom < scene.maxgeom
         geom = scene.geoms[scene.ngeom]
@@ -431,7 +431,7 @@ class Painter:
         return geom
 
     def _gap(self, active: np.ndarray) -> float:
-        """Smallest distance between robot and balls in play [m], inf if none is."""
+        """Return the smallest distance from the robot to an active ball [m], or inf."""
         far = 100.0
         gaps = [
             mujoco.mj_geomDistance(self._model, self._data, ours, ball, far, None)
@@ -443,7 +443,7 @@ class Painter:
 
 
 def closest_point(shape: Shape, pose: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return the closest points of an object's surface.
+    """Return the points of an object that are closest to query points.
 
     Args:
         shape: The object's shape.
@@ -451,7 +451,7 @@ def closest_point(shape: Shape, pose: np.ndarray, points: np.ndarray) -> np.ndar
         points: Query points in the world [m], ``[n, 3]``.
 
     Returns:
-        Points in the world [m], ``[n, 3]``; the query itself where it is inside.
+        Points in the world [m], ``[n, 3]``; the query point itself if it is inside.
     """
     rotation = np.zeros(9)
     mujoco.mju_quat2Mat(rotation, pose[3:])
@@ -464,7 +464,7 @@ def closest_point(shape: Shape, pose: np.ndarray, points: np.ndarray) -> np.ndar
 def _build_model(
     robot: RobotConfig, objects: Sequence[Shape], size: tuple[int, int]
 ) -> mujoco.MjModel:
-    """The robot in a studio: tiled floor, sky, light, balls that go where put."""
+    """Return a model of the robot with tiled floor, sky, light and mocap balls."""
     spec = robot.spec()
     world = spec.worldbody
     spec.visual.global_.offwidth, spec.visual.global_.offheight = size
@@ -497,7 +497,7 @@ def _build_model(
         width=512,
         height=512,
     )
-    # The texture of 2 x 2 tiles is 2 m wide: tiles of 1 m.
+    # The texture has 2 x 2 tiles and is 2 m wide, so tiles are 1 m wide.
     tiles = spec.add_material(name="tiles", texuniform=True, texrepeat=[1, 1])
     tiles.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "tiles"
     world.add_geom(
@@ -506,7 +506,7 @@ def _build_model(
     for i, shape in enumerate(objects):
         body = world.add_body(name=f"ball_{i}", mocap=True)
         shape.add_geom(body, name=f"object_{i}", rgba=_BALL_RGBA)
-    # The light moves with the camera: its shadow map covers what is near the robot.
+    # The light moves with the camera, so its shadow map covers the robot's vicinity.
     world.add_body(name="lamp", mocap=True).add_light(
         pos=[-1.6, 1.2, 4.0],
         dir=[0.4, -0.3, -1.0],
@@ -524,17 +524,17 @@ def _renderer(
     """Return MuJoCo's renderer.
 
     Raises:
-        RenderingError: If no OpenGL context can be made.
-        ValueError: If it has no picture of that size.
+        RenderingError: If no OpenGL context can be created.
+        ValueError: If the picture size is not supported.
     """
     backend = os.environ.get("MUJOCO_GL", "")
     has_display = any(os.environ.get(k) for k in ("DISPLAY", "WAYLAND_DISPLAY"))
-    # It warns of a missing display in some lines before it fails.
+    # Otherwise glfw prints warnings about the missing display before it fails.
     if mujoco.GLContext.__module__ == "mujoco.glfw" and _IS_LINUX and not has_display:
         raise RenderingError(no_gl_text(backend))
     try:
         return mujoco.Renderer(model, size[1], size[0], max_geoms)
-    # PyOpenGL reports a missing library as an attribute that None does not have.
+    # PyOpenGL reports a missing library as a missing attribute of None.
     except (ImportError, AttributeError, RuntimeError) as error:
         raise RenderingError(no_gl_text(backend)) from error
     except mujoco.FatalError as error:
@@ -542,7 +542,7 @@ def _renderer(
 
 
 def no_gl_text(backend: str) -> str:
-    """Return what to tell a user for whom an OpenGL backend does not work."""
+    """Return the error text for an OpenGL backend that does not work."""
     return (
         f"cannot render: no OpenGL context from {backend or 'the default backend'!r}; "
         "install one (Debian: `apt-get install libegl1`, or `apt-get install "

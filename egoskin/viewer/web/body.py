@@ -1,4 +1,4 @@
-"""The body of a robot, to be drawn and to be hit by a click: its shapes and poses."""
+"""Shapes and poses of a robot, for drawing and for picking with a click."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ from egoskin.robots.chains import body_name, joint_name
 from egoskin.robots.config import RobotConfig
 from egoskin.sensors import Skin
 
-# As MuJoCo's own viewer shows at first: groups 3 and above are what collides.
+# Geom groups below this are drawn, as by default in MuJoCo's viewer; groups from 3 on
+# hold collision geoms.
 _SHOWN_GROUPS = 3
 _SEGMENTS = 24
 _GREY = (0.5, 0.5, 0.5, 1.0)
-"""MuJoCo's colour of a shape without one."""
+"""MuJoCo's default colour of a geom."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -25,9 +26,9 @@ class Part:
     """Shapes of one colour on one link."""
 
     body: int
-    """Body of the model."""
+    """Index of the link's body in the model."""
     vertices: np.ndarray
-    """In the frame of the body [m], ``[V, 3]``."""
+    """Vertices in the frame of the body [m], ``[V, 3]``."""
     faces: np.ndarray
     """Indices of vertices, ``[F, 3]``."""
     rgba: tuple[float, float, float, float]
@@ -38,7 +39,7 @@ class Body:
     """A robot that can be put into poses.
 
     Args:
-        robot: The robot; it need not float.
+        robot: The robot; its base may be fixed.
     """
 
     def __init__(self, robot: RobotConfig) -> None:
@@ -55,7 +56,7 @@ class Body:
 
     @property
     def default_qpos(self) -> np.ndarray:
-        """Base pose, on the floor, and joint positions of the default pose."""
+        """Base pose, standing on the floor, and joint positions of the default pose."""
         base = np.array([0.0, 0, 0, 1, 0, 0, 0])
         if self.floats:
             base[2] = self.robot.default_base_height
@@ -65,8 +66,8 @@ class Body:
         """Put the robot into a pose.
 
         Args:
-            qpos: Base pose (which a robot that stands fixed ignores) and joint
-                positions, ``[7 + J]``.
+            qpos: Base pose (ignored if the base is fixed) and joint positions,
+                ``[7 + J]``.
         """
         if self.floats:
             self.data.qpos[:7] = qpos[:7]
@@ -74,7 +75,7 @@ class Body:
         mujoco.mj_kinematics(self.model, self.data)
 
     def sensor_points(self, skin: Skin) -> np.ndarray:
-        """Return where sensors are in the world [m], ``[S, 3]``."""
+        """Return the positions of sensors in the world [m], ``[S, 3]``."""
         return (
             self._turned(skin, skin.position) + self.data.xpos[self.link_indices(skin)]
         )
@@ -84,7 +85,7 @@ class Body:
         return self._turned(skin, skin.normal)
 
     def link_indices(self, skin: Skin) -> list[int]:
-        """Return the body of the model that each sensor is on, ``S`` of them."""
+        """Return the index of the body that each of the ``S`` sensors is on."""
         return [self._bodies[name] for name in skin.links]
 
     def _turned(self, skin: Skin, vectors: np.ndarray) -> np.ndarray:
@@ -92,10 +93,10 @@ class Body:
         return (rotation @ vectors[:, :, None])[..., 0]
 
     def bounds(self) -> np.ndarray:
-        """Return the corners of a box in the world around all its shapes [m].
+        """Return a box in the world that contains all shapes of the robot [m].
 
         Returns:
-            Lower and upper corner, ``[2, 3]``; they may lie a little outside.
+            Lower and upper corner, ``[2, 3]``; the box may be slightly too large.
         """
         shown = self.model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE
         centre = self.data.geom_xpos[shown]
@@ -103,7 +104,7 @@ class Body:
         return np.stack(((centre - reach).min(0), (centre + reach).max(0)))
 
     def hit(self, origin: np.ndarray, direction: np.ndarray) -> np.ndarray | None:
-        """Return where a ray first hits the robot in the world [m]; None if not."""
+        """Return the first hit of a ray on the robot, in the world [m], or None."""
         geom = np.zeros(1, np.int32)
         pnt, vec = np.asarray(origin, float), np.asarray(direction, float)
         vec = vec / np.linalg.norm(vec)
@@ -111,7 +112,7 @@ class Body:
         return None if away < 0 else pnt + away * vec
 
     def parts(self) -> list[Part]:
-        """Return its shapes, those of one link and colour as one."""
+        """Return the robot's shapes, merged by link and colour."""
         merged: dict[tuple[int, tuple], list[trimesh.Trimesh]] = {}
         for body, rgba, mesh in self._shapes():
             merged.setdefault((body, rgba), []).append(mesh)
@@ -129,7 +130,7 @@ class Body:
         return found
 
     def _shapes(self) -> Iterator[tuple[int, tuple, trimesh.Trimesh]]:
-        """Yield body, colour and mesh, in the frame of the body, of what is shown."""
+        """Yield body, colour and mesh (in the body's frame) of each drawn geom."""
         model = self.model
         groups = model.geom_group
         shown = groups < _SHOWN_GROUPS
@@ -151,7 +152,7 @@ class Body:
 
 
 def _mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh | None:
-    """Return a geom's surface in its own frame; None for a plane, and the like."""
+    """Return a geom's mesh in its own frame; None for a plane or unsupported type."""
     kinds, make = mujoco.mjtGeom, trimesh.creation
     kind, size = model.geom_type[geom], model.geom_size[geom]
     if kind == kinds.mjGEOM_SPHERE:
@@ -177,6 +178,6 @@ def _mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh | None:
         mesh = trimesh.Trimesh(vertices, faces, process=False)
     else:
         return None
-    # Edges stay sharp where no two faces share a vertex.
+    # Edges are shaded sharp if faces share no vertices.
     mesh.unmerge_vertices()
     return mesh

@@ -1,7 +1,7 @@
-"""The page that `egoskin view` opens: robots in motion, thrown at by its visitors.
+"""The page of `egoskin view`: robots in motion, and balls thrown by visitors.
 
-Contract: one thread, that of `Page.run`, computes and draws; what visitors do comes to
-it as functions in a queue. While nobody watches it waits for that queue.
+Contract: one thread, that of `Page.run`, computes and draws; requests of visitors reach
+it as functions in a queue. Without visitors it only waits for that queue.
 """
 
 from __future__ import annotations
@@ -30,34 +30,34 @@ from egoskin.viewer.web.server import open_server, stop_server
 from egoskin.viewer.web.session import Frame, Session, Throw
 
 _PAUSE_AFTER_END = 1.2
-"""How long the end of an episode is seen before the next begins [s]."""
+"""Time for which the end of an episode is shown before the next begins [s]."""
 _PICTURE_HZ, _LEAST_PICTURE_HZ, _PANEL_HZ = 30.0, 10.0, 6.0
 _FOLLOW_PERIOD = 2.0
-"""How often it is looked whether a run has a newer policy [s]."""
+"""Time between checks for a newer policy of a run [s]."""
 _TOO_LATE = 0.25
-"""So far behind the clock, lost time is not made up for [s]."""
+"""Beyond this delay, lost time is not made up for [s]."""
 _SPACING = 2.6
-"""Between two robots [m]."""
+"""Distance between neighbouring robots [m]."""
 _FIELD_OF_VIEW = 0.75
-"""From the lower to the upper edge of what is seen [rad]."""
+"""Vertical field of view [rad]."""
 _HALF_WIDTH, _HALF_HEIGHT = 1.2, 1.75
-"""What is seen beside the outer robots, and above and below their middle [m]."""
+"""Visible space beside the outer robots, and above and below their middle [m]."""
 _PANEL_WIDTH, _USUAL_SIZE = 340, (1440, 900)
-"""Of the panel, and of a window [px]."""
+"""Width of the panel, and size of a usual window [px]."""
 _PICK_RADIUS = 0.035
-"""A click so near to a sensor is meant for it [m]."""
+"""A click this close to a sensor selects it [m]."""
 
 
 class Page:
-    """A local page with one robot, or several that meet the same throws.
+    """A local page with one robot, or several that receive the same throws.
 
     Args:
         sources: Policy of each robot: name, file, checkpoint or run folder.
-        port: Port of 127.0.0.1; 0 for any that is free.
-        seed: Seed of what is left to chance.
+        port: Port of 127.0.0.1; 0 for any free one.
+        seed: Random seed of the episodes and throws.
 
     Raises:
-        ValueError: If there is no such policy.
+        ValueError: If a policy does not exist.
         OSError: If the port is taken.
     """
 
@@ -96,7 +96,7 @@ class Page:
         self._look(self.server.initial_camera, _USUAL_SIZE)
         self.is_paused = False
         self.error = ""
-        """What went wrong; "" while all is well."""
+        """Text of the last error; "" if there is none."""
         self.steps = 0
         """Control steps computed so far."""
         self._random = np.random.default_rng(seed)
@@ -116,13 +116,13 @@ class Page:
             session.body,
             session.skin,
             session.config.task.throws.balls,
-            # The camera looks along -x, so the first, on the left, has the least y.
+            # The camera looks along -x, so the first robot, on the left, has least y.
             (0.0, _SPACING * (i - (len(self.sessions) - 1) / 2) * several),
             _short(session.source) if several else "",
         )
 
     def _forget(self) -> None:
-        """Begin all counts and memories anew."""
+        """Reset all counts and recorded frames."""
         number = len(self.sessions)
         self._memory: deque[list[Frame]] = deque(maxlen=round(MEMORY * self.hz))
         self._avoided, self._came = [0] * number, [0] * number
@@ -133,17 +133,17 @@ class Page:
 
     @property
     def address(self) -> str:
-        """Where the page is."""
+        """URL of the page."""
         return f"http://127.0.0.1:{self.server.get_port()}"
 
     # --- the loop ---------------------------------------------------------------
 
     def _ask(self, wish: Callable[..., object], *args: Any) -> None:
-        """Let the loop do something; called by any thread."""
+        """Queue a function for the loop; any thread may call this."""
         self._commands.put(lambda: wish(*args))
 
     def run(self) -> None:
-        """Play in real time for as long as the process lives."""
+        """Play in real time until the process ends."""
         due = time.monotonic()
         while True:
             if not self.server.get_clients():
@@ -155,7 +155,7 @@ class Page:
             due += self.panel.slowdown.value / self.hz
             if late > _TOO_LATE:
                 due = time.monotonic()
-            # At least what has been asked for so far is done.
+            # Handle requests until the next step is due, at least all queued so far.
             while True:
                 try:
                     wish = self._commands.get(timeout=max(due - time.monotonic(), 0))
@@ -168,19 +168,19 @@ class Page:
         stop_server(self.server)
 
     def _do(self, wish: Callable[[], object]) -> None:
-        """Do something; what goes wrong is shown on the page, which lives on."""
+        """Call a function; an exception is shown on the page and does not end it."""
         try:
             wish()
-        # A policy may be any code, and fail in any way.
+        # A policy may be arbitrary code and raise anything.
         except Exception as error:
             self.error = f"{type(error).__name__}: {error}"
             self.panel.show_error(self.error)
 
     def advance(self, is_late: bool = False) -> None:
-        """Go one control step on, if time goes on, and draw if a picture is due.
+        """Advance one control step unless paused, and draw if a picture is due.
 
         Args:
-            is_late: Whether it is behind the clock: pictures are then left out.
+            is_late: Whether the loop is behind the clock; pictures are then skipped.
         """
         if self._replayed:
             frames = self._replayed.popleft()
@@ -191,7 +191,7 @@ class Page:
             frames = None
         now = time.monotonic()
         wait = 1 / (_LEAST_PICTURE_HZ if is_late else _PICTURE_HZ)
-        # A control step sooner is nearer than one later.
+        # Half a step of tolerance: draw at the step nearest to the due time.
         if frames is not None and now - self._pictured > wait - 0.5 / self.hz:
             self._pictured = now
             self._draw(frames)
@@ -207,7 +207,7 @@ class Page:
         tempo = self.panel.tempo.value
         if tempo and self._since_throw >= 60 * self.hz / tempo:
             self.throw_from(None)
-        # The wait after an end is nothing to remember.
+        # The pause after the end of an episode is not recorded.
         goes_on = any(session.frame.ending is None for session in self.sessions)
         frames = []
         for i, session in enumerate(self.sessions):
@@ -226,7 +226,7 @@ class Page:
             self._memory.append(frames)
 
     def _end(self, i: int) -> None:
-        """Count what an episode that ended has brought."""
+        """Add the results of an ended episode to the counts."""
         session = self.sessions[i]
         avoided, came = session.avoided
         self._avoided[i] += avoided
@@ -246,35 +246,35 @@ class Page:
         camera: viser.InitialCameraConfig | viser.CameraHandle,
         size: tuple[int, int],
     ) -> None:
-        """Let a camera see all robots beside the panel.
+        """Place a camera so that it sees all robots beside the panel.
 
         Args:
             camera: The camera.
-            size: Width and height of what it sees [px].
+            size: Width and height of its view [px].
         """
         width, height = size
         free = max(1 - _PANEL_WIDTH / width, 0.4)
         half = _HALF_WIDTH + _SPACING * (len(self.sessions) - 1) / 2
-        # Half the height that is seen at a distance of 1 m [m].
+        # Half the visible height at a distance of 1 m [m].
         slope = math.tan(_FIELD_OF_VIEW / 2)
         away = max(_HALF_HEIGHT / slope, half / (slope * free * width / height))
-        # The robots are in the middle of what the panel, at the right, leaves free.
+        # Centre the robots in the area left of the panel.
         beside = (1 - free) * away * slope * width / height
         camera.fov = _FIELD_OF_VIEW
-        # In this order: a visitor's camera that is moved takes along what it looks at.
+        # In this order: setting the position of a visitor's camera also moves look_at.
         camera.position = (0.92 * away, beside - 0.35 * away, 0.92 + 0.17 * away)
         camera.look_at = (0.0, beside, 0.92)
 
     # --- what visitors ask for --------------------------------------------------
 
     def _welcome(self, client: viser.ClientHandle) -> None:
-        """Show a new visitor all robots, however wide the window is."""
+        """Show all robots to a new visitor, for any window width."""
         camera = client.camera
         self._look(camera, (camera.image_width, camera.image_height))
         self._ask(self._greet)
 
     def _greet(self) -> None:
-        """Show a new visitor how it stands."""
+        """Draw the current frames and update the panel."""
         self._draw([session.frame for session in self.sessions])
         self._show()
 
@@ -286,15 +286,15 @@ class Page:
             session.throw(throw)
 
     def throw_from(self, bearing: float | None) -> None:
-        """Throw a ball as the sliders say.
+        """Throw a ball with the speed and height of the sliders.
 
         Args:
-            bearing: Where it comes from, from the robot's heading [deg]; None: from
-                anywhere.
+            bearing: Direction it comes from, relative to the robot's heading [deg];
+                None for a random one.
         """
         if bearing is None:
             bearing = self._random.uniform(-180, 180)
-        # All robots meet the same one.
+        # All robots receive the same throw.
         self.throw(
             Throw(
                 azimuth=np.radians(bearing),
@@ -308,12 +308,12 @@ class Page:
     def click(self, origin: np.ndarray, direction: np.ndarray) -> None:
         """Mask the sensor that is clicked on, or throw a ball.
 
-        A click on a robot throws one at that place, from where the visitor looks; on
-        the floor, from there.
+        A click on a robot throws a ball at that place from the visitor's side; a click
+        on the floor throws one from there.
 
         Args:
-            origin: Where the visitor looks from [m], ``[3]``.
-            direction: In which direction, ``[3]``.
+            origin: Viewpoint of the visitor [m], ``[3]``.
+            direction: Direction of the click, ``[3]``.
         """
         for i, (session, scene) in enumerate(
             zip(self.sessions, self._scenes, strict=True)
@@ -355,7 +355,7 @@ class Page:
         )
 
     def mask(self, i: int, sensors: set[int]) -> None:
-        """Mask sensors of a robot, and no others."""
+        """Mask exactly these sensors of a robot."""
         session = self.sessions[i]
         session.mask(sensors)
         if session.skin is not None:
@@ -369,17 +369,17 @@ class Page:
                 self.mask(i, set(range(len(session.skin))) if every else set())
 
     def pause(self) -> None:
-        """Stop time, or let it go on."""
+        """Pause or resume."""
         self.is_paused = not self.is_paused
 
     def step_once(self) -> None:
-        """Stop time, and go one control step on."""
+        """Pause, and advance one control step."""
         self.is_paused = True
         self.play()
         self._draw([session.frame for session in self.sessions])
 
     def reset(self) -> None:
-        """Begin anew, with all counts at 0."""
+        """Restart all episodes, with all counts at 0."""
         self._clear_error()
         for session in self.sessions:
             session.reset()
@@ -387,11 +387,11 @@ class Page:
         self._greet()
 
     def replay(self) -> None:
-        """Show what was last once more."""
+        """Replay the recorded frames."""
         self._replayed = deque(self._memory)
 
     def sense(self) -> None:
-        """Take the sensors that the panel says, for all robots with a skin."""
+        """Apply the panel's sensor settings to all robots with a skin."""
         for i, session in enumerate(self.sessions):
             if session.skin is not None:
                 sensor = session.readable(**self.panel.sensor_changes)
@@ -404,10 +404,10 @@ class Page:
         self.panel.show_sensors(self.sessions)
 
     def load(self, i: int, source: str) -> None:
-        """Let a robot take another policy.
+        """Load another policy for a robot.
 
         Raises:
-            ValueError: If there is none, or it acts at another rate than the others.
+            ValueError: If there is no such policy.
         """
         self.sessions[i].load(source)
         self._versions[i], self._notes[i] = _version(source), ""
@@ -426,7 +426,7 @@ class Page:
     # --- what is told -----------------------------------------------------------
 
     def _show(self) -> None:
-        """Bring the panel up to date."""
+        """Update the panel."""
         now = time.monotonic()
         passed, done = now - self._panel_shown, self.steps - self._steps_shown
         self._panel_shown, self._steps_shown = now, self.steps
@@ -457,7 +457,7 @@ class Page:
         )
 
     def _status(self) -> list[str]:
-        """Return how it stands, in Markdown."""
+        """Return the status, in lines of Markdown."""
         state = "**Paused.** " if self.is_paused else self._speed
         state = "**Replay.** " if self._replayed else state
         lines = ["| | avoided&ensp; | untouched&ensp; | best |", "|---|---|---|---|"]
@@ -476,7 +476,7 @@ class Page:
         return [*lines, "", state] if state else lines
 
     def _follow(self) -> None:
-        """Take up newer policies of runs that are still trained."""
+        """Load newer policies of runs that are still in training."""
         for i, session in enumerate(self.sessions):
             if not Path(session.source).is_dir():
                 continue
@@ -488,17 +488,17 @@ class Page:
                 self._notes[i] = f"Newest of the run, taken up at {clock}."
 
     def save(self, client: viser.ClientHandle | None) -> None:
-        """Give a visitor a page that plays what was last without a server."""
+        """Send a visitor the `recording` as a file."""
         if client is not None:
             client.send_file_download(
                 "egoskin.html", self.recording().encode(), save_immediately=True
             )
 
     def recording(self) -> str:
-        """Return a page that plays what was last without a server, as HTML."""
+        """Return an HTML page that plays the recorded frames without a server."""
         frames = list(self._memory)[:: round(self.hz / _PICTURE_HZ)]
         recorder = self.server.get_scene_serializer()
-        # Visitors see the last of these pictures alone.
+        # Visitors only see the last of these pictures.
         with self.server.atomic():
             for each in frames:
                 self._draw(each)
@@ -507,7 +507,7 @@ class Page:
 
 
 def offered_policies(sources: Sequence[str]) -> list[str]:
-    """Return what policies can be chosen: those given, those shipped, runs here."""
+    """Return the selectable policies: those given, those shipped, those in ``runs``."""
     runs = sorted(
         str(path.parent) for path in Path("runs").glob("*/checkpoint.safetensors")
     )
@@ -515,7 +515,7 @@ def offered_policies(sources: Sequence[str]) -> list[str]:
 
 
 def _version(source: str) -> int:
-    """Return what changes when a policy is written anew."""
+    """Return the modification time of a policy's file [ns]."""
     return policy_file(source).stat().st_mtime_ns
 
 

@@ -1,7 +1,7 @@
-"""The panel of the page: what can be pressed and moved, and what is told.
+"""The panel of the page: buttons, sliders, figures and plots.
 
-Contract: the panel computes nothing and changes nothing; it shows what it is given and
-hands what is asked for to the page, by a function for each wish.
+Contract: the panel computes nothing and changes nothing; it shows the values that it
+receives and passes requests to the page, by one function for each kind of request.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from egoskin.viewer.web.scene import colour_of
 from egoskin.viewer.web.session import HEIGHTS, SPEEDS, Session
 
 SIDES = {"Front": 0.0, "Left": 90.0, "Behind": 180.0, "Right": -90.0}
-"""Where a ball can be thrown from: its bearing from the robot's heading [deg]."""
+"""Directions to throw from: bearing relative to the robot's heading [deg]."""
 _KINDS = {
     "spheres": {"coverage": "field", "reduce": "none"},
     "beams, closest of each sensor": {"coverage": "ray", "reduce": "min"},
@@ -29,7 +29,7 @@ _SIGNALS = ("proximity", "closeness", "binary", "localization")
 _CORRUPTIONS = ("none", "time_of_flight", "capacitive", "acoustic")
 _COLOURS = ("#e8590c", "#1c7ed6")
 MEMORY = 5.0
-"""What is remembered, plotted, replayed and saved [s]."""
+"""Length of the recording that is plotted, replayed and saved [s]."""
 # A scale that begins at 0 and reaches at least 1, with room above.
 _FROM_ZERO = {
     "min": {"soft": 0.0, "pad": 0.0, "mode": 1},
@@ -44,26 +44,26 @@ _HELP = (
 
 @dataclass(frozen=True, kw_only=True)
 class Wishes:
-    """What the panel asks of the page."""
+    """Functions of the page that the panel calls."""
 
     throw: Callable[[float | None], None]
-    """Throw a ball from a bearing [deg]; None: from anywhere."""
+    """Throw a ball from a bearing [deg]; None for a random one."""
     pause: Callable[[], None]
-    """Stop time, or let it go on."""
+    """Pause or resume."""
     step: Callable[[], None]
-    """Stop time, and go one control step on."""
+    """Pause, and advance one control step."""
     reset: Callable[[], None]
-    """Begin anew."""
+    """Restart all episodes."""
     replay: Callable[[], None]
-    """Show what was last once more."""
+    """Replay the recorded frames."""
     save: Callable[[viser.ClientHandle | None], None]
-    """Give a visitor a recording of what was last."""
+    """Send a visitor a page with the recorded frames."""
     mask: Callable[[bool], None]
     """Mask all sensors, or none."""
     sense: Callable[[], None]
-    """Take the sensors that the panel says."""
+    """Apply the panel's sensor settings."""
     load: Callable[[int, str], None]
-    """Let a robot take another policy."""
+    """Load another policy for a robot."""
 
 
 class Panel:
@@ -72,8 +72,8 @@ class Panel:
     Args:
         server: The page.
         sessions: The robots.
-        policies: What policies can be chosen.
-        wishes: What is done when something is asked for.
+        policies: Policies that can be selected.
+        wishes: Functions to call for each request.
     """
 
     def __init__(
@@ -154,7 +154,7 @@ class Panel:
         self._range = gui.add_slider("Range [m]", 0.1, 5.0, 0.1, 2.0)
         self._corruption = gui.add_dropdown("Imperfection", _CORRUPTIONS)
         for handle in (self._kind, self._signal, self._range, self._corruption):
-            # What the page itself sets has no client.
+            # A change made by the page itself has no client.
             handle.on_update(lambda event: event.client and wishes.sense())
         self._readable = gui.add_markdown("")
 
@@ -179,7 +179,7 @@ class Panel:
                 (uplot.Series(label=x), *series[1:]),
                 scales={"x": scale, "y": y},
                 axes=(along, axis),
-                # Without what stands at the mouse, which nobody asks for.
+                # Without live values at the cursor.
                 legend=uplot.Legend(show=len(sessions) > 1, live=False),
                 height=150 if len(sessions) == 1 else 130,
             )
@@ -211,7 +211,7 @@ class Panel:
 
     @property
     def sensor_changes(self) -> dict:
-        """The sensors that are asked for: fields of their configuration."""
+        """Selected fields of the sensor configuration."""
         return {
             **_KINDS[self._kind.value],
             "signal": self._signal.value,
@@ -222,19 +222,19 @@ class Panel:
     # --- what is told -----------------------------------------------------------
 
     def show_error(self, text: str) -> None:
-        """Show what went wrong; "" takes it away."""
+        """Show an error text; "" hides it."""
         self._error.visible = bool(text)
         if text:
             self._error.content = f"**Error.** {html.escape(text)}"
 
     def show_status(self, lines: Sequence[str]) -> None:
-        """Show how it stands, in lines of Markdown."""
+        """Show the status, in lines of Markdown."""
         text = "\n".join(lines)
         if text != self._status.content:
             self._status.content = text
 
     def show_policies(self, sessions: Sequence[Session], notes: Sequence[str]) -> None:
-        """Show which policies play, and what is known of them."""
+        """Show which policies are loaded, their sensors and length of training."""
         texts = []
         for session, handle, note in zip(sessions, self._policies, notes, strict=True):
             if handle.value != session.source:
@@ -291,7 +291,7 @@ class Panel:
         """Show readings over time.
 
         Args:
-            readings: Of each robot with sensors, ``[T, S]``, the newest last.
+            readings: Readings of each robot with sensors, ``[T, S]``, the newest last.
             steps: Longest ``T``.
         """
         rows = []
@@ -317,10 +317,10 @@ class Panel:
         """Show curves.
 
         Args:
-            time: Of each step [s], ``[T]``.
+            time: Time of each step [s], ``[T]``.
             strongest: The strongest reading of each robot, ``[T]`` each.
             value: The critic's value, ``[T]`` each, NaN without one.
-            survival: How long each robot was untouched, by episode [s].
+            survival: Untouched time of each robot, by episode [s].
             has_critic: Whether each policy has a critic.
         """
         self._nearest.data = (time, *strongest)

@@ -1,6 +1,6 @@
-"""What of a robot, its skin and the balls is drawn on the page.
+"""Drawing of a robot, its skin and the balls on the page.
 
-Contract: a picture is made of a `Frame` alone, so that what was is drawn as what is.
+Contract: a picture is made from a `Frame` alone, so recorded frames can be drawn too.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _FAR, _NEAR = np.array([0, 170, 255]), np.array([255, 30, 90])
 _FIELD_LINE, _RAY_LINE = (26, 89, 255), (255, 196, 0)
 _BALL, _TRAIL_END = np.array([242, 100, 25]), np.array([236, 238, 242])
 _FLOOR, _TILES = (214, 218, 225), (178, 184, 194)
-# Radii [m]: a sensor at rest, and how much larger it is that reads most.
+# Radius of an idle sensor [m], and its scale at the largest reading.
 _SENSOR_RADIUS, _LARGEST = 0.014, 2.0
 # Balls farther from the robot than this are not drawn [m].
 _FARTHEST = 12.0
@@ -37,14 +37,14 @@ def colour_of(reading: np.ndarray) -> np.ndarray:
     """Return the colours of readings, ``[n, 3]`` uint8.
 
     Args:
-        reading: From 0, nothing, to 1, touching, ``[n]``.
+        reading: Readings, ``[n]``: 1 is contact, 0 is no detection.
     """
     colour = _FAR + reading[:, None] * (_NEAR - _FAR)
     return np.where(reading[:, None] > 0, colour, _IDLE).round().astype(np.uint8)
 
 
 def set_stage(server: viser.ViserServer) -> None:
-    """Put up floor, light and camera."""
+    """Add floor and background, and set the up direction."""
     scene = server.scene
     scene.set_up_direction("+z")
     scene.world_axes.visible = False
@@ -71,12 +71,12 @@ class RobotScene:
 
     Args:
         server: The page.
-        name: Name of its branch of the scene.
+        name: Name of its node in the scene tree.
         body: The robot.
         skin: Its sensors; None for none.
-        balls: Shapes of what is thrown at it.
-        place: Where its origin is drawn [m], ``(x, y)``.
-        title: What stands above it; "" for nothing.
+        balls: Shapes of the balls.
+        place: Position of its origin on the page [m], ``(x, y)``.
+        title: Text above it; "" for none.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class RobotScene:
         self._server, self._body, self._skin, self._title = server, body, skin, title
         self.place = np.array([*place, 0.0])
         self._root = server.scene.add_frame(name, show_axes=False, position=self.place)
-        # What moves are the links: poses reach the browser sooner than anything else.
+        # Only link frames move: poses reach the browser faster than other updates.
         links = {part.body for part in body.parts()}
         if skin is not None:
             links |= set(body.link_indices(skin))
@@ -130,7 +130,7 @@ class RobotScene:
     def _add_sensors(
         self, name: str, skin: Skin
     ) -> list[tuple[np.ndarray, viser.BatchedMeshHandle]]:
-        """Add the sensors of each link; return which they are, and what shows them."""
+        """Add the sensors of each link; return their indices and meshes, by link."""
         kinds = np.array([isinstance(own, Ray) for own in skin.coverage])
         self._line_colour = np.where(kinds[:, None], _RAY_LINE, _FIELD_LINE)
         ball = trimesh.creation.icosphere(subdivisions=2, radius=_SENSOR_RADIUS)
@@ -158,7 +158,7 @@ class RobotScene:
         """Draw a frame.
 
         Args:
-            frame: What there is to see.
+            frame: The frame.
             masked: Indices of the sensors that are masked.
         """
         body = self._body
@@ -222,7 +222,7 @@ class RobotScene:
         self._word.position = (*frame.qpos[:2], _WORD_HEIGHT)
 
     def remove(self) -> None:
-        """Take all of it off the page."""
+        """Remove the robot and everything with it from the page."""
         self._root.remove()
 
 
@@ -234,7 +234,7 @@ def _lit(rgb: Sequence[float]) -> tuple[int, int, int]:
 def _lines(
     server: viser.ViserServer, name: str, thickness: float
 ) -> viser.LineSegmentsHandle:
-    """Add lines, none as yet."""
+    """Add a set of lines, empty at first."""
     return server.scene.add_line_segments(
         name,
         np.zeros((1, 2, 3), np.float32),
@@ -247,11 +247,11 @@ def _lines(
 def _set_lines(
     lines: viser.LineSegmentsHandle, ends: np.ndarray, colours: np.ndarray
 ) -> None:
-    """Draw other lines, none or more.
+    """Replace a set of lines, by none or more.
 
     Args:
-        lines: The lines.
-        ends: Both ends of each [m], ``[n, 2, 3]``.
+        lines: The set of lines.
+        ends: Both ends of each line [m], ``[n, 2, 3]``.
         colours: Colours of the ends, ``[n, 2, 3]``.
     """
     lines.visible = len(ends) > 0

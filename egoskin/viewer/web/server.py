@@ -1,4 +1,4 @@
-"""The server of a page: for this machine alone, and quiet."""
+"""A silent web server that only this machine can reach."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ import viser
 
 
 def open_server(port: int) -> viser.ViserServer:
-    """Return a server of a page that this machine alone can reach.
+    """Return a web server that only this machine can reach.
 
     Args:
-        port: Port of 127.0.0.1; 0 for any that is free.
+        port: Port of 127.0.0.1; 0 for any free one.
 
     Raises:
         OSError: If the port is taken.
     """
-    # viser would take another.
+    # viser would use another port instead.
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -32,6 +32,6 @@ def open_server(port: int) -> viser.ViserServer:
 
 
 def stop_server(server: viser.ViserServer) -> None:
-    """Close a page for all who have it open."""
+    """Stop a server, which closes its page for all visitors."""
     with redirect_stdout(StringIO()):
         server.stop()

@@ -1,7 +1,7 @@
-"""One robot that is played with: its policy, its sensors, balls thrown on demand.
+"""One interactive robot: its policy, its sensors, and balls thrown on demand.
 
-Contract: all is computed by the environment of the task, one row of it; only what is
-thrown, and when, comes from outside, by a `Thrower` that draws what it is given.
+Contract: everything is computed by the environment of the task, with one row; only the
+throws and their times come from outside, by a `Thrower` that returns requested throws.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ from egoskin.sensors.pipeline import SensorGroup
 from egoskin.viewer.offscreen import closest_point, ending_of
 from egoskin.viewer.web.body import Body
 
-# Nothing is thrown by itself: the next throw is this far off [s].
+# Time until the next throw [s]: never, as balls are only thrown on demand.
 _NEVER = 1e6
 _MIN_DISTANCE, _MAX_DISTANCE = 1.5, 8.0
 """Balls clicked nearer or farther than this are released at this distance [m]."""
 SPEEDS, HEIGHTS = (1.0, 12.0), (0.3, 4.0)
-"""Speeds [m/s] and heights of release [m] that can be thrown with."""
+"""Ranges of the speed [m/s] and height of release [m] of a throw."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Throw:
-    """What is wanted of a throw; None leaves it to chance, as the task draws it."""
+    """Requested properties of a throw; None is drawn at random, as in the task."""
 
     speed: float | None = None
     """Initial speed [m/s]."""
@@ -50,12 +50,12 @@ class Throw:
     distance: float | None = None
     """Horizontal distance of release from the base [m]."""
     target: float | None = None
-    """The point aimed at: a number in [0, 1), see `Session.target_near`."""
+    """Point aimed at: a number in [0, 1), see `Session.target_near`."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Frame:
-    """What there is to see after a control step, of one robot."""
+    """State of one robot to show after a control step."""
 
     qpos: np.ndarray
     """Base pose and joint positions, ``[7 + J]``."""
@@ -64,10 +64,10 @@ class Frame:
     active: np.ndarray
     """Which of them are in play, ``[O]`` bool."""
     reading: np.ndarray
-    """What each sensor reads, from 1, touching, to 0, nothing, ``[S]``."""
+    """Reading of each sensor, ``[S]``: 1 is contact, 0 is no detection."""
     line: np.ndarray
-    """Where the line of each sensor ends, on what it sees [m], ``[S, 3]``; NaN: it
-    sees nothing."""
+    """End of each sensor's line, on the ball it detects [m], ``[S, 3]``; NaN if it
+    detects none."""
     step: int
     """Control steps since the start of the episode."""
     survived: float
@@ -79,16 +79,16 @@ class Frame:
 
 
 class ThrownOnDemand(Thrower):
-    """Throws what it is told to; what is left open is drawn as the task draws it."""
+    """Thrower of requested throws; the rest of each is drawn as in the task."""
 
     wanted = Throw()
 
     def first_delay(self, seed: int, row: Tensor, episode: Tensor) -> Tensor:
-        """Return never [s], ``[n]``."""
+        """Return a time that is never reached [s], ``[n]``."""
         return torch.full(row.shape, _NEVER)
 
     def draw(self, seed: int, row: Tensor, episode: Tensor, throw: Tensor) -> Draw:
-        """Return the wanted throw, the next of which is never due."""
+        """Return the requested throw; the one after it is never due."""
         draw = super().draw(seed, row, episode, throw)
         given: dict[str, Tensor] = {"interval": torch.full(row.shape, _NEVER)}
         for name in ("speed", "height", "azimuth", "distance"):
@@ -100,10 +100,9 @@ class ThrownOnDemand(Thrower):
         return dataclasses.replace(draw, **given)
 
     def points_w(self, base_pose: Tensor, joint_pos: Tensor) -> Tensor | None:
-        """Return all points that are aimed at, in the world [m], ``[n, 3]``.
+        """Return all points that can be aimed at, in the world [m], ``[n, 3]``.
 
-        None where the task aims at a box. The i-th is aimed at by a target of
-        (i + 0.5) / n.
+        None if the task aims at a box. A target of (i + 0.5) / n aims at the i-th.
 
         Args:
             base_pose: Base pose in the world, ``[7]``.
@@ -123,8 +122,8 @@ class Session:
 
     Args:
         policy: Name, file, checkpoint or run folder of its policy.
-        seed: Seed of what is left to chance; robots of one seed start alike, and meet
-            the same throws.
+        seed: Random seed; robots with the same seed start alike and receive the same
+            throws.
 
     Raises:
         ValueError: If there is no such policy.
@@ -139,10 +138,10 @@ class Session:
     # --- policy and sensors -----------------------------------------------------
 
     def load(self, source: str) -> None:
-        """Take another policy, with its own robot, task and skin; begin anew.
+        """Load another policy, with its own robot, task and skin, and reset.
 
         Raises:
-            ValueError: If there is no such policy; all is as it was then.
+            ValueError: If there is no such policy; nothing is changed then.
         """
         policy, critic = load_policy(source), load_critic(source)
         self.source = source
@@ -151,7 +150,7 @@ class Session:
         self.configure(policy.env_config.sensor)
 
     def follow(self, policy: Policy, critic: Critic | None) -> None:
-        """Go on with a newer state of the policy, in the midst of the episode."""
+        """Continue the episode with a newer version of the policy."""
         self._take(policy, critic)
 
     def _take(self, policy: Policy, critic: Critic | None) -> None:
@@ -163,10 +162,10 @@ class Session:
         return self.policy.policy_spec.frames
 
     def configure(self, sensor: SensorConfig) -> None:
-        """Measure with other sensors, and begin anew.
+        """Change the sensors, and reset.
 
         Raises:
-            ValueError: If the policy cannot read what they signal.
+            ValueError: If the policy cannot read their signal.
         """
         config, pipeline = self._check(sensor)
         self.config, self.pipeline = config, pipeline
@@ -185,7 +184,7 @@ class Session:
         chain = self.env.transform
         assert isinstance(chain, Compose)
         self._sensors = [t for t in chain if isinstance(t, (FieldSensor, RaySensor))]
-        # All, the masked ones of before too: `mask` lets the others see again.
+        # The new sensors are all unmasked: apply the mask again.
         self.mask(self.masked)
         self.reset()
 
@@ -193,7 +192,7 @@ class Session:
         """Return the policy's own sensors with changes; None if it cannot read them.
 
         Args:
-            changes: Fields of the configuration of the sensors.
+            changes: Fields of the sensor configuration.
         """
         own = self.policy.env_config
         try:
@@ -204,7 +203,7 @@ class Session:
         return sensor
 
     def _check(self, sensor: SensorConfig) -> tuple[EnvConfig, SensorPipeline]:
-        """Return what is measured with; raise ValueError if it cannot be read."""
+        """Return config and pipeline; raise ValueError if the policy cannot read it."""
         own, skin = self.policy.env_config, self.policy.skin
         config = dataclasses.replace(own, sensor=sensor)
         pipeline, expected = config.pipeline(skin), own.pipeline(skin).signal_size
@@ -217,11 +216,11 @@ class Session:
 
     @property
     def skin(self) -> Skin | None:
-        """The sensors, resolved; None without any (blind, or told by an oracle)."""
+        """The sensors with coverage and range resolved; None if blind or an oracle."""
         return self.pipeline.skin if self.pipeline.groups else None
 
     def mask(self, sensors: Collection[int]) -> None:
-        """Let some sensors, and no others, detect nothing from now on."""
+        """Mask exactly these sensors: they detect nothing from now on."""
         self.masked = set(sensors)
         for group, sensor in zip(self.pipeline.groups, self._sensors, strict=True):
             sensor.mask([i for i, own in enumerate(group.index) if own in self.masked])
@@ -229,7 +228,7 @@ class Session:
     # --- time -------------------------------------------------------------------
 
     def reset(self) -> Frame:
-        """Begin an episode: the same start each time, and nothing in the air."""
+        """Start an episode, always from the same state and without a ball in flight."""
         self.env.set_seed(self.seed, static_seed=True)
         self._root = self.env.reset()
         self.first_throw: int | None = None
@@ -238,7 +237,7 @@ class Session:
 
     @torch.no_grad()
     def step(self) -> Frame:
-        """Return what there is to see one control step later.
+        """Advance one control step and return its frame.
 
         Raises:
             ValueError: If the policy's action is not finite.
@@ -257,14 +256,14 @@ class Session:
     def throw(self, throw: Throw) -> None:
         """Throw a ball in the next step."""
         self._thrower.wanted = throw
-        # It is due at once.
+        # The next throw is due immediately.
         self.task.balls.state["next_throw_step"].zero_()
         if self.first_throw is None:
             self.first_throw = self.frame.step
 
     @property
     def avoided(self) -> tuple[int, int]:
-        """Balls avoided and balls that came, in this episode."""
+        """Balls avoided and balls that arrived, in this episode."""
         counted = self.task.balls.state
         return int(counted["avoided"].sum()), int(counted["arrived"].sum())
 
@@ -274,7 +273,7 @@ class Session:
         """Return the direction of a point from the base, relative to the heading [rad].
 
         Args:
-            point: In the world [m], ``[3]`` or ``[2]``.
+            point: Point in the world [m], ``[3]`` or ``[2]``.
         """
         x, y = point[:2] - self.frame.qpos[:2]
         w, qx, qy, qz = self.frame.qpos[3:7]
@@ -283,24 +282,24 @@ class Session:
         return math.remainder(angle, 2 * math.pi)
 
     def distance_of(self, point: np.ndarray) -> float:
-        """Return the distance of a point from the base, as far as one throws [m]."""
+        """Return the planar distance of a point from the base, within limits [m]."""
         away = float(np.hypot(*(point[:2] - self.frame.qpos[:2])))
         return min(max(away, _MIN_DISTANCE), _MAX_DISTANCE)
 
     @property
     def distances(self) -> tuple[float, float]:
-        """Range of distances that the task throws from [m]."""
+        """Range of release distances of the task [m]."""
         return self.config.task.throws.distance
 
     def sensor_at(
         self, origin: np.ndarray, direction: np.ndarray, within: float
     ) -> int | None:
-        """Return the sensor that a ray meets first, on the side turned to it.
+        """Return the first sensor on a ray whose normal faces its origin, or None.
 
         Args:
-            origin: Where the ray starts in the world [m], ``[3]``.
+            origin: Start of the ray in the world [m], ``[3]``.
             direction: Its direction, ``[3]``.
-            within: How far off the ray it may be [m].
+            within: Largest distance of the sensor from the ray [m].
         """
         if self.skin is None:
             return None
@@ -314,10 +313,10 @@ class Session:
         return int(np.where(met, ahead, np.inf).argmin()) if met.any() else None
 
     def target_near(self, point: np.ndarray) -> float | None:
-        """Return what `Throw.target` is for the point aimed at nearest to a place.
+        """Return the `Throw.target` nearest to a point; None if the task aims at a box.
 
         Args:
-            point: In the world [m], ``[3]``.
+            point: Point in the world [m], ``[3]``.
         """
         pose = torch.from_numpy(self.frame.qpos).float()
         points = self._thrower.points_w(pose[:7], pose[7:])
@@ -329,7 +328,7 @@ class Session:
     # --- what is seen -----------------------------------------------------------
 
     def _look(self, state: TensorDictBase, ending: str | None) -> Frame:
-        """Return what there is to see of a state, ``[1]``, after all transforms."""
+        """Return the frame of a state, ``[1]``, after all transforms."""
         row = state[0]
         assert isinstance(row, TensorDictBase)
         qpos = np.concatenate((row["base_pose"], row["joint_pos"])).astype(float)
@@ -371,14 +370,14 @@ class Session:
         )
 
     def _readings(self, row: TensorDictBase, group: SensorGroup) -> np.ndarray:
-        """Return what the sensors of a group read, as in `Frame.reading`."""
+        """Return the readings of a group of sensors, as in `Frame.reading`."""
         corrupted = f"reading{group.suffix}"
         key = corrupted if corrupted in row.keys() else f"distance{group.suffix}"
         distance = np.asarray(row[key], float).reshape(len(group.index), -1).min(-1)
         ranges = group.skin.range
         if self.config.sensor.signal == "binary":
             return (distance <= ranges).astype(float)
-        # As the signal of proximity has it, 1 m being the scale of no range.
+        # As in the proximity signal, with a scale of 1 m for infinite range.
         with np.errstate(invalid="ignore"):
             share = np.where(
                 np.isinf(ranges), 1 - 1 / (1 + distance), distance / ranges

@@ -1,7 +1,7 @@
-"""The page of a robot without a policy: its joints, its skin, and what that sees.
+"""The page of a robot without a policy: its joints, its skin, and visible directions.
 
-Contract: as in `egoskin.viewer.web.page`, one thread draws what visitors ask for. A
-map of the directions seen takes seconds: another thread computes it.
+Contract: as in `egoskin.viewer.web.page`, one thread handles the requests of visitors.
+The map of directions seen takes seconds, so another thread computes it.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from egoskin.viewer.web.scene import RobotScene, set_stage
 from egoskin.viewer.web.server import open_server, stop_server
 from egoskin.viewer.web.session import Frame
 
-# Size of the sphere's points over its radius; how far an unlimited joint turns [rad].
+# Point size relative to the sphere's radius; slider limit of an unlimited joint [rad].
 _POINT_SIZE, _ANY_TURN = 0.013, math.pi
-# Clearance when first seen over range, from late to early, and never.
+# Colours of directions first seen late or early, and of those never seen.
 _LATE, _EARLY, _NEVER = np.array([88, 60, 140]), np.array([70, 205, 120]), (200, 30, 40)
 _MOST_IN_FOLDER = 12
 _LEGEND = (
@@ -44,14 +44,14 @@ def colour_directions(share: np.ndarray) -> np.ndarray:
     """Return the colours of directions, ``[n, 3]`` uint8.
 
     Args:
-        share: Clearance when first seen over range, 0 for never, ``[n]``.
+        share: Clearance when first seen, divided by the range, ``[n]``; 0 if never.
     """
     colours = _LATE + share[:, None].clip(0, 1) * (_EARLY - _LATE)
     return np.where(share[:, None] > 0, colours, _NEVER).astype(np.uint8)
 
 
 def group_joints(names: Sequence[str]) -> dict[str, list[int]]:
-    """Return joints by the first word of their names, few enough to be looked over."""
+    """Return joint indices in small groups, by the first word of the joints' names."""
     groups: dict[str, list[int]] = {}
     for i, name in enumerate(names):
         groups.setdefault(name.split("_")[0], []).append(i)
@@ -66,12 +66,12 @@ def group_joints(names: Sequence[str]) -> dict[str, list[int]]:
 
 
 class SkinPage:
-    """A local page with a robot that stands, and sliders for its joints.
+    """A local page with a standing robot and sliders for its joints.
 
     Args:
         robot: The robot.
         skin: Its skin, if it has one.
-        port: Port of 127.0.0.1; 0 for any that is free.
+        port: Port of 127.0.0.1; 0 for any free one.
 
     Raises:
         ValueError: If the skin is on links that the robot does not have.
@@ -85,7 +85,7 @@ class SkinPage:
         self.body = Body(robot)
         self.server = open_server(port)
         self.joint_pos = robot.default_joint_pos.copy()
-        """Joint positions [rad], of slides [m], ``[J]``."""
+        """Joint positions [rad], [m] for slide joints, ``[J]``."""
         self._commands: queue.Queue[Callable[[], object]] = queue.Queue()
         self._computing: threading.Thread | None = None
         set_stage(self.server)
@@ -99,14 +99,14 @@ class SkinPage:
         self.draw()
 
     def _resolved(self) -> Skin | None:
-        """The skin, its sensors having coverage and range."""
+        """Return the skin with the coverage and range of each sensor resolved."""
         if self.skin is None:
             return None
         return SensorPipeline(SensorConfig(), self.robot, self.skin).skin
 
     @property
     def address(self) -> str:
-        """Where the page is."""
+        """URL of the page."""
         return f"http://127.0.0.1:{self.server.get_port()}"
 
     def _add_panel(self) -> None:
@@ -158,7 +158,7 @@ class SkinPage:
     # --- what visitors ask for --------------------------------------------------
 
     def run(self) -> None:
-        """Do what visitors ask for, for as long as the process lives."""
+        """Handle the requests of visitors until the process ends."""
         while True:
             self._commands.get()()
 
@@ -167,7 +167,7 @@ class SkinPage:
         stop_server(self.server)
 
     def move(self, joint: int, position: float) -> None:
-        """Move a joint to a position [rad], [m]."""
+        """Move a joint to a position [rad], [m] for a slide joint."""
         self.joint_pos[joint] = position
         self.draw()
 
@@ -198,7 +198,7 @@ class SkinPage:
             )
 
     def look(self) -> None:
-        """Compute what is seen in this pose, and show it when it is known."""
+        """Start to compute the directions seen in this pose; show them when done."""
         if self._computing is not None:
             return
         self._button.disabled = True
@@ -231,11 +231,11 @@ class SkinPage:
         self._result.content = text
 
     def show(self, clearance: np.ndarray, max_range: float) -> None:
-        """Show directions on a sphere about the robot.
+        """Show directions on a sphere around the robot.
 
         Args:
-            clearance: At which a ball is first seen [m], in the order of
-                `direction_grid`; 0 where never, NaN where none comes from.
+            clearance: Clearance at which a ball is first seen [m], in the order of
+                `direction_grid`; 0 if never, NaN where no ball can come from.
             max_range: Range of the sensors [m].
         """
         azimuth, elevation = (angle.ravel() for angle in direction_grid())
@@ -259,7 +259,7 @@ class SkinPage:
 
 
 def _short(name: str, names: Sequence[str]) -> str:
-    """Return a joint's name without an ending that all have."""
+    """Return a joint's name without ``_joint`` if all names end in it."""
     common = "_joint"
     alike = all(other.endswith(common) for other in names)
     return name.removesuffix(common) if alike else name
