@@ -12,8 +12,9 @@ import pytest
 
 pytest.importorskip("viser")
 
-from calling import fail
+from calling import BATCH, SMALL, fail, succeed
 from egoskin.viewer.web.page import Page
+from egoskin.viewer.web.panel import MEMORY
 from visiting import Visitor
 
 
@@ -232,6 +233,23 @@ def test_two_robots_meet_the_same_throws():
         np.testing.assert_allclose(one.balls[0], other.balls[0], atol=0.02)
         page._draw([one, other])
         assert len(page._status()) >= 4
+    finally:
+        page.close()
+
+
+def test_robots_side_by_side_have_one_control_rate(tmp_path):
+    slow = tmp_path / "slow"
+    rate = ("--task.physics.control-hz", "50")
+    succeed("train", *SMALL, *rate, "--run-dir", slow, "--total-frames", BATCH)
+    with pytest.raises(
+        ValueError, match="blind acts at 60 Hz and the other robot at 50 Hz"
+    ):
+        Page([str(slow), "blind"])
+    page = Page(["blind"])
+    try:
+        page.load(0, str(slow))
+        assert page.hz == 50
+        assert page._memory.maxlen == MEMORY * 50
     finally:
         page.close()
 

@@ -57,13 +57,15 @@ class Page:
         seed: Random seed of the episodes and throws.
 
     Raises:
-        ValueError: If a policy does not exist.
+        ValueError: If a policy does not exist, or two have different control rates.
         OSError: If the port is taken.
     """
 
     def __init__(self, sources: Sequence[str], port: int = 0, seed: int = 0) -> None:
-        self.sessions = [Session(source, seed) for source in sources]
-        self.hz = self.sessions[0].hz
+        self.sessions: list[Session] = []
+        for source in sources:
+            rate = self.sessions[0].hz if self.sessions else None
+            self.sessions.append(Session(source, seed, rate))
         self.server = open_server(port)
         set_stage(self.server)
         self._commands: queue.Queue[Callable[[], object]] = queue.Queue()
@@ -130,6 +132,11 @@ class Page:
         self._ended_for = [0] * number
         self._since_throw = 0
         self._replayed.clear()
+
+    @property
+    def hz(self) -> float:
+        """Control rate of all robots [Hz]."""
+        return self.sessions[0].hz
 
     @property
     def address(self) -> str:
@@ -407,9 +414,11 @@ class Page:
         """Load another policy for a robot.
 
         Raises:
-            ValueError: If there is no such policy.
+            ValueError: If there is no such policy, or it has another control rate than
+                that of a second robot.
         """
-        self.sessions[i].load(source)
+        others = [s.hz for s in self.sessions if s is not self.sessions[i]]
+        self.sessions[i].load(source, *others)
         self._versions[i], self._notes[i] = _version(source), ""
         self._exchange_scene(i)
         self.reset()

@@ -124,26 +124,38 @@ class Session:
         policy: Name, file, checkpoint or run folder of its policy.
         seed: Random seed; robots with the same seed start alike and receive the same
             throws.
+        hz: Control rate that the policy must have [Hz]; None: any.
 
     Raises:
-        ValueError: If there is no such policy.
+        ValueError: If there is no such policy, or it has another control rate.
     """
 
-    def __init__(self, policy: str, seed: int = 0) -> None:
+    def __init__(self, policy: str, seed: int = 0, hz: float | None = None) -> None:
         self.seed = seed
         self.masked: set[int] = set()
         """Indices of the sensors that detect nothing."""
-        self.load(policy)
+        self.load(policy, hz)
 
     # --- policy and sensors -----------------------------------------------------
 
-    def load(self, source: str) -> None:
+    def load(self, source: str, hz: float | None = None) -> None:
         """Load another policy, with its own robot, task and skin, and reset.
 
+        Args:
+            source: Name, file, checkpoint or run folder of the policy.
+            hz: Control rate that it must have [Hz]; None: any.
+
         Raises:
-            ValueError: If there is no such policy; nothing is changed then.
+            ValueError: If there is no such policy, or it has another control rate;
+                nothing is changed then.
         """
         policy, critic = load_policy(source), load_critic(source)
+        own = policy.env_config.task.physics.control_hz
+        if hz is not None and own != hz:
+            raise ValueError(
+                f"{source} acts at {own:g} Hz and the other robot at {hz:g} Hz: side "
+                "by side they need the same control rate"
+            )
         self.source = source
         self._take(policy, critic)
         self.masked.clear()
