@@ -100,7 +100,7 @@ def approaches_b(
 ) -> Tensor:
     """Return the predicted time and position of each object's closest approach.
 
-    This follows from the objects' states, but a small network cannot compute it.
+    It follows from the objects' states, but a small network cannot compute it.
 
     Args:
         base_pose: Base pose in the world, ``[B, 7]``.

@@ -14,8 +14,8 @@ from egoskin.envs.randomization import RandomizationConfig
 from egoskin.envs.throws import ThrowConfig
 
 Standard = Literal["2", "1", "paper"]
-"""Name of a version: 2 is the default; 1 aims at the whole body and throws the first
-ball at the start of the episode; ``paper`` is 2 with the first ball at the start."""
+"""Name of a version: 2 is the default; ``paper`` is 2 with the first ball at the start
+in training, too; 1 is ``paper`` aimed at the whole body."""
 CUSTOM = "custom"
 """Name of a task that matches no version."""
 

@@ -59,8 +59,8 @@ class ThrowConfig:
     interval: _Seconds = (1.0, 2.0)
     """Time from one throw to the next [s]."""
     height: _Metres = (2.0, 3.0)
-    """Height of release above ground [m] for the H1-2 (1.78 m tall); for other robots it
-    is scaled with their height."""
+    """Height of release above ground [m] for the H1-2 (1.78 m tall); scaled with the
+    height of other robots."""
     distance: _Metres = (4.0, 6.0)
     """Horizontal distance of release from the base [m]."""
     speed: _MetresPerSecond = (4.0, 8.0)
@@ -77,7 +77,7 @@ class ThrowConfig:
     lead: Annotated[float, Interval(ge=0, le=10)] = 1.0
     """Share of the base's planar velocity used to lead the aim."""
     flight: Literal["ballistic", "straight"] = "straight"
-    """With gravity, or without it at constant speed (the last 2 m then take longer)."""
+    """With gravity, or without it at constant speed (the last 2 m take longer)."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for invalid values, or options without effect."""
@@ -204,7 +204,7 @@ class Thrower:
     def at_standing_robot(self, draw: Draw) -> tuple[Tensor, Tensor]:
         """Return arrival height and speed at the robot standing in its default pose.
 
-        They depend only on the draws, so a throw has the same values for every policy.
+        They depend only on the draws, so they are the same for every policy.
 
         Args:
             draw: Draws of ``n`` throws.
@@ -270,10 +270,10 @@ class Thrower:
     def release(
         self, draw: Draw, base_pose: Tensor, base_lin_vel_w: Tensor, joint_pos: Tensor
     ) -> Release:
-        """Return position and velocity of balls thrown at robots in their current state.
+        """Return position and velocity of balls thrown at robots in a given state.
 
-        If the number of rows is a multiple of 32
-        (`egoskin.robots.kinematics.pad_rows`), no row's result depends on the others.
+        A row's result does not depend on the other rows if their total number is a
+        multiple of 32 (`egoskin.robots.kinematics.pad_rows`).
 
         Args:
             draw: Draws of ``n`` throws.

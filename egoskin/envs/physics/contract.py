@@ -146,7 +146,7 @@ class Physics(ABC):
         device: Device of the simulations and of all tensors.
 
     Raises:
-        ValueError: If the engine cannot simulate the scene, or cannot run on this device.
+        ValueError: If the engine cannot simulate the scene, or not on this device.
     """
 
     @abstractmethod

@@ -7,8 +7,8 @@ import numpy as np
 
 from egoskin.envs.physics.contract import OBJECT_MASS, Scene
 
-# Contact bits of the model files: a geom's conaffinity has bit 1 for balls and bit 2 for
-# the floor; all other bits are self-collision. Objects and floor have conaffinity 0.
+# Contact bits of the model files: in a geom's conaffinity, 1 is balls and 2 the floor;
+# higher bits are self-collision. Objects and floor have conaffinity 0.
 _BALL_BIT, _FLOOR_BIT = 1, 2
 # Maximum Newton iterations per physics step; even a fall seldom needs as many.
 _SOLVER_ITERATIONS = 10
@@ -21,14 +21,14 @@ MAX_SPEED = 200.0
 def build_scene(scene: Scene) -> mujoco.MjModel:
     """Return the compiled model of a robot on a floor with objects to throw.
 
-    Position actuators carry the PD law, evaluated in every substep.
+    Position actuators implement the PD law, evaluated in every substep.
 
     Args:
         scene: The scene; the robot's MJCF has no floor, actuators or sensors.
 
     Raises:
-        ValueError: If the robot's base does not float, a joint is not a hinge, or MuJoCo
-            cannot compile the scene.
+        ValueError: If the robot's base does not float, a joint is not a hinge, or
+            MuJoCo cannot compile the scene.
     """
     robot, config = scene.robot, scene.config
     robot.check_floating_base()

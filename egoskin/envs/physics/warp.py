@@ -76,7 +76,7 @@ class WarpPhysics(Physics):
         wp.config.log_level = wp.LOG_WARNING
         self._mujoco, contacts = build_scene(scene), self.num_contacts()
         model = self._mujoco
-        # Constraint rows: the sides of each contact's friction pyramid, joint limits, etc.
+        # Constraint rows: sides of each contact's friction pyramid, joint limits, etc.
         sides = max(2 * (int(model.geom_condim.max()) - 1), 1)
         others = int(model.jnt_limited.sum() + (model.dof_frictionloss > 0).sum())
         others += 6 * model.neq + model.ntendon
@@ -133,7 +133,7 @@ class WarpPhysics(Physics):
 
     @contextmanager
     def _in_order(self) -> Iterator[None]:
-        """Run Warp on this device, ordered after the work PyTorch has already queued."""
+        """Run Warp on this device, after the work that PyTorch has already queued."""
         if self.device.type == "cpu":
             with wp.ScopedDevice("cpu"):
                 yield
