@@ -1,1 +1,1 @@
-"""Batched environments: physics, throws, rewards. No sensor and no observation."""
+"""Batched environments: physics, throws, rewards and non-sensor observations."""

@@ -1,7 +1,7 @@
-"""Objects thrown at robots: which is thrown next and when, and what became of it.
+"""Objects thrown at robots: when each is thrown, and whether it hits or is avoided.
 
-Contract: what is thrown is a function of the draws of `Thrower` and of the robot at
-release; who hit whom is told by the physics. The rest is counted here, row by row.
+Contract: a throw is a function of the draws of `Thrower` and of the robot's state at
+release; contacts are those reported by the physics. All counts are per row.
 """
 
 from __future__ import annotations
@@ -46,22 +46,22 @@ class Balls:
         zeros = torch.zeros(num_envs, dtype=torch.int64, device=device)
         flags = torch.zeros(num_envs, len(objects), dtype=torch.bool, device=device)
         self.state = {
-            # Throws so far; age at which the next one is due, and the first.
+            # Throws so far; episode steps at which the next and the first one are due.
             "throw": zeros,
             "next_throw_step": zeros.clone(),
             "first_throw_step": zeros.clone(),
-            # Of each object: whether it is in play, was thrown first, has arrived.
+            # For each object: whether it is in play, was thrown first, has arrived.
             "active": flags,
             "is_first": flags.clone(),
             "passed": flags.clone(),
-            # First ball, later balls: arrived so far, of which without touching.
+            # First ball, later balls: arrived so far, and avoided (without contact).
             "arrived": torch.zeros(num_envs, 2, device=device),
             "avoided": torch.zeros(num_envs, 2, device=device),
         }
-        """Everything that is counted, ``[B, ...]`` each, to be saved and put back."""
+        """All counters and flags, ``[B, ...]`` each, for saving and restoring."""
 
     def start(self, rows: Tensor, seed: int, ids: Tensor, episode: Tensor) -> None:
-        """Begin episodes: nothing is in play, and the first throw is due later.
+        """Begin episodes with no object in play, and schedule the first throw.
 
         Args:
             rows: Rows whose episodes begin, ``[n]``.
@@ -77,7 +77,7 @@ class Balls:
             self.state[key][rows] = steps
 
     def due(self, step: Tensor) -> Tensor:
-        """Return whether the next throw is due at an age, ``[B]`` bool."""
+        """Return whether the next throw is due at an episode step, ``[B]`` bool."""
         return step >= self.state["next_throw_step"]
 
     def throw(
@@ -89,12 +89,12 @@ class Balls:
         ids: Tensor,
         episode: Tensor,
     ) -> None:
-        """Throw the next object of some rows at the robot as it is now.
+        """Throw the next object of some rows at the robot in its current state.
 
         Args:
-            physics: Where they fly.
+            physics: The simulations.
             rows: Rows to throw in, ``[n]``, at least one.
-            step: Their age, ``[n]``.
+            step: Their episode steps, ``[n]``.
             seed: Seed of the draws.
             ids: Global indices of these rows, padded (`pad_rows`).
             episode: Their episodes, padded.
@@ -115,15 +115,15 @@ class Balls:
         throw[rows] += 1
 
     def count(self, now: PhysicsState, hit_by: Tensor, sound: Tensor) -> None:
-        """Count the balls that came and those avoided; retire those that landed.
+        """Count the balls that arrived and were avoided; deactivate those that landed.
 
-        A ball has arrived when it touches the robot or when it has passed: it lands,
-        or flies away from the base and is farther than a metre.
+        A ball has arrived when it touches the robot or has passed it. It has passed
+        when it lands, or flies away from the base and is farther than a metre.
 
         Args:
-            now: State reached.
+            now: State after the control step.
             hit_by: Which objects touched the robot, ``[B, O]`` bool.
-            sound: Which rows have a simulation to be believed, ``[B, 1]`` bool.
+            sound: Which rows have not diverged, ``[B, 1]`` bool.
         """
         state = self.state
         gap = now.object_pose[..., :2] - now.base_pose[:, None, :2]

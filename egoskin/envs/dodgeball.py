@@ -44,21 +44,21 @@ class DodgeballConfig:
     reward: RewardConfig = field(default_factory=RewardConfig)
     """Weights of the reward terms."""
     randomization: RandomizationConfig = field(default_factory=RandomizationConfig)
-    """How robots differ from their model, for the real world; nothing by default."""
+    """Domain randomisation for sim-to-real; none by default."""
     action_scale: Annotated[float, Interval(gt=0, le=100)] = 0.3
     """q* = q_default + action_scale x torque limit / kp x action, per joint. (It is not
-    clipped to the joint's range: an ankle could then ask for little torque.)"""
+    clipped to the joint's range, which would limit an ankle's torque.)"""
     episode_length_s: Annotated[float, Interval(gt=0, le=3600)] = 10.0
     """Episodes are truncated this long after the first throw [s]."""
     success_s: Annotated[float, Interval(gt=0, le=3600)] = 3.0
-    """An episode not terminated until this long after the first throw succeeds [s]."""
+    """Success: no termination within this time after the first throw [s]."""
     self_contact_ends: bool = False
-    """Whether a robot that touches itself terminates the episode, as a fall does."""
+    """Whether self-contact terminates the episode, as a fall does."""
     start_joint_noise: Annotated[float, Interval(ge=0, le=10)] = 0.05
-    """Joints start uniformly within this of the default pose [rad]."""
+    """Largest uniform offset of the initial joints from the default pose [rad]."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for values that make no episode."""
+        """Raise ValueError for invalid values."""
         check_bounds(self)
         if self.episode_length_s * self.physics.control_hz < 1:
             raise ValueError(
@@ -68,12 +68,12 @@ class DodgeballConfig:
 
     @property
     def episode_steps(self) -> int:
-        """Control steps from the first throw to the end of a whole episode."""
+        """Control steps from the first throw to truncation."""
         return round(self.episode_length_s * self.physics.control_hz)
 
     @property
     def delay_steps(self) -> int:
-        """Most control steps before the first throw."""
+        """Largest number of control steps before the first throw."""
         return round(self.throws.first_delay[1] * self.physics.control_hz)
 
 
@@ -83,23 +83,23 @@ class DodgeballEnv(EnvBase):
     **Action** ``action [B, J]``, unbounded: position targets
     q* = q_default + scale x action, scale per joint; see `DodgeballConfig`.
 
-    **Observation**: the environment assembles none; it gives the state, from which
-    transforms (`egoskin.make`) make what the actor and the critic see.
+    **Observation**: the environment returns the state below; transforms
+    (`egoskin.make`) compute the observations of the actor and the critic from it.
 
     STATE
 
     **Reward**: the sum of ``reward_terms``; see `egoskin.envs.rewards`.
 
-    **Start**: default pose with a little joint noise on the ground at the origin,
+    **Start**: default pose with small joint noise, on the ground at the origin, with
     uniform heading, at rest; the first ball is thrown after a random delay.
 
-    **End**: ``terminated`` = hit or fallen or diverged, or self-contact if that ends
-    an episode; ``truncated`` some time after the first throw. A diverged row is reset
-    like any other and harms no other row.
+    **End**: ``terminated`` if hit, fallen or diverged or, with ``self_contact_ends``,
+    in self-contact; ``truncated`` ``episode_length_s`` after the first throw. A
+    diverged row is reset like any other and does not affect other rows.
 
     All draws are functions of (seed, global row, episode, ...): rows
     ``row_offset`` to ``row_offset + num_envs`` give the same episodes whichever
-    process simulates them. Split over a ParallelEnv, use
+    process simulates them. With a ParallelEnv, call
     ``set_seed(seed, static_seed=True)``.
 
     Args:
@@ -110,13 +110,13 @@ class DodgeballEnv(EnvBase):
         row_offset: Global index of the first row.
         num_threads: Physics threads; results do not depend on it.
         hold: Whether the robot is held rigid in its start pose.
-        tactile: Whether to tell which links were touched, the key ``tactile``.
-        objects: Shape of what is thrown, by default the balls of the configuration.
-        engine: What simulates.
-        device: Where it simulates, and all tensors are.
+        tactile: Whether to return the links touched, under the key ``tactile``.
+        objects: Shapes of the thrown objects; by default those of the configuration.
+        engine: Physics engine.
+        device: Device of the simulation and of all tensors.
 
     Raises:
-        ValueError: If the robot's base does not float, or a joint is no hinge.
+        ValueError: If the robot's base does not float, or a joint is not a hinge.
     """
 
     def __init__(
@@ -168,7 +168,7 @@ class DodgeballEnv(EnvBase):
             "previous_action": torch.zeros(num_envs, len(robot.joints), device=device),
         }
         self.state_rows = [key for key in STATE if tactile or key.name != "tactile"]
-        """What it tells: rows of the table of the state."""
+        """Rows of `STATE` that are part of the output."""
         self._sizes = {
             "J": len(robot.joints),
             "L": len(robot.links),
@@ -199,7 +199,7 @@ class DodgeballEnv(EnvBase):
 
     @property
     def physics(self) -> Physics:
-        """The simulations, built when first needed (a parent process needs none)."""
+        """The simulations, built on first use (a parent process does not need them)."""
         if self._physics is None:
             self._physics = self._engine(
                 self.scene,
@@ -210,7 +210,7 @@ class DodgeballEnv(EnvBase):
         return self._physics
 
     def check_scene(self) -> None:
-        """Raise ValueError if the engine cannot make the robot and the balls."""
+        """Raise ValueError if the engine cannot simulate the robot and the balls."""
         _ = self.physics
 
     def _set_seed(self, seed: int | None) -> None:
@@ -237,7 +237,7 @@ class DodgeballEnv(EnvBase):
         return out
 
     def _start_episodes(self, rows: Tensor) -> None:
-        """Put some rows into their start pose and start their counters."""
+        """Put some rows into their start pose and reset their counters."""
         counters, n = self._counters, len(rows)
         counters["episode"][rows] += 1
         counters["step"][rows] = 0
@@ -258,13 +258,13 @@ class DodgeballEnv(EnvBase):
         self.randomization.start(self.physics, rows, seed, ids[:n], episode[:n])
 
     def _throw(self, rows: Tensor) -> None:
-        """Throw the next ball of some rows, none or more."""
+        """Throw the next ball of some rows, of which there may be none."""
         if len(rows):
             step = self._counters["step"][rows]
             self.balls.throw(self.physics, rows, step, *self._draws_of(pad_rows(rows)))
 
     def _draws_of(self, rows: Tensor) -> tuple[int, Tensor, Tensor]:
-        """Return what names the draws of some rows: seed, global row, episode."""
+        """Return the arguments of the draws of some rows: seed, global row, episode."""
         return self._seed, self._rows[rows], self._counters["episode"][rows]
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -280,7 +280,7 @@ class DodgeballEnv(EnvBase):
         counters["step"] += 1
         state = self.physics.read()
 
-        # What a failed simulation touches means nothing.
+        # Contacts of diverged rows are ignored.
         sound = ~result.diverged
         hit_by = result.object_hit & self.balls.state["active"] & sound[:, None]
         hit, fallen = hit_by.any(-1), result.fallen & sound
@@ -290,7 +290,7 @@ class DodgeballEnv(EnvBase):
         since = counters["step"] - self.balls.state["first_throw_step"]
         truncated = (since >= config.episode_steps) & ~terminated
         self.balls.count(state, hit_by, sound[:, None])
-        # Of the balls in flight until here: a throw makes the flag a new ball's.
+        # Copied before the next throw, which clears the flag of its ball.
         arrived = self.balls.state["passed"].clone()
 
         due = self.balls.due(counters["step"]) & ~terminated & ~truncated
@@ -311,7 +311,7 @@ class DodgeballEnv(EnvBase):
             action_change=action - counters["previous_action"],
             terminated=terminated,
         )
-        # What a failed simulation leaves behind earns and costs nothing.
+        # Diverged rows get zero reward.
         terms = torch.where(result.diverged[:, None], 0.0, terms)
         counters["previous_action"].copy_(action)
         out["previous_action"] = action.clone()
@@ -330,7 +330,7 @@ class DodgeballEnv(EnvBase):
         return out
 
     def _state_td(self, state: PhysicsState) -> TensorDict:
-        """The state part of an output; the tensors are nobody else's."""
+        """Return the state part of an output; its tensors are copies."""
         counters, balls = self._counters, self.balls.state
         return TensorDict(
             {
@@ -363,10 +363,10 @@ class DodgeballEnv(EnvBase):
         }
 
     def load_simulation_state(self, state: dict[str, Tensor]) -> None:
-        """Continue from what `simulation_state` returned.
+        """Restore a state that `simulation_state` returned.
 
         Args:
-            state: The state of *all* rows of the run; this environment takes its own.
+            state: State of *all* rows of the run; this environment uses only its own.
         """
         mine = slice(self._first_row, self._first_row + len(self._rows))
         for key, value in self._counted().items():
@@ -378,7 +378,7 @@ class DodgeballEnv(EnvBase):
         self.physics.load_state(state["physics"][mine])
 
     def _counted(self) -> dict[str, Tensor]:
-        """All that is remembered beside the physics, ``[B, ...]`` each."""
+        """Return all state other than that of the physics, ``[B, ...]`` each."""
         return {**self._counters, **self.balls.state, **self.randomization.state}
 
 

@@ -1,4 +1,4 @@
-"""What the actor feels of its own body, what the critic or an oracle is told."""
+"""Proprioception, the critic's privileged observation and the oracle's signal."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 from egoskin.robots.kinematics import axis_vectors, rotate_inverse
 from egoskin.transform import RowTransform
 
-# An approach is looked ahead for this long [s], a pass is told up to this far [m], and
-# what comes within this time [s] is near.
+# Approaches: longest prediction [s], largest offset reported along an axis [m], and
+# time scale of the nearness [s].
 _LONGEST_APPROACH, _FARTHEST_PASS, _SOON = 2.0, 3.0, 0.3
 
 
 class Proprioception(RowTransform):
     """Base angular velocity, joint positions and velocities, gravity.
 
-    Reads ``base_pose``, ``base_ang_vel_b``, ``joint_pos``, ``joint_vel`` and, if asked
-    to, ``previous_action``; writes ``observation [*B, 6 + 2 J]``: angular velocity
-    [rad/s] 3, q - q_default [rad] J, joint velocities [rad/s] J, unit gravity in the
-    base frame 3; and then the previous action J.
+    Reads ``base_pose``, ``base_ang_vel_b``, ``joint_pos``, ``joint_vel`` and optionally
+    ``previous_action``; writes ``observation [*B, 6 + 2 J]``: angular velocity [rad/s]
+    3, q - q_default [rad] J, joint velocities [rad/s] J, unit gravity in the base frame
+    3; then, if it is read, the previous action J.
 
     Args:
         default_joint_pos: Default pose [rad], ``[J]``.
-        in_keys: Keys of the inputs, in the order above; the fifth may be left out.
+        in_keys: Keys of the inputs, in the order above; the fifth is optional.
         out_keys: Key of the observation.
     """
 
     _default: Tensor
     STATE_KEYS = ("base_pose", "base_ang_vel_b", "joint_pos", "joint_vel")
-    """The inputs that it always reads."""
+    """The required inputs."""
 
     def __init__(
         self,
@@ -68,7 +68,7 @@ def object_states_b(
     object_lin_vel_w: Tensor,
     object_active: Tensor,
 ) -> Tensor:
-    """Return what there is to know of the objects, seen from the base.
+    """Return the state of the objects relative to the base.
 
     Args:
         base_pose: Base pose in the world, ``[B, 7]``.
@@ -98,23 +98,23 @@ def approaches_b(
     *,
     gravity: float,
 ) -> Tensor:
-    """Return how soon and where each object passes the base, if both fly on.
+    """Return the predicted time and position of each object's closest approach.
 
-    It follows from the objects' states, but a small network cannot work it out.
+    It follows from the objects' states, but a small network cannot compute it.
 
     Args:
         base_pose: Base pose in the world, ``[B, 7]``.
-        base_lin_vel_w: Base velocity [m/s], ``[B, 3]``; the base keeps it.
+        base_lin_vel_w: Base velocity [m/s], ``[B, 3]``, assumed constant.
         object_pose: Poses in the world, ``[B, O, 7]``.
         object_lin_vel_w: Velocities [m/s], ``[B, O, 3]``.
         object_active: Whether each is in play, ``[B, O]`` bool.
-        gravity: What pulls the objects down [m/s^2].
+        gravity: Downward acceleration of the objects [m/s^2].
 
     Returns:
         ``[B, 4 O]``, for each object: nearness in time 0.3 s / (0.3 s + t), where t
-        is the time until its horizontal distance from the base is least (at least 0,
-        at most 2 s), and its position relative to the base at that time [m], at most
-        3 m along each of the base's axes; zero where inactive.
+        is the time of its least horizontal distance from the base, clamped to [0, 2] s,
+        and its position relative to the base at that time along the base's axes [m],
+        each clamped to [-3, 3] m; zero where inactive.
     """
     gap = object_pose[..., :3] - base_pose[:, None, :3]
     speed = object_lin_vel_w - base_lin_vel_w[:, None]
@@ -131,9 +131,9 @@ def approaches_b(
 
 
 class HideObjects(RowTransform):
-    """Hides all objects from the transforms after it: masks every sensor.
+    """Hides all objects from later transforms, which masks every sensor.
 
-    Reads ``object_active [*B, O]`` and writes it again, false.
+    Reads ``object_active [*B, O]`` and overwrites it with False.
 
     Args:
         keys: Key of the flags.
@@ -152,7 +152,7 @@ class HideObjects(RowTransform):
 
 
 class Oracle(RowTransform):
-    """What every ball does: a diagnostic of the task, no sensor can give it.
+    """The true state of every ball: a diagnostic that no sensor can provide.
 
     Reads ``base_pose``, ``base_lin_vel_w``, ``object_pose``, ``object_lin_vel_w`` and
     ``object_active``; writes ``signal [*B, 7 O]``, see `object_states_b`.
@@ -187,25 +187,25 @@ class Oracle(RowTransform):
 
 
 class Privileged(RowTransform):
-    """What the critic is told in training; the same for every skin.
+    """Privileged observation of the critic in training; the same for every skin.
 
-    Reads ``base_pose``, ``base_lin_vel_w`` and, unless told of the velocity alone,
+    Reads ``base_pose``, ``base_lin_vel_w`` and, with content "objects",
     ``displacement_w``, ``previous_action``, ``object_pose``, ``object_lin_vel_w`` and
-    ``object_active``. Writes ``privileged_observation``: base velocity [m/s] 3; then
-    displacement from the start [m] 3, previous action J, the objects' states
-    (`object_states_b`) 7 O and approaches (`approaches_b`) 4 O, and height of the base
-    above the ground [m] 1. Vectors are in the base frame.
+    ``object_active``. Writes ``privileged_observation``: base velocity [m/s] 3; with
+    content "objects" also displacement from the start [m] 3, previous action J, the
+    objects' states (`object_states_b`) 7 O and approaches (`approaches_b`) 4 O, and
+    height of the base above the ground [m] 1. Vectors are in the base frame.
 
     Args:
         content: "objects" for everything above, "velocity" for the paper's critic.
         num_joints: ``J``.
         num_objects: ``O``.
-        gravity: What pulls the objects down [m/s^2].
+        gravity: Downward acceleration of the objects [m/s^2].
         in_keys: Keys of the inputs, in the order above.
         out_keys: Key of the observation.
 
     Raises:
-        ValueError: If the number of in keys is not that of the content.
+        ValueError: If the number of ``in_keys`` does not match the content.
     """
 
     _VELOCITY_KEYS = ("base_pose", "base_lin_vel_w")

@@ -1,8 +1,8 @@
-"""Randomisation for the real world: robots that differ, late actions, pushes.
+"""Domain randomisation for sim-to-real: robot parameters, action delay, pushes.
 
-Contract: what a robot is like in an episode, and when and how it is pushed, are
-functions of (seed, row, episode, ...), as all draws are (`egoskin.rng`). With the
-defaults nothing is drawn, and not one bit is another than without this file.
+Contract: the robot's parameters, action delay and pushes in an episode are functions
+of (seed, row, episode, ...), like all draws (`egoskin.rng`). With the defaults nothing
+is drawn, and results are bit-identical to those without randomisation.
 """
 
 from __future__ import annotations
@@ -24,26 +24,26 @@ _NONE = (1.0, 1.0)
 
 @dataclass(frozen=True, kw_only=True)
 class RandomizationConfig:
-    """How robots differ from their model; every range is drawn from uniformly."""
+    """Ranges of the domain randomisation; each is sampled uniformly."""
 
     link_mass: _Factor = _NONE
-    """Mass and inertia of each link, times this."""
+    """Factor on mass and inertia of each link."""
     friction: _Factor = _NONE
-    """Friction of robot and floor, times this."""
+    """Factor on the friction of robot and floor."""
     gains: _Factor = _NONE
-    """kp and kd of each joint, times this."""
+    """Factor on kp and kd of each joint."""
     torque_limit: _Factor = _NONE
-    """Torque limit of each joint, times this."""
+    """Factor on the torque limit of each joint."""
     delay_steps: Annotated[tuple[int, int], Interval(ge=0, le=100)] = (0, 0)
-    """Control steps by which all actions of an episode come late."""
+    """Delay of all actions of an episode [control steps]."""
     push_speed: Annotated[tuple[float, float], Interval(ge=0, le=100)] = (0.0, 0.0)
-    """Pushes: what the base's speed changes by, in any direction over the ground [m/s];
-    0: none."""
+    """Pushes: change of the base velocity, in a random horizontal direction [m/s]; 0:
+    none."""
     push_interval: Annotated[tuple[float, float], Interval(gt=0, le=1000)] = (1.0, 3.0)
     """Time from one push to the next [s]."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for what is no range."""
+        """Raise ValueError for invalid ranges."""
         check_bounds(self)
         for field in fields(self):
             low, high = getattr(self, field.name)
@@ -52,7 +52,7 @@ class RandomizationConfig:
 
     @property
     def varies_robot(self) -> bool:
-        """Whether robots differ from their model."""
+        """Whether robot parameters are randomised."""
         factors = (self.link_mass, self.friction, self.gains, self.torque_limit)
         return any(factor != _NONE for factor in factors)
 
@@ -63,7 +63,7 @@ class RandomizationConfig:
 
 
 class Randomization:
-    """What is random of the robots of every row.
+    """Randomises the robots of every row: parameters, action delay and pushes.
 
     Args:
         config: The ranges.
@@ -87,7 +87,7 @@ class Randomization:
         self._links, self._joints = num_links, num_joints
         zeros = torch.zeros(num_envs, dtype=torch.int64, device=device)
         self.state: dict[str, Tensor] = {}
-        """What is remembered, ``[B, ...]`` each, to be saved and put back."""
+        """The state, ``[B, ...]`` each, for saving and restoring."""
         if most := config.delay_steps[1]:
             late = torch.zeros(num_envs, most, num_joints, device=device)
             self.state |= {"delay": zeros.clone(), "late_actions": late}
@@ -95,7 +95,7 @@ class Randomization:
             self.state |= {"push": zeros.clone(), "next_push_step": zeros.clone()}
 
     def variation(self, seed: int, ids: Tensor, episode: Tensor) -> Variation:
-        """Return how robots differ from their model, a function of the arguments.
+        """Return the variation of robots, a pure function of the arguments.
 
         Args:
             seed: Seed of the draws.
@@ -116,7 +116,7 @@ class Randomization:
     def start(
         self, physics: Physics, rows: Tensor, seed: int, ids: Tensor, episode: Tensor
     ) -> None:
-        """Begin episodes of some rows ``[n]``; they are named by their draws.
+        """Begin the episodes of some rows.
 
         Args:
             physics: The simulations.
@@ -137,14 +137,14 @@ class Randomization:
             self._plan_push(rows, seed, ids, episode)
 
     def _plan_push(self, rows: Tensor, seed: int, ids: Tensor, episode: Tensor) -> None:
-        """Draw when the next push comes."""
+        """Draw the time of the next push."""
         count = self.state["push"][rows]
         wait = uniform(seed, Stream.PUSH, ids, episode, count, 3)[:, 0]
         steps = (_between(self.config.push_interval, wait) * self._hz).round().long()
         self.state["next_push_step"][rows] += steps.clamp(min=1)
 
     def due(self, step: Tensor) -> Tensor:
-        """Return the rows that are to be pushed at an age ``[B]``, ``[n]``."""
+        """Return the rows ``[n]`` due for a push at episode steps ``[B]``."""
         if not self.config.pushes:
             return step.new_empty(0)
         return (step >= self.state["next_push_step"]).nonzero()[:, 0]
@@ -156,7 +156,7 @@ class Randomization:
         count = self.state["push"][rows]
         u = uniform(seed, Stream.PUSH, ids, episode, count, 3)
         speed, n = _between(self.config.push_speed, u[:, 2]), len(rows)
-        # A cosine's bits depend on where it stands in a row that is no multiple of 32.
+        # Padded to a multiple of 32: a cosine may round differently in an array's tail.
         angle = torch.nn.functional.pad(2 * math.pi * u[:, 1], (0, -n % 32))
         way = torch.stack((angle.cos(), angle.sin()), -1)[:n]
         velocity = torch.nn.functional.pad(speed[:, None] * way, (0, 1))
@@ -165,7 +165,7 @@ class Randomization:
         self._plan_push(rows, seed, ids, episode)
 
     def delayed(self, action: Tensor) -> Tensor:
-        """Return what acts now, of actions ``[B, J]`` that come late; 0 at first."""
+        """Return the delayed actions that apply now, ``[B, J]``; 0 at first."""
         if "delay" not in self.state:
             return action
         all_actions = torch.cat((action[:, None], self.state["late_actions"]), 1)

@@ -1,6 +1,6 @@
-"""Reward terms of the dodgeball task. None of them reads a sensor or a ball.
+"""Reward terms of the dodgeball task; none of them reads a sensor or a ball.
 
-Adding a term is adding a weight to `RewardConfig` and a line to `reward_terms`.
+To add a term, add a weight to `RewardConfig` and a line to `reward_terms`.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from egoskin.bounds import Interval, check_bounds
 
 # Width of the upright bonus: exp(-|g_xy|^2 / 0.2), as in common humanoid tasks.
 _UPRIGHT_WIDTH = 0.2
-# Beyond, the squares of returns are too large for float32 soon.
+# Beyond this, squared returns could overflow float32.
 _Weight = Annotated[float, Interval(ge=-1e6, le=1e6)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class RewardConfig:
-    """Weights of the reward terms; a cost is negative. Units of reward per step."""
+    """Weights of the reward terms, per control step; costs are negative."""
 
     survival: _Weight = 0.1
     """For every control step without contact or fall."""
     upright: _Weight = 0.01
-    """Posture: times ``exp(-|gravity_xy|^2 / 0.2)``, horizontal in the base."""
+    """Posture: times ``exp(-|gravity_xy|^2 / 0.2)``, gravity in the base frame."""
     posture: _Weight = -0.05
     """Posture: times the mean squared deviation from the default pose [rad^2]."""
     energy: _Weight = -5e-7
@@ -39,7 +39,7 @@ class RewardConfig:
     """Times the mean squared change of the action since the last step."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for numbers out of bounds."""
+        """Raise ValueError for values out of bounds."""
         check_bounds(self)
 
 
@@ -67,8 +67,8 @@ def reward_terms(
         power: Mechanical power of the joints [W], ``[B]``.
         base_lin_vel_w: Base velocity [m/s], ``[B, 3]``.
         displacement_w: Planar displacement from the start [m], ``[B, 2]``.
-        action_change: Action less the previous action, ``[B, J]``.
-        terminated: Whether the episode ends here, ``[B]`` bool.
+        action_change: Action minus the previous action, ``[B, J]``.
+        terminated: Whether the episode terminates in this step, ``[B]`` bool.
 
     Returns:
         Terms in the order of `TERMS`, ``[B, R]``.

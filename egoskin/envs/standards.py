@@ -1,7 +1,7 @@
 """Versions of the standard throw: how balls are thrown and when an episode ends.
 
-A version never changes: what was trained or judged on it stays comparable. A better
-throw is a new version.
+A version never changes, so policies trained or evaluated on it stay comparable. An
+improved throw gets a new version.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from egoskin.envs.randomization import RandomizationConfig
 from egoskin.envs.throws import ThrowConfig
 
 Standard = Literal["2", "1", "paper"]
-"""Name of a version: 2 is the default; 1 aims at the whole body, the first ball at the
-start; ``paper`` is 2 with the first ball at the start in training, too."""
+"""Name of a version: 2 is the default; ``paper`` is 2 with the first ball at the start
+in training, too; 1 is ``paper`` aimed at the whole body."""
 CUSTOM = "custom"
-"""Name of throws and ends that are those of no version."""
+"""Name of a task that matches no version."""
 
-# What the versions share, and what they differ in.
+# Settings shared by all versions, followed by those that differ.
 _SHARED = {
     "radius": 0.15,
     "num_balls": 2,
@@ -37,7 +37,7 @@ _THROWS: dict[Standard, ThrowConfig] = {
     "1": ThrowConfig(**_SHARED, aim="body", first_delay=_AT_ONCE),
     "paper": ThrowConfig(**_SHARED, aim="skin", first_delay=_AT_ONCE),
 }
-# Start and ends of an episode, of every version.
+# Start and ends of an episode, the same in every version.
 _ENDS = {
     "start_joint_noise": 0.05,
     "episode_length_s": 10.0,
@@ -47,23 +47,23 @@ _ENDS = {
 
 
 def training_task(version: Standard, task: DodgeballConfig) -> DodgeballConfig:
-    """Return a task with the throws and ends that a version trains on.
+    """Return a task with the throws and episode ends of a version in training.
 
     Args:
         version: The version.
-        task: What else the task is made of.
+        task: Task that provides all other settings.
     """
     return replace(task, throws=_THROWS[version], **_ENDS)
 
 
 def evaluation_task(version: Standard, task: DodgeballConfig) -> DodgeballConfig:
-    """Return a task with the throws and ends that a version judges by.
+    """Return a task with the throws and episode ends of a version in evaluation.
 
-    The first ball is thrown at the start of the episode, and the robot is its model.
+    The first ball is thrown at the start of the episode; nothing is randomised.
 
     Args:
         version: The version.
-        task: What else the task is made of.
+        task: Task that provides all other settings.
     """
     trained = training_task(version, task)
     return replace(
@@ -74,7 +74,7 @@ def evaluation_task(version: Standard, task: DodgeballConfig) -> DodgeballConfig
 
 
 def standard_of(task: DodgeballConfig) -> str:
-    """Return the version that a task trains on, `CUSTOM` if it is none."""
+    """Return the version whose training task this is, or `CUSTOM` if there is none."""
     for version in _THROWS:
         if task == training_task(version, task):
             return version

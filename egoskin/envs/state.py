@@ -1,8 +1,8 @@
-"""What the environment tells at every step: each key declared once, in `STATE`.
+"""Keys of the environment's output at every step, each declared once, in `STATE`.
 
 Contract: a key is a row of the table and a line of `DodgeballEnv` that computes it. Its
-spec, its value at the start of an episode, whether it leaves the worker, and its place
-in the documentation follow from the row.
+spec, its value at the start of an episode, whether it leaves the worker, and its entry
+in the documentation are derived from the row.
 """
 
 from __future__ import annotations
@@ -16,33 +16,33 @@ from torch import Tensor
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 
 Reader = Literal["sensors", "observations", "trainer", "evaluation"]
-"""Who reads a key, besides what watches every step where the environment is (behaviour,
-films): the worker's transforms, ``sensors`` and ``observations``; or, in the parent
-process, the metrics of a training and the figures of a throw set."""
+"""Reader of a key: ``sensors`` and ``observations``, transforms in the worker; or
+``trainer`` and ``evaluation``, metrics of training and of a throw set in the parent
+process. Code beside the environment (behaviour, films) is not listed: it reads all."""
 _FLAG, _COUNT, _NUMBER = torch.bool, torch.int64, torch.float32
 
 
 @dataclass(frozen=True)
 class StateKey:
-    """One key of the environment's output, beside reward and ends."""
+    """One key of the environment's output, other than reward and done flags."""
 
     name: str
     """The key."""
     shape: tuple[int | str, ...]
     """Shape of a row; ``J`` joints, ``L`` links, ``O`` objects, ``R`` reward terms."""
     content: str
-    """What it holds, with its unit."""
+    """Description, with units."""
     read_by: tuple[Reader, ...]
-    """Who reads it."""
+    """Readers of the key."""
     dtype: torch.dtype = _NUMBER
-    """Its type."""
+    """Data type."""
     of_step: bool = False
-    """Whether it tells what happened in the step, which is zero when an episode starts;
-    otherwise it tells the state that was reached."""
+    """Whether it describes the step itself, and is zero at the start of an episode;
+    otherwise it describes the resulting state."""
 
     @property
     def stays_in_worker(self) -> bool:
-        """Whether nobody outside the worker reads it."""
+        """Whether it is read only inside the worker."""
         return not set(_PARENT) & set(self.read_by)
 
     def zeros(
@@ -72,7 +72,7 @@ def _event(
     *read_by: Reader,
     kind: torch.dtype = _FLAG,
 ) -> StateKey:
-    """Return a row that tells what happened in a step."""
+    """Return a row that describes a step (``of_step``)."""
     return StateKey(name, (size,), content, read_by, kind, of_step=True)
 
 
@@ -111,7 +111,7 @@ STATE = (
 
 
 def keys_read_by(*readers: Reader) -> list[str]:
-    """Return the names of the keys that any of some readers reads."""
+    """Return the names of the keys that at least one of the readers reads."""
     return [key.name for key in STATE if set(readers) & set(key.read_by)]
 
 
@@ -126,7 +126,7 @@ def state_spec(
     Args:
         keys: Rows of the table.
         num_envs: Number of rows ``B``.
-        sizes: What each letter of the shapes stands for.
+        sizes: Size for each letter in the shapes.
         device: Device of the output.
     """
     specs = {key.name: key.spec(num_envs, sizes, device) for key in keys}

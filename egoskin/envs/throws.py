@@ -1,8 +1,8 @@
-"""Throws: which ball flies from where to which point of the body, and when.
+"""Throws: release position, speed, target point on the body, and timing.
 
-A throw is made of draws that depend on nothing of the robot but its size (direction,
-distance, height, speed, interval, point aimed at) and is turned into a position and a
-velocity for the pose the robot has at release. One throw set of draws therefore serves
+The random draws of a throw (direction, distance, height, speed, interval, target point)
+depend on the robot only through its size. At release they are turned into a position
+and a velocity for the robot's current pose. One throw set can therefore be used for
 every policy.
 """
 
@@ -24,21 +24,21 @@ from egoskin.robots.surface import sample_surface
 from egoskin.shapes import Sphere
 
 GRAVITY = 9.81
-# Points of the body that throws are aimed at: dense enough that two neighbours are
-# 2 cm apart, and fixed, so that a throw set means the same for every run.
+# Target points on the body: dense enough that neighbours are 2 cm apart, and fixed, so
+# that a throw set is the same in every run.
 _NUM_AIM_POINTS, _AIM_SEED = 4096, 0
-# A robot that runs away faster than this share of the ball's speed is led as if it
-# ran at it; otherwise no throw could reach it.
+# The aim leads the robot by at most this share of the ball's speed: no throw could
+# reach a robot that runs away faster than the ball.
 _MAX_LEAD_RATIO = 0.9
-# Height of the H1-2 [m], for which heights of release are given.
+# Height of the H1-2 [m], to which the release heights refer.
 _REFERENCE_HEIGHT = 1.78
-# Bounds that leave every throw finite in float32 and MuJoCo a model that it can make.
+# Bounds that keep every throw finite in float32 and the MuJoCo model valid.
 _Delay = Annotated[tuple[float, float], Interval(ge=0, le=1000)]
 _Seconds = Annotated[tuple[float, float], Interval(gt=0, le=1000)]
 _MetresPerSecond = Annotated[tuple[float, float], Interval(ge=0.01, le=1000)]
 _Degrees = Annotated[tuple[float, float], Interval(ge=-360, le=360)]
 _Metres = Annotated[tuple[float, float], Interval(gt=0, le=1000)]
-# Options that have an effect with one value of another alone.
+# Options that have an effect only with one value of another option.
 _ONLY_WITH = {
     "box_half_width": ("aim", "box"),
     "box_height": ("aim", "box"),
@@ -47,40 +47,40 @@ _ONLY_WITH = {
 
 @dataclass(frozen=True, kw_only=True)
 class ThrowConfig:
-    """The balls and how they are thrown; every range is drawn from uniformly."""
+    """The balls and how they are thrown; every range is sampled uniformly."""
 
     radius: Annotated[float, Interval(ge=1e-3, le=10)] = 0.15
     """Radius of the balls [m]."""
     num_balls: Annotated[int, Interval(ge=1, le=100)] = 2
-    """Balls thrown in turn, so that a slow one is not snatched away in flight."""
+    """Balls thrown in turn; with several, a slow one can finish its flight."""
     first_delay: _Delay = (0.0, 2.0)
-    """Time from the start of an episode to the first throw [s]: at a random moment no
-    fixed programme pays, with (0, 0) a blind robot learns to duck at once."""
+    """Time from the start of an episode to the first throw [s]. A random delay makes
+    fixed motions useless; with (0, 0) a blind robot learns to duck at once."""
     interval: _Seconds = (1.0, 2.0)
     """Time from one throw to the next [s]."""
     height: _Metres = (2.0, 3.0)
-    """Height of release above ground [m] for a robot as tall as the H1-2 (1.78 m): of
-    another it is scaled with the robot's height."""
+    """Height of release above ground [m] for the H1-2 (1.78 m tall); scaled with the
+    height of other robots."""
     distance: _Metres = (4.0, 6.0)
     """Horizontal distance of release from the base [m]."""
     speed: _MetresPerSecond = (4.0, 8.0)
-    """Initial speed [m/s]: its horizontal part if ballistic, else the whole."""
+    """Initial speed [m/s]; if ballistic, only its horizontal component."""
     azimuth_deg: _Degrees = (-180.0, 180.0)
     """Direction the ball comes from, relative to the robot's heading [deg]."""
     aim: Literal["skin", "body", "box"] = "skin"
-    """A random point of the outer surface of the links that carry skin (the robot's
-    ``skin_links``, whatever the skin), of the body (no shins, no feet), or of a box."""
+    """Target: a random point on the outer surface of the robot's ``skin_links``
+    (whatever the skin) or of the body (without shins and feet), or in a box."""
     box_half_width: Annotated[float, Interval(ge=0, le=1000)] = 0.45
     """For aim=box: largest sideways offset from the base [m]."""
     box_height: _Metres = (0.3, 1.8)
     """For aim=box: height above ground [m]."""
     lead: Annotated[float, Interval(ge=0, le=10)] = 1.0
-    """Share of the base's planar velocity by which the aim is led."""
+    """Share of the base's planar velocity used to lead the aim."""
     flight: Literal["ballistic", "straight"] = "straight"
-    """With gravity, or without weight at constant speed (the last 2 m take longer)."""
+    """With gravity, or without it at constant speed (the last 2 m take longer)."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for what cannot be thrown, or has no effect."""
+        """Raise ValueError for invalid values, or options without effect."""
         check_bounds(self)
         for field in fields(self):
             value = getattr(self, field.name)
@@ -93,12 +93,12 @@ class ThrowConfig:
 
     @property
     def gravity(self) -> float:
-        """What pulls the balls down [m/s^2]."""
+        """Downward acceleration of the balls [m/s^2]."""
         return GRAVITY if self.flight == "ballistic" else 0.0
 
     @property
     def balls(self) -> tuple[Sphere, ...]:
-        """The shapes in play."""
+        """Shape of each ball."""
         return (Sphere(radius=self.radius),) * self.num_balls
 
 
@@ -113,11 +113,11 @@ class Draw:
     height: Tensor
     """Height of release [m]."""
     speed: Tensor
-    """Initial speed [m/s]: the horizontal one if ballistic, else the whole."""
+    """Initial speed [m/s]; if ballistic, only its horizontal component."""
     interval: Tensor
     """Time until the next throw [s]."""
     target: Tensor
-    """Two uniform numbers in [0, 1) that choose the point aimed at, ``[n, 2]``."""
+    """Two uniform numbers in [0, 1) that select the target point, ``[n, 2]``."""
 
 
 QUARTERS = ("front", "left", "back", "right")
@@ -147,7 +147,7 @@ class Thrower:
         config: The throws.
         robot: The robot they are aimed at.
         timestep: Physics time step [s].
-        device: Device of the robots it throws at.
+        device: Device of the robots' state tensors.
     """
 
     def __init__(
@@ -163,12 +163,12 @@ class Thrower:
 
     @cached_property
     def _size(self) -> float:
-        """Height of the robot, that of the H1-2 being 1."""
+        """Height of the robot relative to the H1-2."""
         return self._robot.standing_height / _REFERENCE_HEIGHT
 
     @cached_property
     def _aim_points(self) -> tuple[LinkKinematics, Tensor, Tensor]:
-        """Kinematics of the links aimed at; link index and position of each point."""
+        """Kinematics of the target links; link index and position of each target."""
         robot = self._robot
         if self.config.aim == "skin":
             aimed_at = set(robot.skin_links)
@@ -185,12 +185,12 @@ class Thrower:
         )
 
     def aim_link(self, draw: Draw) -> list[str]:
-        """Return the name of the link each throw is aimed at (unless at a box)."""
+        """Return the name of the link each throw is aimed at (not for aim=box)."""
         kinematics, link, _ = self._aim_points
         return [kinematics.links[i] for i in link[self._point_index(draw)].tolist()]
 
     def aim_point(self, draw: Draw) -> Tensor:
-        """Return where on its link each throw is aimed at (unless at a box).
+        """Return the target point of each throw on its link (not for aim=box).
 
         Args:
             draw: Draws of ``n`` throws.
@@ -202,15 +202,15 @@ class Thrower:
         return local[self._point_index(draw)]
 
     def at_standing_robot(self, draw: Draw) -> tuple[Tensor, Tensor]:
-        """Return how throws arrive at the robot standing in its default pose.
+        """Return arrival height and speed at the robot standing in its default pose.
 
-        A property of the draws alone, so that a throw is the same for every policy.
+        They depend only on the draws, so they are the same for every policy.
 
         Args:
             draw: Draws of ``n`` throws.
 
         Returns:
-            Height of the points aimed at [m] and speed of the ball there [m/s],
+            Height of the target points [m] and speed of the ball there [m/s],
             ``[n]`` each.
         """
         n = len(draw.speed)
@@ -270,10 +270,10 @@ class Thrower:
     def release(
         self, draw: Draw, base_pose: Tensor, base_lin_vel_w: Tensor, joint_pos: Tensor
     ) -> Release:
-        """Return position and velocity of balls thrown at robots as they are now.
+        """Return position and velocity of balls thrown at robots in a given state.
 
-        A row's result is the same whichever rows are computed with it if their
-        number is a multiple of 32 (`egoskin.robots.kinematics.pad_rows`).
+        A row's result does not depend on the other rows if their total number is a
+        multiple of 32 (`egoskin.robots.kinematics.pad_rows`).
 
         Args:
             draw: Draws of ``n`` throws.
@@ -329,9 +329,9 @@ class Thrower:
     def _target(
         self, draw: Draw, base_pose: Tensor, joint_pos: Tensor, side: Tensor
     ) -> Tensor:
-        """Point in the world that each throw is aimed at [m], ``[n, 3]``.
+        """Return the target point of each throw in the world [m], ``[n, 3]``.
 
-        The poses are those of each throw's own robot, or of one for all, ``[1, ...]``.
+        There is one pose for each throw, or one for all, ``[1, ...]``.
         """
         if self.config.aim == "box":
             offset = (2 * draw.target[:, :1] - 1) * self.config.box_half_width

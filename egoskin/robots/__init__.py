@@ -1,1 +1,1 @@
-"""What a robot is: its model, chains and kinematics, and its outer surface."""
+"""Robots: model, kinematic chain, kinematics and outer surface."""

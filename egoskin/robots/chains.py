@@ -1,4 +1,4 @@
-"""Kinematic chains, for pytorch-kinematics, of compiled MuJoCo models.
+"""Build pytorch-kinematics chains from compiled MuJoCo models.
 
 `pytorch_kinematics.build_chain_from_mjcf` fails with MuJoCo 4 (its table of joint types
 is keyed by an enum that no longer equals an integer) and keeps the root's offset.
@@ -18,40 +18,40 @@ JOINT_TYPES = {
     mujoco.mjtJoint.mjJNT_HINGE: "revolute",
     mujoco.mjtJoint.mjJNT_SLIDE: "prismatic",
 }
-"""Joints that pytorch-kinematics has, by MuJoCo's type."""
+"""Joint types of pytorch-kinematics by MuJoCo joint type."""
 
 
 _BODY, _JOINT = mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_JOINT
 
 
 def body_name(model: mujoco.MjModel, body: int) -> str:
-    """Return the name of a body; one of its own if the model gives it none.
+    """Return the name of a body; a generated one if it is unnamed in the model.
 
-    That is ``body2``, or ``body2_`` where another body has that name.
+    A generated name is ``body2``, or ``body2_`` if another body has that name.
     """
     return model.body(body).name or _made_name(model, _BODY, f"body{body}")
 
 
 def joint_name(model: mujoco.MjModel, joint: int) -> str:
-    """Return the name of a joint; one of its own if the model gives it none.
+    """Return the name of a joint; a generated one if it is unnamed in the model.
 
-    That is ``joint3``, or ``joint3_`` where another joint has that name.
+    A generated name is ``joint3``, or ``joint3_`` if another joint has that name.
     """
     return model.joint(joint).name or _made_name(model, _JOINT, f"joint{joint}")
 
 
 def _made_name(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str) -> str:
-    """Return a name, with as many underscores after it as make it new."""
+    """Return a name, with underscores appended until it is unique."""
     while mujoco.mj_name2id(model, kind, name) >= 0:
         name += "_"
     return name
 
 
 def body_id(model: mujoco.MjModel, name: str) -> int:
-    """Return which body has a name, given or made.
+    """Return the index of the body with a name, which may be a generated one.
 
     Raises:
-        KeyError: If none has it.
+        KeyError: If no body has the name.
     """
     names = [body_name(model, body) for body in range(model.nbody)]
     if name not in names:
@@ -65,9 +65,9 @@ def _body_frames(
 ) -> list[pk_frame.Frame]:
     """Return the frames that lead from a body's parent to the body, in series.
 
-    MuJoCo turns a hinge about the axis through its ``pos`` p: T(p) R(q - ref) T(-p).
-    A frame of pytorch-kinematics has a fixed offset before its joint and none after, so
-    T(-p) goes to the next frame, and there is one more frame after the last such joint.
+    MuJoCo rotates a hinge about the axis through its ``pos`` p: T(p) R(q - ref) T(-p).
+    A pytorch-kinematics frame has a fixed offset before its joint and none after, so
+    T(-p) goes into the next frame, and one more frame follows the last such joint.
     """
     body = model.body(body_id)
     name = body_name(model, body_id)
@@ -100,7 +100,7 @@ def _body_frames(
             before, after = -reference * joint.axis, np.zeros(3)
         mujoco.mju_mulPose(position, quat, position.copy(), quat.copy(), before, turn)
         append(
-            # Frames need names of their own: no body may be called so, too.
+            # Frame names must be unique and differ from all body names.
             _made_name(model, _BODY, f"{name}:{own_name}"),
             pk_frame.Joint(
                 own_name,
@@ -124,27 +124,27 @@ def build_chain(
     """Return the pytorch-kinematics chain of a MuJoCo model from a body downwards.
 
     Args:
-        model: Compiled model with any number of hinges and slides in a body.
-        base: Root of the chain: the body with the free joint or, of a robot that stands
-            fixed, one that is welded to the world, or ``"world"`` itself. Its own pose
-            and joints are not part of the chain.
+        model: Compiled model; a body may have any number of hinges and slides.
+        base: Root of the chain: the body with the free joint or, for a fixed-base
+            robot, a body welded to the world or ``"world"`` itself. Its own pose and
+            joints are not part of the chain.
         dtype: Precision of the chain's constants.
 
     Returns:
-        A chain whose joints and links are the joints below the base and the bodies from
-        it on, in the order and with the names of the model (unnamed ones: `joint_name`,
-        `body_name`). A body with several joints, or one that does not turn about the
-        body's origin, has further frames, ``body:joint``.
+        A chain whose joints are those below the base and whose links are the base and
+        the bodies below it, in the order and with the names of the model (if unnamed:
+        `joint_name`, `body_name`). A body with several joints, or with a joint that is
+        not at the body's origin, has additional frames, ``body:joint``.
 
     Raises:
         KeyError: If the model has no body of the base's name.
         ValueError: If a joint below the base is neither hinge nor slide, or too many
-            bodies hang on each other in a row.
+            bodies are nested in each other.
     """
     joint = pk_frame.Joint(f"{base}_fixed", dtype=dtype)
     root = pk_frame.Frame(base, link=pk_frame.Link(base), joint=joint)
     ends = {body_id(model, base): root}
-    # A body comes after its parent.
+    # Bodies come after their parents.
     for body in range(1, model.nbody):
         end = ends.get(int(model.body_parentid[body]))
         if end is None or body in ends:

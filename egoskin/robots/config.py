@@ -1,8 +1,8 @@
-"""Robots: a model and the facts that no model holds.
+"""Robots: a model and the settings that a model file does not contain.
 
-Those of the package are at the end, with their MJCF in ``assets/``; one of your own
-comes from a folder or a file of yours (`egoskin.robots.own`). Names are resolved to
-indices once, in the properties of the configuration.
+The built-in robots are at the end, with their MJCF in ``assets/``; your own robots are
+read from a folder or a file (`egoskin.robots.own`). Names are resolved to indices once,
+in the properties of the configuration.
 """
 
 from __future__ import annotations
@@ -49,14 +49,14 @@ def resolve(table: Mapping[str, object], names: tuple[str, ...], what: str) -> l
     Args:
         table: Values by shell pattern (``*_knee_joint``).
         names: Names to look up.
-        what: What the table holds, for the error text.
+        what: Name of the table, for the error text.
 
     Returns:
         One value for each name.
 
     Raises:
-        ValueError: If a name matches no pattern or several, or a pattern matches
-            nothing.
+        ValueError: If a name matches no pattern or several, or a pattern matches no
+            name.
     """
     values = []
     for name in names:
@@ -93,25 +93,25 @@ class Primitive:
 class RobotConfig:
     """A robot: a base, and the hinges and slides below it.
 
-    Sensors can be placed on any. The task wants a floating base, hinges alone, gains
-    and the file of the robot alone: no floor, no actuators, no sensors.
+    Sensors can be placed on any robot. The task requires a floating base, only hinges,
+    gains, and a file of the robot only: no floor, actuators or sensors.
     """
 
     name: str
     """Name by which configurations refer to the robot."""
     model_path: Path | None = None
-    """MJCF or URDF; only what hangs on the base counts. Of a URDF links on fixed joints
-    are links, too, and meshes, which seldom lie where it says, are left out."""
+    """MJCF or URDF; only the base and the bodies below it are used. In a URDF, links on
+    fixed joints are kept, and meshes, whose paths are seldom valid, are left out."""
     model_xml: str | None = None
-    """An MJCF as text instead, which names no other file: what policies and runs keep
-    (`egoskin.robots.own.portable`)."""
+    """Instead of a path, an MJCF as text that refers to no other file, as saved with
+    policies and runs (`egoskin.robots.own.portable`)."""
     base: str
-    """Root of `chain`, the *robot's centre frame*: the body with the free joint or, of
-    a robot that stands fixed, one that is welded to the world, or ``"world"``."""
+    """Root of `chain`, the *robot's centre frame*: the body with the free joint or, for
+    a fixed-base robot, a body welded to the world or ``"world"``."""
     skin_links: tuple[str, ...]
     """Links that carry the proximity skin (the upper body)."""
     default_pose: Mapping[str, float] = field(default_factory=dict)
-    """Joint positions [rad], of slides [m], of the default pose by joint name pattern;
+    """Joint positions of the default pose [rad], for slides [m], by joint name pattern;
     else 0."""
     gains: Mapping[str, Mapping[str, Gain]] = field(default_factory=dict)
     """Named sets of PD gains by joint name pattern; the first is the default."""
@@ -121,7 +121,7 @@ class RobotConfig:
     """Links that throws are not aimed at."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError unless there is one model."""
+        """Raise ValueError unless exactly one model is given."""
         if (self.model_path is None) == (self.model_xml is None):
             raise ValueError(
                 f"robot {self.name!r} must have a model_path or a model_xml, one of "
@@ -129,16 +129,16 @@ class RobotConfig:
             )
 
     def __hash__(self) -> int:
-        """Return a hash, which its tables have not."""
+        """Return a hash without the tables, which are not hashable."""
         return hash((self.name, self.base, self.model_path, self.model_xml))
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what a copy or another process needs: nothing that is computed."""
+        """Return the fields only: cached properties are not copied or pickled."""
         return {f.name: getattr(self, f.name) for f in fields(self)}
 
     @cached_property
     def model(self) -> mujoco.MjModel:
-        """The robot alone, compiled."""
+        """The compiled model of the robot alone."""
         spec = self.spec()
         try:
             return spec.compile()
@@ -146,11 +146,11 @@ class RobotConfig:
             raise self._unreadable(error) from error
 
     def spec(self) -> mujoco.MjSpec:
-        """Return a fresh, editable specification of the robot.
+        """Return a new, editable specification of the robot.
 
         Raises:
-            ValueError: If the model is no MJCF or URDF that MuJoCo can read, or, as
-                text, holds more than a robot of primitives.
+            ValueError: If MuJoCo cannot read the model as MJCF or URDF, or a model
+                given as text contains more than a robot of primitives.
             OSError: If there is no such file.
         """
         path, is_urdf, text = self.model_path, self.is_urdf, ""
@@ -167,7 +167,7 @@ class RobotConfig:
             for element in (*_mesh_geoms(spec), *spec.meshes):
                 spec.delete(element)
             spec.compiler.fusestatic = False
-            # A URDF may leave out masses, and MuJoCo wants them where joints move.
+            # A URDF may leave out masses, but MuJoCo requires them for moving bodies.
             spec.compiler.boundmass = spec.compiler.boundinertia = 1e-6
             spec.compiler.balanceinertia = True
         try:
@@ -178,12 +178,12 @@ class RobotConfig:
 
     @property
     def is_urdf(self) -> bool:
-        """Whether its model is a URDF."""
+        """Whether the model is a URDF."""
         path = self.model_path
         return path is not None and _root_tag(read_regular(path)) == "robot"
 
     def _unreadable(self, error: ValueError) -> ValueError:
-        """The error for a model that MuJoCo refuses, on one line."""
+        """Return the error for a model that MuJoCo cannot read, on one line."""
         what = self.model_path or f"the model of {self.name!r}"
         return ValueError(
             f"{what} is no robot that MuJoCo can read: {' '.join(str(error).split())}"
@@ -191,7 +191,7 @@ class RobotConfig:
 
     @cached_property
     def _bodies(self) -> list[int]:
-        """The base, be it the world, and all that hangs on it, in MuJoCo's order."""
+        """The base (possibly the world) and all bodies below it, in MuJoCo's order."""
         bodies = [body_id(self.model, self.base)]
         for body in range(bodies[0] + 1, self.model.nbody):
             if self.model.body_parentid[body] in bodies:
@@ -202,20 +202,20 @@ class RobotConfig:
     def links(self) -> tuple[str, ...]:
         """The base and the bodies below it in MuJoCo's order (without the world).
 
-        Those without a name are named as in `build_chain`.
+        Unnamed bodies are named as in `build_chain`.
         """
         return tuple(body_name(self.model, body) for body in self._bodies if body)
 
     @cached_property
     def _joint_ids(self) -> np.ndarray:
-        """Which of the model's joints are the robot's, ``[J]``."""
+        """Indices of the robot's joints in the model, ``[J]``."""
         model = self.model
         below = np.isin(model.jnt_bodyid, self._bodies[1:])
         return np.flatnonzero(below & np.isin(model.jnt_type, list(JOINT_TYPES)))
 
     @cached_property
     def joints(self) -> tuple[str, ...]:
-        """Hinges and slides below the base, in MuJoCo's order, as `build_chain`'s."""
+        """Hinges and slides below the base, in MuJoCo's order, as in `build_chain`."""
         return tuple(joint_name(self.model, joint) for joint in self._joint_ids)
 
     def check_floating_base(self) -> None:
@@ -235,7 +235,7 @@ class RobotConfig:
 
     @cached_property
     def default_joint_pos(self) -> np.ndarray:
-        """Joint positions of the default pose [rad], of slides [m], ``[J]``."""
+        """Joint positions of the default pose [rad], for slides [m], ``[J]``."""
         rest = {
             glob.escape(name): 0.0
             for name in self.joints
@@ -248,20 +248,20 @@ class RobotConfig:
     def torque_limit(self) -> np.ndarray:
         """Largest torque of each joint [N m], ``[J]`` (``actuatorfrcrange``).
 
-        Of a slide, the largest force [N].
+        For a slide, the largest force [N].
         """
         return self.model.jnt_actfrcrange[self._joint_ids, 1]
 
     @cached_property
     def joint_range(self) -> np.ndarray:
-        """Lower and upper end of each joint's range [rad], [m], ``[2, J]``."""
+        """Lower and upper limit of each joint [rad], for slides [m], ``[2, J]``."""
         return self.model.jnt_range[self._joint_ids].T.copy()
 
     def joint_gains(self, gain_set: str | None) -> tuple[np.ndarray, np.ndarray]:
         """Return (kp [N m/rad], kd [N m s/rad]) of a gain set, ``[J]`` each.
 
         Args:
-            gain_set: Its name; None is the first.
+            gain_set: Name of the gain set; None selects the first.
 
         Raises:
             ValueError: If the robot has no gain set of that name, or none at all.
@@ -297,19 +297,19 @@ class RobotConfig:
 
     @cached_property
     def standing_height(self) -> float:
-        """Height of its highest point in the default pose, to the centimetre [m]."""
+        """Height of the robot in the default pose, rounded to 1 cm [m]."""
         lowest, highest = self._extent(self._in_default_pose())
         return round(highest - lowest, 2)
 
     def _in_default_pose(self) -> mujoco.MjData:
-        """The robot alone in its default pose, its base where the file puts it."""
+        """Return the robot in its default pose, the base where the file puts it."""
         model, data = self.model, mujoco.MjData(self.model)
         data.qpos[model.jnt_qposadr[self._joint_ids]] = self.default_joint_pos
         mujoco.mj_kinematics(model, data)
         return data
 
     def _extent(self, data: mujoco.MjData) -> tuple[float, float]:
-        """Height of the lowest and of the highest point of its shapes [m]."""
+        """Return the height of the lowest and highest point of its shapes [m]."""
         ends = [_extent(self.model, data, g) for g in self._collision_geoms(self.links)]
         lows, highs = zip(*ends, strict=True)
         return min(lows), max(highs)
@@ -320,7 +320,7 @@ class RobotConfig:
         return self.primitives_on(self.links)
 
     def _collision_geoms(self, links: Collection[str]) -> list[int]:
-        """Return the geoms of links that touch something, not those to look at."""
+        """Return the collision geoms of some links, without visual geoms."""
         model = self.model
         wanted = [b for b in self._bodies if b and body_name(model, b) in links]
         touching = (model.geom_contype | model.geom_conaffinity) != 0
@@ -332,10 +332,10 @@ class RobotConfig:
         """Return the collision shapes of some links, with their poses in their frames.
 
         Args:
-            links: Names of the links; the shapes of others are not looked at.
+            links: Names of the links; the shapes of other links are ignored.
 
         Raises:
-            ValueError: If a shape is no sphere, capsule or box.
+            ValueError: If a shape is not a sphere, capsule or box.
         """
         model, shapes = self.model, []
         for geom in self._collision_geoms(links):
@@ -361,15 +361,15 @@ class RobotConfig:
 def read_robot(path: Path | str) -> RobotConfig:
     """Return the robot of an MJCF or URDF file, to place or import sensors on.
 
-    Its base is the one body that stands in the world, or the world itself where several
-    do; all its links may carry skin. Its name is the model's, or else the file's.
+    The base is the only body attached to the world, or the world itself if there are
+    several; all links may carry skin. The name is the model's, or else the file's.
 
     Raises:
-        ValueError: If the file is no MJCF or URDF that MuJoCo can read.
+        ValueError: If MuJoCo cannot read the file as MJCF or URDF.
         OSError: If there is no such file.
     """
     path = Path(path)
-    # Elsewhere MuJoCo does not know the format, and logs a warning.
+    # With other suffixes MuJoCo does not know the format, and logs a warning.
     if path.suffix.lower() not in (".xml", ".urdf"):
         check_regular(path)
         raise ValueError(f"{path} must be an MJCF (.xml) or a URDF (.urdf, .xml)")
@@ -379,7 +379,7 @@ def read_robot(path: Path | str) -> RobotConfig:
     one = len(in_world) == 1
     return replace(
         whole,
-        # That of a model without a name.
+        # MuJoCo's default name of a model.
         name=whole.name if name in ("", "MuJoCo Model") else name,
         base=body_name(model, int(in_world[0])) if one else "world",
         skin_links=whole.links,
@@ -387,7 +387,7 @@ def read_robot(path: Path | str) -> RobotConfig:
 
 
 def _root_tag(content: bytes) -> str:
-    """Name of the outermost element of an XML file, "" if there is none."""
+    """Return the tag of the root element of an XML file, "" if there is none."""
     content = re.sub(rb"<!--.*?-->", b"", content, flags=re.DOTALL)
     tag = re.search(rb"<([A-Za-z][\w:.-]*)", content)
     return "" if tag is None else tag[1].decode()
@@ -399,7 +399,7 @@ def _mesh_geoms(spec: mujoco.MjSpec) -> list[mujoco.MjsGeom]:
 
 
 def _name_all(spec: mujoco.MjSpec) -> None:
-    """Give bodies and joints without a name those that the robot's chain has."""
+    """Give unnamed bodies and joints the names that the robot's chain uses."""
     bodies = [body for body in spec.bodies if not body.name]
     joints = [
         joint
@@ -418,7 +418,7 @@ def _primitive_kind(model: mujoco.MjModel, geom: int) -> str:
     """Return "sphere", "capsule" or "box".
 
     Raises:
-        ValueError: If the geom is none of these.
+        ValueError: If the geom is of another kind.
     """
     kind = mujoco.mjtGeom(int(model.geom_type[geom])).name
     kind = kind.removeprefix("mjGEOM_").lower()
@@ -436,7 +436,7 @@ def _primitive_kind(model: mujoco.MjModel, geom: int) -> str:
 def _extent(
     model: mujoco.MjModel, data: mujoco.MjData, geom: int
 ) -> tuple[float, float]:
-    """Height of the lowest and of the highest point of a primitive geom [m]."""
+    """Return the height of the lowest and highest point of a primitive geom [m]."""
     size, kind = model.geom_size[geom], _primitive_kind(model, geom)
     z_row = data.geom_xmat[geom].reshape(3, 3)[2]
     if kind == "sphere":
@@ -526,8 +526,8 @@ G1 = RobotConfig(
         "*_elbow_joint": 0.6,
     },
     gains={
-        # As for the H1-2: from the armatures, at 10 Hz and damping ratio 2, as public
-        # controllers of the G1 have them (BeyondMimic, mjlab).
+        # As for the H1-2: from the armatures, at 10 Hz and damping ratio 2, as in
+        # public controllers of the G1 (BeyondMimic, mjlab).
         "rotor_inertia": {
             "*_hip_pitch_joint": Gain(kp=40.2, kd=2.56),
             "*_hip_yaw_joint": Gain(kp=40.2, kd=2.56),

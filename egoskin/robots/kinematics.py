@@ -1,12 +1,12 @@
 """Fast forward kinematics of some links of a pytorch-kinematics chain.
 
-The `pytorch_kinematics.Chain` is the description, the public reference and the
-oracle of the tests; this module evaluates only the branches that lead to the links
-asked for, all frames of one depth in one go, with the batch last and contiguous.
+The `pytorch_kinematics.Chain` describes the robot and is the reference in the tests.
+This module evaluates only the branches that lead to the requested links, all frames of
+one depth at once, with the batch last and contiguous. The C++ code in
 ``egoskin/sensors/kernels/kernels.cpp`` evaluates the same `Steps`, bit for bit.
 
-Contract: all poses are relative to the root of the chain (the robot's base), whatever
-offset the root itself has, so that they depend on the joint positions alone.
+Contract: all poses are relative to the root of the chain (the robot's base), regardless
+of the root's own offset, so they depend only on the joint positions.
 """
 
 from __future__ import annotations
@@ -28,9 +28,8 @@ def pad_rows(rows: Tensor, multiple: int = 32) -> Tensor:
     """Return row indices padded to a multiple by repeating the first.
 
     Vectorised functions (``atan2``) round differently in the scalar tail of an array
-    than in its body, which goes by two vectors: 32 float32 numbers with AVX-512.
-    Subsets of rows are padded, so that a row's result does not depend on which other
-    rows happen to be computed with it.
+    than in its body, which is processed two vectors at a time: 32 float32 numbers with
+    AVX-512. Padding makes a row's result independent of the rows computed with it.
 
     Args:
         rows: Indices, ``[n]`` int64, n >= 1.
@@ -44,10 +43,10 @@ def pad_rows(rows: Tensor, multiple: int = 32) -> Tensor:
 
 
 class Steps(NamedTuple):
-    """How the frames follow from each other: a fixed offset, then a joint.
+    """Steps from frame to frame: each is a fixed offset, then a joint.
 
-    A step turns by ``constant + by_cos cos q + by_sin sin q`` and moves by
-    ``shift + slide q``, q being its joint's position; float64.
+    A step rotates by ``constant + by_cos cos q + by_sin sin q`` and translates by
+    ``shift + slide q``, where q is the position of its joint; float64.
     """
 
     parent: np.ndarray
@@ -64,20 +63,20 @@ class Steps(NamedTuple):
     shift: np.ndarray
     """[m], ``[n, 3]``."""
     slide: np.ndarray
-    """Of a prismatic joint, ``[n, 3]``."""
+    """Axis of a prismatic joint, else 0, ``[n, 3]``."""
 
 
 class _Constants(NamedTuple):
-    """What `LinkKinematics` computes with, of one dtype and on one device."""
+    """Constants of `LinkKinematics` for one dtype and device."""
 
     joint: Tensor
     """Joint of each step."""
     matrices: list[Tensor]
-    """`Steps` from ``constant`` on, with a last dimension for the batch."""
+    """Fields of `Steps` from ``constant`` on, with a last dimension for the batch."""
     unit: Tensor
     """Rotation of the base."""
     levels: list[tuple[Tensor, Tensor]]
-    """Steps of each depth and the frames they start from, from the base on."""
+    """Steps of each depth and the frames they start from, in order of depth."""
     wanted: Tensor
     """Frame of each link."""
 
@@ -90,11 +89,11 @@ class LinkKinematics:
 
     Args:
         chain: Chain of the robot; its root is the base.
-        links: Names of the links wanted, in the order of the results.
+        links: Names of the requested links, in the order of the results.
 
     Raises:
-        ValueError: If a link is not in the chain, or the chain does not say which
-            joint or link is meant: two have one name, or an axis is none.
+        ValueError: If a link is not in the chain, two links or two joints have the same
+            name, or a joint's axis has no direction.
     """
 
     def __init__(self, chain: pk.Chain, links: Sequence[str]) -> None:
@@ -106,7 +105,7 @@ class LinkKinematics:
         frames = _frames(chain)
         _check_different("links", [frame.name for frame, _ in frames])
         wanted = {frame.name for frame, _ in frames} & set(self.links)
-        # Only what leads to a wanted link is evaluated.
+        # Only frames that lead to a requested link are evaluated.
         needed = [frame.name in wanted for frame, _ in frames]
         for i in range(len(frames) - 1, 0, -1):
             needed[frames[i][1]] |= needed[i]
@@ -141,7 +140,7 @@ class LinkKinematics:
         depth = [0]
         for parent in self.steps.parent:
             depth.append(depth[parent] + 1)
-        # Steps of each depth, from the base on.
+        # Steps of each depth, in order of depth.
         self._levels = [
             level
             for d in range(1, max(depth) + 1)
@@ -150,9 +149,9 @@ class LinkKinematics:
         self._constants: dict[tuple[torch.dtype, torch.device], _Constants] = {}
 
     def reach(self) -> list[float]:
-        """Return how far each link's origin can be from the base [m], at most.
+        """Return an upper bound of each link origin's distance from the base [m].
 
-        Infinite behind a prismatic joint.
+        Infinite for links after a prismatic joint.
         """
         farthest = [0.0]
         steps = self.steps
@@ -207,8 +206,8 @@ class LinkKinematics:
         position = joint_pos.new_zeros(len(turn) + 1, 3, len(joint_pos))
         rotation[0] = own.unit
         for steps, parents in own.levels:
-            # Sums are written out: a library's product may round differently for
-            # another batch.
+            # Sums are written out: a library's matrix product may round differently
+            # for another batch size.
             x, y, z = rotation[parents].unbind(2)
             t, w = turn[steps], way[steps]
             rotation[steps + 1] = (
@@ -230,7 +229,7 @@ class LinkKinematics:
                 return torch.from_numpy(x).to(joint_pos.device)
 
             self._constants[kind] = _Constants(
-                # What does not turn turns by the 0 that follows the joints.
+                # Steps without a joint use the 0 appended to the joint positions.
                 joint=index(self.steps.joint % (self.num_joints + 1)),
                 matrices=[
                     torch.from_numpy(x)[..., None].to(joint_pos) for x in self.steps[2:]
@@ -245,7 +244,7 @@ class LinkKinematics:
 
 
 def _frames(chain: pk.Chain) -> list[tuple[pk.Frame, int]]:
-    """Return all frames, each with the place of its parent, depth first."""
+    """Return all frames, each with the index of its parent, depth first."""
     found: list[tuple[pk.Frame, int]] = []
     # The public methods of a chain return frames by name only.
     left = [(chain._root, -1)]
@@ -258,7 +257,7 @@ def _frames(chain: pk.Chain) -> list[tuple[pk.Frame, int]]:
 
 
 def _check_different(what: str, names: Sequence[str]) -> None:
-    """Raise ValueError if two names are equal: which is meant nobody could say."""
+    """Raise ValueError if two names are equal, and thus ambiguous."""
     twice = [name for name, number in Counter(names).items() if number > 1]
     if twice:
         raise ValueError(
@@ -268,7 +267,7 @@ def _check_different(what: str, names: Sequence[str]) -> None:
 
 
 def _step(parent: int, frame: pk.Frame, joint_index: Mapping[str, int]) -> tuple:
-    """Return what `Steps` holds of the step to a frame."""
+    """Return the entries of `Steps` for the step to a frame."""
     joint = frame.joint
     offset = _matrix(frame.link.offset) @ _matrix(joint.offset)
     turn, shift = offset[:3, :3], offset[:3, 3]
@@ -334,14 +333,14 @@ def quat_to_entries(quat: Sequence[Tensor]) -> tuple[Tensor, ...]:
 
 
 def axis_vectors(quat: Tensor, axis: int, length: float = 1.0) -> Tensor:
-    """Return the same vector along one axis for each of some quaternions.
+    """Return a vector along one axis, repeated for each quaternion.
 
-    Nothing is copied from the host, as a tensor of Python numbers would be.
+    Unlike a tensor made of Python numbers, it is not copied from the host.
 
     Args:
         quat: ``[*B, 4]``.
         axis: 0, 1 or 2.
-        length: Length, negative for the other way.
+        length: Length; negative for the opposite direction.
 
     Returns:
         ``[*B, 3]``.

@@ -1,14 +1,14 @@
-"""A robot's model as text that may come from a stranger: data, and the robot alone.
+"""Check of a robot's model that is given as text, possibly from an untrusted source.
 
-Contract: MuJoCo is given what was looked through, element by element, written anew; so
-a model names no other file, and nothing in it is run.
+Contract: MuJoCo receives only text that was parsed, checked element by element and
+serialised again. So a model refers to no other file, and nothing in it is executed.
 """
 
 from __future__ import annotations
 
 from xml.etree import ElementTree
 
-# All that a robot of primitives is made of. None of them names a file or a plugin.
+# The elements of a robot of primitives. None of them refers to a file or a plugin.
 _ELEMENTS = frozenset(
     (
         *("mujoco", "compiler", "option", "flag", "default", "asset", "material"),
@@ -20,18 +20,18 @@ _LONGEST, _DEEPEST = 2**20, 200
 
 
 def checked_model(text: str, what: str) -> str:
-    """Return an MJCF as MuJoCo may read it, whoever wrote it.
+    """Return an MJCF from any source as text that MuJoCo can safely read.
 
     Args:
         text: The MJCF.
-        what: Whose it is, for the error text.
+        what: What the model belongs to, for the error text.
 
     Raises:
-        ValueError: If it is no MJCF, or holds more than a robot of primitives.
+        ValueError: If it is not an MJCF, or contains more than a robot of primitives.
     """
     if len(text) > _LONGEST:
         raise ValueError(f"{what}: its model is longer than {_LONGEST:,} characters")
-    # Entities could name files, or grow without bounds.
+    # Entities could refer to files, or expand without bounds.
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise ValueError(f"{what}: its model declares a document type, as none may")
     try:

@@ -1,4 +1,4 @@
-"""Robots of your own: from a folder, from a file of Python, and as data alone.
+"""Your own robots: from a folder, from a Python file, or as self-contained data.
 
 A folder holds an MJCF or URDF and ``robot.toml``::
 
@@ -15,8 +15,8 @@ A folder holds an MJCF or URDF and ``robot.toml``::
     [gains.soft]                           # N m/rad, N m s/rad; the first set is used
     "*" = { kp = 100, kd = 5 }
 
-Names may be patterns (``*``, ``?``, ``[ab]``). Contract: what `portable` returns names
-no file and is the same robot wherever it is loaded.
+Names may be patterns (``*``, ``?``, ``[ab]``). Contract: the result of `portable`
+refers to no file and is the same robot wherever it is loaded.
 """
 
 from __future__ import annotations
@@ -49,26 +49,26 @@ else:
     import tomli as tomllib
 
 TOML_NAME = "robot.toml"
-"""Name of the file that makes a folder a robot."""
+"""Name of the file that describes the robot of a folder."""
 _LISTS = ("feet", "skin_links", "untargeted_links")
 _TABLES = ("default_pose", "gains")
 _KEYS = ("name", "model", "base", *_LISTS, *_TABLES)
 _NEEDED = ("model", "base", "feet", "skin_links", "gains")
-# Bits of collision that balls and floor ask for; a robot's own come above them.
+# Collision bits of balls and floor; a robot's own bits are above them.
 _WORLD_BITS, _NUM_WORLD_BITS = 3, 2
 
 
 def find_robot(name: str) -> RobotConfig:
-    """Return a robot by its name, or from where it is described.
+    """Return a built-in robot by name, or one read from a path.
 
     Args:
-        name: That of a robot of the package, a folder with ``robot.toml``, a
-            `RobotConfig` in a file of Python (``my_robot.py:ROBOT``, which is run), or
-            an MJCF or URDF, to place sensors on (`egoskin.robots.config.read_robot`).
+        name: Name of a built-in robot, a folder with ``robot.toml``, a `RobotConfig` in
+            a Python file (``my_robot.py:ROBOT``; the file is executed), or an MJCF or
+            URDF, to place sensors on (`egoskin.robots.config.read_robot`).
 
     Raises:
-        ValueError: If there is no such robot, or its description is wrong.
-        OSError: If a file that it names cannot be read.
+        ValueError: If there is no such robot, or its description is invalid.
+        OSError: If a file that it refers to cannot be read.
     """
     if name in ROBOTS:
         return ROBOTS[name]
@@ -93,20 +93,20 @@ def find_robot(name: str) -> RobotConfig:
 
 
 def kept_robot(name: str) -> str | RobotConfig:
-    """Return a robot as configurations keep it: a name of the package, or data.
+    """Return a robot as stored in configurations: a built-in name, or data.
 
     Args:
-        name: What `find_robot` takes.
+        name: As for `find_robot`.
 
     Raises:
-        ValueError: If there is no such robot, or its description is wrong.
-        OSError: If a file that it names cannot be read.
+        ValueError: If there is no such robot, or its description is invalid.
+        OSError: If a file that it refers to cannot be read.
     """
     return name if name in ROBOTS else portable(find_robot(name))
 
 
 def _name(robot: str | RobotConfig) -> str:
-    """Return the name of a robot as configurations keep it."""
+    """Return the name of a robot as stored in configurations."""
     return robot if isinstance(robot, str) else robot.name
 
 
@@ -120,15 +120,15 @@ Robot = Annotated[
         str_from_instance=lambda value: [_name(value)],
     ),
 ]
-"""A robot of the package by its name, or another as data; an option of a command takes
-what `find_robot` does."""
+"""A built-in robot by name, or another one as data; a command-line option accepts the
+names and paths of `find_robot`."""
 
 
 def robot_of(robot: str | RobotConfig) -> RobotConfig:
-    """Return the robot that a configuration keeps.
+    """Return the robot stored in a configuration.
 
     Raises:
-        ValueError: If it is neither one of the package nor data alone.
+        ValueError: If it is neither a built-in name nor self-contained data.
     """
     if isinstance(robot, str):
         if robot not in ROBOTS:
@@ -146,7 +146,7 @@ def robot_of(robot: str | RobotConfig) -> RobotConfig:
 
 
 def _from_python(path: Path, variable: str) -> RobotConfig:
-    """Run a file of Python, and return the robot of one of its variables."""
+    """Run a Python file and return the robot in one of its variables."""
     if not path.is_file():
         raise ValueError(f"no file {path}: a robot is my_robot.py:ROBOT")
     names = runpy.run_path(str(path))
@@ -161,14 +161,14 @@ def _from_python(path: Path, variable: str) -> RobotConfig:
 
 
 class _Toml:
-    """A file of TOML, whose errors name the line of what is wrong."""
+    """A TOML file, with errors that give the line number."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.text = path, read_regular(path).decode(errors="replace")
         try:
             self.content: dict[str, Any] = tomllib.loads(self.text)
         except tomllib.TOMLDecodeError as error:
-            # It says where: (at line 3, column 5), or (at end of document).
+            # The text ends in (at line 3, column 5), or (at end of document).
             text = str(error)
             if where := re.search(r" \(at line (\d+), column \d+\)$", text):
                 text, line = text[: where.start()], where[1]
@@ -177,15 +177,15 @@ class _Toml:
             raise ValueError(f"{path}:{line}: {text}") from None
 
     def error(self, text: str, *keys: str) -> ValueError:
-        """Return an error at the line of a key, or of the innermost that is found."""
+        """Return an error at the line of a key path, as far as the path is found."""
         return ValueError(f"{self.path}:{self._line(keys)}: {text}")
 
     def _line(self, keys: Sequence[str]) -> int:
-        """Return the line of a key path, of which the last may be an item's text."""
+        """Return the line of a key path; its last key may be the text of an item."""
         lines, at = self.text.splitlines(), 0
         for key in keys:
             quoted = rf"(?:{re.escape(key)}|\"{re.escape(key)}\"|'{re.escape(key)}')"
-            # As a key, as part of a table's name, or else as a string.
+            # As a key or in a table's name, in an inline table, or else as a string.
             patterns = (
                 rf"^\s*(?:\[[^\]#]*)?(?<![\w-]){quoted}\s*[=.\]]",
                 rf"[{{,.]\s*{quoted}\s*=",
@@ -210,8 +210,8 @@ def read_folder(folder: Path) -> RobotConfig:
     """Return the robot of a folder with an MJCF or URDF and ``robot.toml``.
 
     Raises:
-        ValueError: If there is none, or something in it is wrong; the text names the
-            file, the line, and what is right.
+        ValueError: If there is no ``robot.toml`` or it is invalid; the text gives the
+            file, the line and what is valid.
         OSError: If a file cannot be read.
     """
     path = folder / TOML_NAME
@@ -244,7 +244,7 @@ def read_folder(folder: Path) -> RobotConfig:
         default_pose=_pose(toml),
         gains=_gains(toml),
     )
-    # What names links and joints can be told wrong only once they are known.
+    # Names of links and joints can only be checked once the model is loaded.
     try:
         _ = robot.model
     except ValueError as error:
@@ -280,7 +280,7 @@ def read_folder(folder: Path) -> RobotConfig:
 def _flat(
     gains: Mapping[str, Mapping[str, Gain]],
 ) -> list[tuple[str, Mapping[str, Gain]]]:
-    """Return sets of gains by the path of their keys."""
+    """Return the gain sets with the paths of their keys."""
     return [(f"gains/{name}", table) for name, table in gains.items()]
 
 
@@ -298,7 +298,7 @@ def _pose(toml: _Toml) -> dict[str, float]:
 
 
 def _gains(toml: _Toml) -> dict[str, dict[str, Gain]]:
-    """Return the sets of gains."""
+    """Return the gain sets."""
     if not toml.content["gains"]:
         raise toml.error("gains must have a set: [gains.NAME]", "gains")
     sets: dict[str, dict[str, Gain]] = {}
@@ -324,14 +324,14 @@ def _gains(toml: _Toml) -> dict[str, dict[str, Gain]]:
 
 
 def _is_number(value: object) -> bool:
-    """Whether a value is a finite number; a whole one may have any digits in TOML."""
+    """Return whether a value is a finite number; TOML integers may be of any size."""
     if not isinstance(value, (int, float)) or isinstance(value, bool):
         return False
     return abs(value) <= sys.float_info.max
 
 
 def _links(toml: _Toml, key: str, links: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the links that a list of patterns names, in the robot's order."""
+    """Return the links that match a list of patterns, in the robot's order."""
     wanted: set[str] = set()
     for pattern in toml.content.get(key, []):
         matching = fnmatch.filter(links, str(pattern))
@@ -347,20 +347,20 @@ def _no_match(pattern: str, names: Sequence[str], what: str) -> str:
 
 
 def portable(robot: RobotConfig) -> RobotConfig:
-    """Return a robot as data alone: its model is an MJCF of primitives, as text.
+    """Return a robot as self-contained data: an MJCF of primitives, as text.
 
-    What only looks, and actuators, sensors, key frames and whatever does not hang on
-    the base are left out; masses stay. A cylinder becomes the capsule inside it, as
-    long and as wide, or a flat one a box. The base of a URDF floats. Where the file's
-    bits of collision are not this package's (``egoskin/assets/h1_2.xml`` explains
-    them), the robot's own shapes meet as there, and balls and floor meet them all.
+    Visual meshes, actuators, sensors, key frames and everything that is not below the
+    base are left out; masses are kept. A cylinder becomes the capsule inside it, of the
+    same length and radius, or, if it is flat, a box. The base of a URDF floats. If the
+    file does not use this package's collision bits (see ``egoskin/assets/h1_2.xml``),
+    self-collision stays as in the file, and balls and floor collide with all shapes.
 
     Args:
         robot: A robot of the task; `RobotConfig.model_path` is read.
 
     Raises:
-        ValueError: If a shape that touches is no primitive, or the model holds what is
-            neither left out nor a robot of primitives.
+        ValueError: If a collision shape is not a sphere, capsule, box or cylinder, or
+            the model contains other elements that cannot be kept as data.
     """
     if robot.model_xml is not None:
         return robot
@@ -408,7 +408,7 @@ def portable(robot: RobotConfig) -> RobotConfig:
         text = " ".join(str(error).split())
         raise ValueError(f"{robot.name} cannot be kept as data: {text}") from error
     data = replace(robot, model_path=None, model_xml=spec.to_xml())
-    # What else it holds is refused here.
+    # This raises for any other element that cannot be kept.
     _ = data.model
     return data
 
@@ -422,7 +422,7 @@ _PRIMITIVES = (
 
 
 def _fix_inertia(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
-    """Say the inertia of each link, which may come from shapes that are left out."""
+    """Set the inertia of each link, which may come from shapes that are left out."""
     for body in spec.bodies:
         if body.name == "world" or body.explicitinertial:
             continue
@@ -434,7 +434,7 @@ def _fix_inertia(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
 
 
 def _round_off(geom: mujoco.MjsGeom) -> None:
-    """Make a capsule of a cylinder, or a box of a flat one."""
+    """Turn a cylinder into a capsule or, if it is flat, into a box."""
     radius, half = float(geom.size[0]), float(geom.size[1])
     if half > radius:
         geom.type = mujoco.mjtGeom.mjGEOM_CAPSULE
@@ -445,7 +445,7 @@ def _round_off(geom: mujoco.MjsGeom) -> None:
 
 
 def _set_bits(spec: mujoco.MjSpec) -> None:
-    """Let balls and floor meet all that touches, where the model is not made so."""
+    """Make balls and floor collide with all collision shapes, if they do not yet."""
     touching = [g for g in spec.geoms if g.contype or g.conaffinity]
     if all(
         g.conaffinity & _WORLD_BITS == _WORLD_BITS and not g.contype & _WORLD_BITS

@@ -1,8 +1,8 @@
-"""Points on a robot's outer surface: where skin sits and where throws are aimed.
+"""Points on a robot's outer surface, for placing skin and aiming throws.
 
-The outer surface is that of the union of the robot's shapes in its default pose: what
-lies inside another shape belongs to no surface. Shapes are the robot's primitives here;
-`egoskin.sensors.skin.mesh_surface` builds the same surface of meshes.
+The outer surface is that of the union of the robot's shapes in its default pose: parts
+inside another shape are excluded. The shapes here are the robot's primitives;
+`egoskin.sensors.skin.mesh_surface` builds the same surface from meshes.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from egoskin.shapes import shape_of
 
 # A sampled point is inside another primitive if it is deeper than this [m].
 _INSIDE = 1e-6
-# Rounds of sampling that must find some outer surface.
+# Sampling fails if this many rounds find no outer surface.
 _MAX_ROUNDS = 1000
 
 
@@ -54,7 +54,7 @@ class Patch:
 
 
 def area(shape: Primitive) -> float:
-    """Surface area of a primitive [m^2]."""
+    """Return the surface area of a primitive [m^2]."""
     a, b, c = shape.size
     if shape.kind == "sphere":
         return float(4 * np.pi * a**2)
@@ -64,7 +64,7 @@ def area(shape: Primitive) -> float:
 
 
 def distance_to(shape: Primitive, points: np.ndarray) -> np.ndarray:
-    """Signed distance from points to a primitive, negative inside.
+    """Return the signed distance from points to a primitive, negative inside.
 
     Args:
         shape: The primitive.
@@ -81,7 +81,7 @@ def distance_to(shape: Primitive, points: np.ndarray) -> np.ndarray:
 def _sample_primitive(
     shape: Primitive, n: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Area-uniform (points, normals) in the link frame, ``[n, 3]`` each."""
+    """Return area-uniform (points, normals) in the link frame, ``[n, 3]`` each."""
     if shape.kind == "box":
         size = shape.size
         face_area = np.array([size[1] * size[2], size[0] * size[2], size[0] * size[1]])
@@ -109,19 +109,19 @@ def _sample_primitive(
 
 
 class Surface:
-    """The outer surface of some links, made of patches of which parts are hidden.
+    """The outer surface of some links, made of patches that may be partly covered.
 
     Args:
         robot: The robot.
         links: Names of the links to sample.
         patches: Patches of the robot; those on other links are not sampled.
         side: Function of points [m] and normals in the base frame, ``[n, 3]``, and a
-            stand-off [m]: 1 where both a point and what stands off it along its normal
-            are outside all shapes, -1 where that holds for the reversed normal, else
-            0, ``[n]``.
+            stand-off [m]: 1 where both a point and the point at the stand-off along its
+            normal are outside all shapes, -1 where that holds for the reversed normal,
+            else 0, ``[n]``.
 
     Raises:
-        ValueError: If a link is not the robot's, or the links carry no patch.
+        ValueError: If the robot has no such link, or the links carry no patch.
     """
 
     def __init__(
@@ -165,14 +165,14 @@ class Surface:
         weights: Mapping[str, float] | None = None,
         stand_off: float = 0.0,
     ) -> SurfacePoints:
-        """Return points spread at random over the outer surface, uniformly by area.
+        """Return random points on the outer surface, uniform by area.
 
         Args:
             n: Number of points.
             seed: Seed of the sampling.
             weights: Points per area of each link, relative to the others; 1 for links
                 not named.
-            stand_off: Distance along the normal at which it must be outside, too [m].
+            stand_off: Distance along the normal at which it must also be outside [m].
 
         Returns:
             Points in random order.
@@ -226,7 +226,7 @@ class Surface:
     def _sample_patch(
         self, index: int, n: int, rng: np.random.Generator, stand_off: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return (link, position, normal) of those of n points that are outer."""
+        """Return (link, position, normal) of those of n points on the outer surface."""
         points, normals = self._patches[index].sample(n, rng)
         turn, shift = (a[self._link_index[index]] for a in (self._turn, self._shift))
         side = self._side(points @ turn.T + shift, normals @ turn.T, stand_off)
@@ -260,7 +260,7 @@ def primitive_patch(shape: Primitive) -> Patch:
 def outside_primitives(
     robot: RobotConfig, shapes: Sequence[Primitive]
 ) -> Callable[[np.ndarray, np.ndarray, float], np.ndarray]:
-    """Return a test of points in the base frame, in the default pose.
+    """Return a test whether points are outside primitives, in the default pose.
 
     Args:
         robot: The robot.
@@ -300,8 +300,8 @@ def primitive_surface(robot: RobotConfig, links: Sequence[str]) -> Surface:
         links: Names of the links.
 
     Raises:
-        ValueError: If a link is not the robot's, the links have no primitives, or a
-            link, covered or not, has a collision shape that is none.
+        ValueError: If the robot has no such link, the links have no primitives, or any
+            link of the robot has a collision shape that is not a primitive.
     """
     patches = [primitive_patch(shape) for shape in robot.primitives]
     return Surface(robot, links, patches, outside_primitives(robot, robot.primitives))
@@ -310,7 +310,7 @@ def primitive_surface(robot: RobotConfig, links: Sequence[str]) -> Surface:
 def sample_surface(
     robot: RobotConfig, links: Sequence[str], n: int, seed: int
 ) -> SurfacePoints:
-    """Return points spread uniformly by area over the primitives' outer surface.
+    """Return random points on the outer surface of primitives, uniform by area.
 
     Args:
         robot: The robot.
@@ -322,7 +322,7 @@ def sample_surface(
         Points in random order.
 
     Raises:
-        ValueError: If n is not positive, a link is not the robot's, or the links
-            have no outer surface.
+        ValueError: If n is not positive, the robot has no such link, or the links have
+            no outer surface.
     """
     return primitive_surface(robot, links).sample(n, seed)

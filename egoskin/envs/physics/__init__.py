@@ -1,4 +1,4 @@
-"""Physics: what an engine must do (`contract`), and the engines, a file each."""
+"""Physics: the engine interface (`contract`) and the engines, one file each."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from egoskin.envs.physics.mujoco import MujocoPhysics
 Engine = Literal["mujoco", "warp"]
 """Engines by name: MuJoCo on the CPU; MuJoCo Warp, on a GPU or, slowly, on the CPU."""
 DEFAULT_ENGINE: type[Physics] = MujocoPhysics
-"""What simulates unless another engine is asked for."""
+"""The engine used by default."""
 
 
 def engine_of(name: Engine) -> type[Physics]:
-    """Return an engine.
+    """Return the class of an engine.
 
     Raises:
         ValueError: If its package is not installed.

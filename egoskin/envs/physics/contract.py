@@ -1,24 +1,25 @@
-"""What a physics engine must do: a batch of simulations of one robot and some objects.
+"""Interface of a physics engine: batched simulations of one robot and some objects.
 
-An engine is one class, `Physics`, in a file of its own. The environment knows this file
-alone. Every tensor is on the engine's device; all that an engine returns are copies,
-float32 unless said otherwise, and rows are named by int64 indices. ``B`` rows, ``J``
-joints, ``L`` links, ``O`` objects; quaternions are (w, x, y, z), unit; suffix ``_w``
-world, ``_b`` base frame.
+An engine is a subclass of `Physics` in its own file. The environment depends only on
+this file. Every tensor is on the engine's device. Returned tensors are copies, float32
+unless stated otherwise; rows are selected by int64 indices. ``B`` rows, ``J`` joints,
+``L`` links, ``O`` objects; quaternions are (w, x, y, z), unit; suffix ``_w`` world,
+``_b`` base frame.
 
-The world is a floor at height 0, the robot, and objects that touch the robot alone (not
-the floor, nor each other) and never turn: their quaternion stays (1, 0, 0, 0).
+The world is a floor at height 0, the robot, and objects. Objects collide only with the
+robot (not with the floor or each other) and never rotate: their quaternion stays
+(1, 0, 0, 0).
 
-- **Rows are independent.** What happens in a row depends on what was asked of that row
-  alone: not on the number of rows, nor of threads, nor on a row that diverged.
-- **A control step** is ``substeps`` physics steps of ``timestep`` each. In every one of
-  them each joint gets the torque clip(kp (q* - q) + kd (qdot* - qdot), +-limit); a
-  `Variation` scales kp, kd and the limit, masses and friction, row by row.
-- **Contacts** are those of every physics state of a control step but its final one,
-  which is the next step's first: no state is skipped or seen twice.
-- **Divergence** (a failed solver, numbers that are not finite, speeds that physics did
-  not mean) is told, row by row, and never raised; what is read stays finite.
-- **State**: from what `Physics.state` returns, everything continues as it would have.
+- **Rows are independent.** The results of a row depend only on the calls for that row:
+  not on the number of rows or threads, nor on a row that diverged.
+- **A control step** is ``substeps`` physics steps of ``timestep`` each. In each physics
+  step, every joint gets the torque clip(kp (q* - q) + kd (qdot* - qdot), +-limit); a
+  `Variation` scales kp, kd and the limit, masses and friction, per row.
+- **Contacts** are those of every physics state of a control step except the final one,
+  which is the first of the next step: no state is skipped or counted twice.
+- **Divergence** (solver failure, non-finite numbers, implausible speeds) is reported
+  per row and never raised; the values returned stay finite.
+- **State**: a simulation restored from `Physics.state` continues as the original would.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from egoskin.robots.config import RobotConfig
 from egoskin.shapes import Shape
 
 OBJECT_MASS = 0.4
-"""Mass of each object [kg]; a touch ends the episode, so it hardly matters."""
+"""Mass of each object [kg]; contact ends the episode, so it hardly matters."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +54,7 @@ class PhysicsConfig:
     """Velocity target of the PD law: 0, or the change of the position target."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for numbers out of bounds."""
+        """Raise ValueError for values out of bounds."""
         check_bounds(self)
 
     @property
@@ -64,7 +65,7 @@ class PhysicsConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """What is simulated in every row."""
+    """The scene simulated in every row."""
 
     robot: RobotConfig
     """The robot; its base floats and all its joints are hinges."""
@@ -73,25 +74,25 @@ class Scene:
     config: PhysicsConfig
     """Actuation and rates."""
     weightless_objects: bool = False
-    """Whether gravity spares the objects."""
+    """Whether the objects are exempt from gravity."""
     link_contacts: bool = False
-    """Whether `StepResult.link_contact` is asked for, which costs a few per cent."""
+    """Whether to compute `StepResult.link_contact`, which costs a few per cent."""
     hold: bool = False
-    """Whether the robot is held rigid where it is put."""
+    """Whether the robot is held rigid in the pose of its reset."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Variation:
-    """How the robots of some rows differ from their model: factors."""
+    """Scale factors on the model parameters of the robots of some rows."""
 
     link_mass: Tensor
-    """Of mass and inertia of each link, ``[n, L]``."""
+    """For mass and inertia of each link, ``[n, L]``."""
     friction: Tensor
-    """Of all friction, ``[n]``."""
+    """For all friction, ``[n]``."""
     gains: Tensor
-    """Of kp and kd of each joint, ``[n, J]``."""
+    """For kp and kd of each joint, ``[n, J]``."""
     torque_limit: Tensor
-    """Of the torque limit of each joint, ``[n, J]``."""
+    """For the torque limit of each joint, ``[n, J]``."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,7 +117,7 @@ class PhysicsState:
 
 @dataclass(frozen=True, kw_only=True)
 class StepResult:
-    """What happened during one control step, apart from the state reached."""
+    """Contacts, power, saturation and divergence of one control step."""
 
     object_hit: Tensor
     """Whether each object touched the robot, ``[B, O]`` bool."""
@@ -126,7 +127,7 @@ class StepResult:
     """Whether the robot touched itself, ``[B]`` bool."""
     link_contact: Tensor | None
     """Whether each link touched an object or the floor, ``[B, L]`` bool; None unless
-    the scene asks for it."""
+    `Scene.link_contacts`."""
     power: Tensor
     """Mean over the substeps of the sum of ``|torque x velocity|`` [W], ``[B]``."""
     torque_saturation: Tensor
@@ -136,17 +137,16 @@ class StepResult:
 
 
 class Physics(ABC):
-    """Simulations of a scene; see the module for what all engines keep to.
+    """Simulations of a scene; the module describes what every engine guarantees.
 
     Args:
-        scene: What is simulated.
+        scene: The scene.
         num_envs: Number of rows ``B``.
         num_threads: Threads that step the rows; results do not depend on it.
-        device: Where they are simulated, and all tensors are.
+        device: Device of the simulations and of all tensors.
 
     Raises:
-        ValueError: If the scene holds what the engine cannot simulate, or it cannot on
-            this device.
+        ValueError: If the engine cannot simulate the scene, or not on this device.
     """
 
     @abstractmethod
@@ -162,9 +162,9 @@ class Physics(ABC):
 
     @abstractmethod
     def reset(self, rows: Tensor, base_pose: Tensor, joint_pos: Tensor) -> None:
-        """Put the robots of some rows at rest into a pose; no object is in play.
+        """Put the robots of some rows at rest in a pose, with no object in play.
 
-        Nothing is remembered of what the rows did before.
+        The result does not depend on what the rows did before.
 
         Args:
             rows: Row indices, ``[n]``.
@@ -180,25 +180,25 @@ class Physics(ABC):
 
         Args:
             rows: Row indices, ``[n]``.
-            objects: Which object of each row, ``[n]`` int64.
+            objects: Index of the object in each row, ``[n]`` int64.
             position: Positions in the world [m], ``[n, 3]``.
             velocity: Velocities in the world [m/s], ``[n, 3]``.
         """
 
     @abstractmethod
     def vary(self, rows: Tensor, variation: Variation) -> None:
-        """Make the robots of some rows ``[n]`` differ from their model from now on.
+        """Scale model parameters of the robots of some rows ``[n]`` from now on.
 
-        It is no part of `state`, and a reset leaves it as it is.
+        The variation is not part of `state` and persists through a reset.
         """
 
     @abstractmethod
     def push(self, rows: Tensor, velocity: Tensor) -> None:
-        """Change the velocity of the base of some rows ``[n]``, at once.
+        """Change the base velocity of some rows instantaneously.
 
         Args:
             rows: Row indices, ``[n]``.
-            velocity: What is added, in the world [m/s], ``[n, 3]``.
+            velocity: Velocity added, in the world [m/s], ``[n, 3]``.
         """
 
     @abstractmethod
@@ -207,17 +207,17 @@ class Physics(ABC):
 
         Args:
             target: Position targets q* [rad], ``[B, J]``.
-            active: Objects in play, ``[B, O]`` bool; the others wait at rest far above.
+            active: Objects in play, ``[B, O]`` bool; others are parked far above.
         """
 
     @abstractmethod
     def read(self, rows: Tensor | None = None) -> PhysicsState:
-        """Return the state of some rows ``[n]``, which may repeat, or of all."""
+        """Return the state of some rows ``[n]``, which may repeat, or of all rows."""
 
     def note(self) -> str | None:
-        """Say what limited the simulations since this was asked last, and the cure.
+        """Return what limited the simulations since the last call, and the remedy.
 
-        Asked once in a rollout. None if nothing did.
+        Called once per rollout. None if nothing did.
         """
         return None
 
@@ -227,4 +227,4 @@ class Physics(ABC):
 
     @abstractmethod
     def load_state(self, state: Tensor) -> None:
-        """Continue from a state that `state` returned, of as many rows."""
+        """Restore a state that `state` returned for the same number of rows."""

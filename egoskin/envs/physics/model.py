@@ -1,4 +1,4 @@
-"""The MuJoCo model of a scene, which every engine of MuJoCo's family simulates."""
+"""The MuJoCo model of a scene, shared by all MuJoCo-based engines."""
 
 from __future__ import annotations
 
@@ -7,27 +7,28 @@ import numpy as np
 
 from egoskin.envs.physics.contract import OBJECT_MASS, Scene
 
-# Contact bits of the model files: geoms listen to balls (1) and to the floor (2);
-# every further bit is self-collision. Objects and floor listen to nothing.
+# Contact bits of the model files: in a geom's conaffinity, 1 is balls and 2 the floor;
+# higher bits are self-collision. Objects and floor have conaffinity 0.
 _BALL_BIT, _FLOOR_BIT = 1, 2
-# Most Newton iterations of a physics step; a fall seldom needs as many.
+# Maximum Newton iterations per physics step; even a fall seldom needs as many.
 _SOLVER_ITERATIONS = 10
 PARKING = np.array([0.0, 0.0, 1000.0])
-"""Where inactive objects wait, far above everything [m]."""
+"""Position of inactive objects, far above the scene [m]."""
 MAX_SPEED = 200.0
-"""A faster robot than this has left physics behind: the row is reset and counted."""
+"""A row diverges, and is reset, if a robot velocity exceeds this [m/s, rad/s]."""
 
 
 def build_scene(scene: Scene) -> mujoco.MjModel:
     """Return the compiled model of a robot on a floor with objects to throw.
 
-    Position actuators carry the PD law, evaluated in every substep.
+    Position actuators implement the PD law, evaluated in every substep.
 
     Args:
-        scene: What is in it; the robot's MJCF holds no floor, actuators or sensors.
+        scene: The scene; the robot's MJCF has no floor, actuators or sensors.
 
     Raises:
-        ValueError: If the robot's base does not float, or a joint is no hinge.
+        ValueError: If the robot's base does not float, a joint is not a hinge, or
+            MuJoCo cannot compile the scene.
     """
     robot, config = scene.robot, scene.config
     robot.check_floating_base()
@@ -47,9 +48,9 @@ def build_scene(scene: Scene) -> mujoco.MjModel:
         contype=_FLOOR_BIT,
         conaffinity=0,
     )
-    # Slides instead of a free joint: what ends an episode by its touch need not turn,
-    # three degrees of freedom fewer; and one common parent lets a contact sensor name
-    # all objects.
+    # Slide joints instead of a free joint: contact ends the episode, so objects need
+    # not rotate, which saves three degrees of freedom each. The common parent lets one
+    # contact sensor refer to all objects.
     shelf = spec.worldbody.add_body(name="objects")
     axes = ([1, 0, 0], [0, 1, 0], [0, 0, 1])
     for i, shape in enumerate(scene.objects):
@@ -93,7 +94,7 @@ def build_scene(scene: Scene) -> mujoco.MjModel:
 
 
 def _add_contact_sensors(spec: mujoco.MjSpec, scene: Scene) -> None:
-    """Add counts of contacts in the order that an engine's step reads them."""
+    """Add contact-count sensors in the order in which an engine's step reads them."""
     body, subtree = mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_XBODY
     robot, floor = (subtree, scene.robot.base), (mujoco.mjtObj.mjOBJ_GEOM, "floor")
     objects = [(body, f"object_{i}") for i in range(len(scene.objects))]

@@ -1,6 +1,6 @@
-"""The engine on MuJoCo's batch, on the CPU: exact to the bit whatever the threads.
+"""CPU engine on MuJoCo's batch: bit-identical results for any number of threads.
 
-Contract: that of `egoskin.envs.physics.contract`. This file alone touches the live
+Contract: that of `egoskin.envs.physics.contract`. Only this file accesses the live
 arrays of the simulations.
 """
 
@@ -27,7 +27,7 @@ class MujocoPhysics(Physics):
     """MuJoCo simulations of a scene on a thread pool; see `Physics`.
 
     Args:
-        scene: What is simulated.
+        scene: The scene.
         num_envs: Number of rows ``B``.
         num_threads: Threads that step the rows; results do not depend on it.
         device: The CPU.
@@ -90,7 +90,7 @@ class MujocoPhysics(Physics):
                 errors[error.ids] = True
             counts = self._sensordata
             found |= counts > 0
-            # What of the robot's contacts with the floor is not a foot's.
+            # Fallen: the floor has more contacts with the robot than with its feet.
             fallen |= counts[:, floor] > counts[:, floor + 1 : links].sum(1)
             power += np.abs(self._torque * self._qvel[:, self._joint_v]).sum(1)
             saturation += (np.abs(self._torque) >= self._torque_limit).mean(1)
@@ -129,7 +129,7 @@ class MujocoPhysics(Physics):
         self._ctrl[:] = ctrl.numpy()
 
     def vary(self, rows: Tensor, variation: Variation) -> None:
-        """Give rows model fields of their own; see `Physics.vary`."""
+        """Scale model fields per row; see `Physics.vary`."""
         model, which, expand = self.model, rows.numpy(), self._batch.expand
         links = np.array([body_id(model, link) for link in self.scene.robot.links])
         joints = model.actuator_trnid[:, 0]
@@ -147,7 +147,7 @@ class MujocoPhysics(Physics):
         ranges = expand("actuator_forcerange")
         ranges[which] = limit[..., None] * model.actuator_forcerange
         self._torque_limit = ranges[..., 1]
-        # The joints clip once more.
+        # The joints clip the actuator torque again.
         clip = limit[..., None] * model.jnt_actfrcrange[joints]
         expand("jnt_actfrcrange")[at_joints] = clip
         self._batch.set_const(which)
@@ -157,17 +157,17 @@ class MujocoPhysics(Physics):
         self._qvel[rows.numpy(), :3] += velocity.double().numpy()
 
     def park(self, objects: Tensor) -> None:
-        """Take objects out of play, ``[B, O]`` bool: they wait at rest far above."""
+        """Park objects out of play, ``[B, O]`` bool, at rest far above the scene."""
         parked = objects.numpy()
         self._objects(self._object_q)[parked] = PARKING
         self._objects(self._object_v)[parked] = 0.0
 
     def step_raw(self) -> None:
-        """Advance one control step and look at nothing: what physics alone costs."""
+        """Advance one control step without reading results, to time physics alone."""
         self._batch.step(nstep=self.config.substeps)
 
     def reset(self, rows: Tensor, base_pose: Tensor, joint_pos: Tensor) -> None:
-        """Put the robots of some rows at rest into a pose; see `Physics.reset`."""
+        """Put the robots of some rows at rest in a pose; see `Physics.reset`."""
         which = rows.numpy()
         self._batch.reset(which, stage=mujoco.mjtStage.mjSTAGE_NONE)
         robot = torch.cat((base_pose, joint_pos), -1).double().numpy()
@@ -211,7 +211,7 @@ class MujocoPhysics(Physics):
         return torch.cat(parts, -1)
 
     def load_state(self, state: Tensor) -> None:
-        """Continue from a state that `state` returned."""
+        """Restore a state that `state` returned."""
         size = self._batch.nstate
         self._batch.state[:] = state[:, :size].numpy()
         if self.config.target_velocity == "finite_difference":

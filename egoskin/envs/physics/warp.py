@@ -1,11 +1,11 @@
-"""The engine on MuJoCo Warp: all rows on one device, made for an NVIDIA GPU.
+"""Engine on MuJoCo Warp: all rows on one device, intended for an NVIDIA GPU.
 
-Contract: that of `egoskin.envs.physics.contract`, with float32 inside. PyTorch's
-tensors are views of Warp's arrays: nothing is copied to the host. `WarpPhysics.note`
-says that contacts did not fit into Warp's fixed buffers; the rows that may be harmed
-count as diverged.
+Contract: that of `egoskin.envs.physics.contract`, computed in float32. PyTorch tensors
+are views of Warp arrays: nothing is copied to the host. `WarpPhysics.note` reports
+contacts that did not fit into Warp's fixed buffers; rows that may be affected count as
+diverged.
 
-Warp's CPU device computes the same, slowly: it is there for tests.
+Warp's CPU device runs the same computation slowly; it is meant for tests.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from egoskin.envs.physics.model import MAX_SPEED, PARKING, build_scene
 from egoskin.robots.chains import body_id
 
 SETTING = "EGOSKIN_WARP_CONTACTS"
-"""Environment variable: contacts of a robot that there is room for."""
-# Four times what was seen of a robot that flails on the floor.
+"""Environment variable: capacity of the buffers, in contacts per robot."""
+# Four times the number observed for a robot flailing on the floor.
 _CONTACTS = 48
-# What may not fit: rows that it harms have a simulation that means nothing.
+# Buffer overflows that invalidate the simulation of a row.
 _LOST = (
     mjw.OverflowType.NEFC
     | mjw.OverflowType.NJMAX_NNZ
@@ -43,7 +43,7 @@ _LOST = (
     | mjw.OverflowType.CCD
     | mjw.OverflowType.CONTACT_MATCH
 )
-# What a variation gives rows of their own, and what MuJoCo works out from it.
+# Model fields that a variation sets per row, and those that MuJoCo derives from them.
 _VARIED = (
     *("body_mass", "body_inertia", "geom_friction", "jnt_actfrcrange"),
     *("actuator_gainprm", "actuator_biasprm", "actuator_forcerange"),
@@ -55,9 +55,9 @@ class WarpPhysics(Physics):
     """Simulations of a scene on one device; see `Physics`.
 
     Args:
-        scene: What is simulated.
+        scene: The scene.
         num_envs: Number of rows ``B``.
-        num_threads: Without effect.
+        num_threads: Ignored.
         device: A CUDA device, or the CPU.
     """
 
@@ -72,11 +72,11 @@ class WarpPhysics(Physics):
         robot, config = scene.robot, scene.config
         self.scene, self.config, self.num_envs = scene, config, num_envs
         self.device = torch.device(device)
-        # Not a line for each kernel that is loaded.
+        # Do not log each kernel that is loaded.
         wp.config.log_level = wp.LOG_WARNING
         self._mujoco, contacts = build_scene(scene), self.num_contacts()
         model = self._mujoco
-        # Rows of the constraints: of each contact a pyramid's sides, and of limits.
+        # Constraint rows: sides of each contact's friction pyramid, joint limits, etc.
         sides = max(2 * (int(model.geom_condim.max()) - 1), 1)
         others = int(model.jnt_limited.sum() + (model.dof_frictionloss > 0).sum())
         others += 6 * model.neq + model.ntendon
@@ -114,10 +114,10 @@ class WarpPhysics(Physics):
 
     @staticmethod
     def num_contacts() -> int:
-        """Return how many contacts of a robot there is room for.
+        """Return the capacity of the buffers, in contacts per robot.
 
         Raises:
-            ValueError: If the environment variable holds no such number.
+            ValueError: If the environment variable is not a positive integer.
         """
         text = os.environ.get(SETTING, str(_CONTACTS))
         if not (text.isdecimal() and int(text)):
@@ -126,14 +126,14 @@ class WarpPhysics(Physics):
 
     def _put_model(self, **options: object) -> mjw.Model:
         model = mjw.put_model(self._mujoco, **options)
-        # `note` says so; and more iterations than the model's are none that is lost.
+        # `note` reports overflows; reaching the iteration limit invalidates no row.
         model.opt.warn_overflow = 0
         model.opt.contact_sensor_maxmatch = self.num_contacts()
         return model
 
     @contextmanager
     def _in_order(self) -> Iterator[None]:
-        """Let Warp work on this device, after what PyTorch was told before."""
+        """Run Warp on this device, after the work that PyTorch has already queued."""
         if self.device.type == "cpu":
             with wp.ScopedDevice("cpu"):
                 yield
@@ -143,7 +143,7 @@ class WarpPhysics(Physics):
                 yield
 
     def _substep(self) -> None:
-        """Advance one physics step; on a GPU as one graph of all its kernels."""
+        """Advance one physics step; on a GPU as one CUDA graph, if possible."""
         device = wp.device_from_torch(self.device)
         if self._graph is None and device.is_cuda and device.is_mempool_enabled:
             torch.cuda.synchronize(self.device)
@@ -174,7 +174,7 @@ class WarpPhysics(Physics):
             self._substep()
             counts = self._counts
             found |= counts > 0
-            # What of the robot's contacts with the floor is not a foot's.
+            # Fallen: the floor has more contacts with the robot than with its feet.
             fallen |= counts[:, floor] > counts[:, floor + 1 : links].sum(1)
             power += (self._torque * self._qvel[:, self._robot_v][:, 6:]).abs().sum(1)
             limited = self._torque.abs() >= self._torque_limit
@@ -186,7 +186,7 @@ class WarpPhysics(Physics):
         # The comparison is also False for NaN.
         sound = (speed < MAX_SPEED) & self._qpos.isfinite().all(1)
         lost = (self._overflow & int(_LOST)) != 0
-        # Of a robot that has left physics behind any number may touch.
+        # Diverged robots may have any number of contacts, which is not reported.
         self._overflowed |= (lost & sound).any()
         by_link = None
         if self.scene.link_contacts:
@@ -212,12 +212,12 @@ class WarpPhysics(Physics):
         self._last_target.copy_(target)
 
     def step_raw(self) -> None:
-        """Advance one control step and look at nothing: what physics alone costs."""
+        """Advance one control step without reading results, to time physics alone."""
         for _ in range(self.config.substeps):
             self._substep()
 
     def note(self) -> str | None:
-        """Say whether contacts did not fit; see `Physics.note`."""
+        """Report contacts that did not fit; see `Physics.note`."""
         overflowed = bool(self._overflowed)
         self._overflowed.zero_()
         if not overflowed:
@@ -229,11 +229,11 @@ class WarpPhysics(Physics):
         )
 
     def reset(self, rows: Tensor, base_pose: Tensor, joint_pos: Tensor) -> None:
-        """Put the robots of some rows at rest into a pose; see `Physics.reset`."""
+        """Put the robots of some rows at rest in a pose; see `Physics.reset`."""
         self._qpos[rows, self._robot_q] = torch.cat((base_pose, joint_pos), -1)
         self._object_pos[rows] = 0.0
         self._object_pos[rows, :, 2] = PARKING[2]
-        # All else follows from these.
+        # Everything else is computed from these.
         self._qvel[rows] = 0.0
         self._warmstart[rows] = 0.0
         self._last_target[rows] = joint_pos
@@ -246,7 +246,7 @@ class WarpPhysics(Physics):
         self._object_vel[rows, objects] = velocity
 
     def vary(self, rows: Tensor, variation: Variation) -> None:
-        """Give rows model fields of their own; see `Physics.vary`."""
+        """Scale model fields per row; see `Physics.vary`."""
         model, n = self._mujoco, self.num_envs
         with self._in_order():
             if len(self._model.body_mass) < n:
@@ -270,7 +270,7 @@ class WarpPhysics(Physics):
             scale("actuator_gainprm", variation.gains)
             scale("actuator_biasprm", variation.gains)
             scale("actuator_forcerange", variation.torque_limit)
-            # The joints clip once more.
+            # The joints clip the actuator torque again.
             scale("jnt_actfrcrange", variation.torque_limit, joints)
             mjw.set_const(self._model, self._data)
 
@@ -302,14 +302,14 @@ class WarpPhysics(Physics):
         return torch.cat(self._parts(), -1).double()
 
     def load_state(self, state: Tensor) -> None:
-        """Continue from a state that `state` returned."""
+        """Restore a state that `state` returned."""
         parts = self._parts()
         sizes = [part.shape[1] for part in parts]
         for part, value in zip(parts, state.split(sizes, -1), strict=True):
             part.copy_(value)
 
     def _parts(self) -> list[Tensor]:
-        """Return all that is remembered, ``[B, ...]`` each: not copies."""
+        """Return the tensors that make up the state, ``[B, ...]`` each, not copied."""
         parts = [self._qpos, self._qvel, self._warmstart]
         if self.config.target_velocity == "finite_difference":
             parts.append(self._last_target)
