@@ -140,7 +140,7 @@ class WorkerEnv(TransformedEnv):
             return super().reset(tensordict, **kwargs)
 
     def answer(self, method: str, *args: object) -> object:
-        """Return what a method of the base environment returns."""
+        """Call a method of the base environment; return its result."""
         with _reported(self._report):
             return getattr(self.base_env, method)(*args)
 
