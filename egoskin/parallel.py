@@ -2,7 +2,7 @@
 
 TorchRL's parent process polls shared flags in a busy loop, which takes a core away from
 the physics. It reports a dead worker without the reason, and waits thousands of seconds
-for a worker that hangs. This module changes these three points only.
+for a worker that hangs. Everything else is unchanged TorchRL.
 
 Contract: no worker and no file of a pool outlives the parent, however the parent ends.
 """
