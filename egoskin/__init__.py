@@ -1,13 +1,13 @@
 """egoskin: which proximity skin makes avoidance easy to learn?
 
-TensorDict keys, by who writes them. ``*B`` batch, ``J`` joints, ``L`` links, ``O``
+TensorDict keys, grouped by their writer. ``*B`` batch, ``J`` joints, ``L`` links, ``O``
 objects, ``S`` sensors; suffix ``_w`` world frame, ``_b`` base frame; unit
 quaternions (w, x, y, z).
 
 =========================== ============== ============================= ==============
 key                         shape          content                       read by
 =========================== ============== ============================= ==============
-from `egoskin.envs.dodgeball.DodgeballEnv` (all its keys: its docstring)
+from `egoskin.envs.dodgeball.DodgeballEnv` (all keys: see its docstring)
 ---------------------------------------------------------------------------------------
 ``base_pose``               ``[*B, 7]``    pose in the world [m]         sensors
 ``joint_pos``               ``[*B, J]``    hinges [rad], slides [m]      sensors
@@ -21,7 +21,7 @@ from `egoskin.sensors.FieldSensor` or ``RaySensor``
 ``object_detected``         ``[*B, O]``    bool: by any sensor           signals
 from `egoskin.sensors.imperfections.corruption.Corruption`
 ---------------------------------------------------------------------------------------
-``reading``                 as distance    as a real sensor reports it   signals
+``reading``                 as distance    with sensor imperfections     signals
 ``reading_clock``           ``[*B, 2]``    episode, step                 itself
 ``reading_i_*``             any            state of an imperfection      itself
 from `egoskin.sensors.Proximity`, ``Binary`` or ``Localization``
@@ -29,17 +29,17 @@ from `egoskin.sensors.Proximity`, ``Binary`` or ``Localization``
 ``signal``                  ``[*B, S]``    or ``[*B, 3]`` (localization) actor, critic
 from `egoskin.sensors.history`
 ---------------------------------------------------------------------------------------
-``last_signal``             as signal      when last anything was seen   actor, critic
-``signal_history``          ``[*B, ...]``  the last signals              actor, critic
-from `egoskin.sensors.tactile`, in tasks of your own
+``last_signal``             as signal      last one with a detection     actor, critic
+``signal_history``          ``[*B, ...]``  the latest signals            actor, critic
+from `egoskin.sensors.tactile`, in custom tasks
 ---------------------------------------------------------------------------------------
-``contact_force``           ``[*B, L, 3]`` yours [N]                     tactile
-``contact_free``            ``[*B, 1]``    bool: untouched so far        you
+``contact_force``           ``[*B, L, 3]`` from your task [N]            tactile
+``contact_free``            ``[*B, 1]``    bool: no contact so far       your task
 from `egoskin.envs.observations`
 ---------------------------------------------------------------------------------------
-``observation``             ``[*B, 6+2J]`` body; 6+3J: and last action   actor, critic
+``observation``             ``[*B, 6+2J]`` body; 6+3J with last action   actor, critic
 ``privileged_observation``  ``[*B, P]``    observed in training only     critic
-``signal``                  ``[*B, 7 O]``  an oracle's: the truth        actor, critic
+``signal``                  ``[*B, 7 O]``  oracle: true ball states      actor, critic
 from `egoskin.agents.networks.Agent`
 ---------------------------------------------------------------------------------------
 ``action``                  ``[*B, J]``    see DodgeballEnv              env
@@ -54,9 +54,9 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING, Any
 
-# Threads of torch that wait in a busy loop take the cores from whatever else runs, and
-# on a loaded machine an update then takes many times as long. OpenMP reads these when
-# torch is first imported, so import egoskin before it; what is set already stays.
+# By default, idle torch threads busy-wait and take cores from other processes; on a
+# loaded machine an update then takes many times as long. OpenMP reads these variables
+# when torch is first imported, so import egoskin first. Values already set are kept.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("GOMP_SPINCOUNT", "0")
 
@@ -78,7 +78,7 @@ __all__ = ["EnvConfig", "Policy", "load_policy", "make_env", "make_worker_env"]
 
 
 def __getattr__(name: str) -> Any:
-    """Return a public name, importing its module when it is first asked for."""
+    """Return a public name; its module is imported on first access."""
     if name not in _EXPORTS:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module
@@ -87,5 +87,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """Return the names of the module, those not imported yet included."""
+    """Return the names of the module, including those not yet imported."""
     return sorted({*globals(), *_EXPORTS})

@@ -1,4 +1,4 @@
-"""`python -m egoskin` is the command `egoskin`."""
+"""Run the `egoskin` command as `python -m egoskin`."""
 
 from egoskin.commands import main
 

@@ -1,9 +1,10 @@
-"""Bounds of numbers, declared with the field of a configuration.
+"""Bounds of numbers, declared in the type of a configuration field.
 
     mass: Annotated[float, Interval(gt=0, le=1e6)] = 0.4
 
-Contract: every number of a checked configuration lies in the interval of its field,
-each of a tuple, too; one without an interval is finite, and if whole fits 64 bits.
+Contract: every number of a checked configuration lies in the interval of its field;
+this includes each number of a tuple. Numbers without an interval are finite, and
+integers fit into 64 bits.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from typing import Any
 
 @dataclass(frozen=True, kw_only=True)
 class Interval:
-    """An interval of numbers; infinity is in it only if it is named: ``le=inf``."""
+    """An interval of numbers; it contains infinity only with ``le=inf``."""
 
     gt: float | None = None
     """Numbers are above this."""
@@ -31,9 +32,9 @@ class Interval:
     """Numbers are at most this."""
 
     def violation(self, value: float) -> str | None:
-        """Return what a number outside must be or not be; None for one inside."""
+        """Return the violated condition as text, or None for a number inside."""
         if isinstance(value, int):
-            # Compared as it is: one of 400 digits is no float.
+            # Not converted: an int of 400 digits does not fit into a float.
             if not -(2**63) <= value < 2**63:
                 return "be a number of 64 bits"
         elif math.isnan(value) or (math.isinf(value) and self.le != value):
@@ -58,7 +59,7 @@ class BoundsError(ValueError):
 
     Args:
         owner: Class of the configuration.
-        text: Name of its field, what it must be and what it is.
+        text: Name of the field, the condition and the actual value.
     """
 
     def __init__(self, owner: type, text: str) -> None:
@@ -69,7 +70,7 @@ class BoundsError(ValueError):
 def check_bounds(config: Any) -> None:
     """Raise BoundsError if a number of a dataclass is out of bounds.
 
-    Those of inner dataclasses are their own to check.
+    Nested dataclasses are not checked; they check their own fields.
 
     Args:
         config: The dataclass; it calls this first in its ``__post_init__``.
@@ -96,11 +97,11 @@ def _intervals(kind: type) -> Mapping[str, Interval]:
 
 
 def path_to(owner: type, kind: type) -> str:
-    """Return where a configuration stands in another: "env.task.", or "" if nowhere.
+    """Return the path of a nested configuration ("env.task."), or "" if not nested.
 
     Args:
-        owner: Class of the inner one, of which there is one.
-        kind: Class of the outer one.
+        owner: Class of the inner configuration, which occurs once.
+        kind: Class of the outer configuration.
     """
     for name, hint in typing.get_type_hints(kind).items():
         if hint is owner:

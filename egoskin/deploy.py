@@ -1,6 +1,6 @@
-"""A policy on a robot: from joint states and raw distances to joint targets.
+"""Run a policy on a robot: from joint states and raw distances to joint targets.
 
-Needs numpy and onnxruntime, and of this package this file alone; see docs/deploy.md.
+Needs only numpy, onnxruntime and this file of the package; see docs/deploy.md.
 """
 
 from __future__ import annotations
@@ -14,24 +14,26 @@ import onnxruntime
 
 
 class Controller:
-    """Runs an exported policy, one call of `step` for each control step.
+    """Runs an exported policy; call `step` once per control step.
 
-    It stops, and stays stopped, when the body's state or the skin's distances are too
-    old, when state or action are not finite, or when too many distances are missing (a
-    missing one reads as nothing). `stopped` then says why, and the last target is given
-    again: what the motors do (damp, say) is for the driver to decide. `metadata` is all
-    that the file says of robot, skin and policy.
+    The controller stops, and stays stopped, when the body state or the distances are
+    too old, when state or action are not finite, or when too many distances are missing
+    (a missing one counts as no detection). `stopped` then holds the reason, and `step`
+    returns the last target; the motor driver decides what to do (for example, damp).
+    `metadata` holds the file's description of robot, skin and policy.
 
     Args:
         path: The exported policy.
         max_age: Stop when states or distances are older than this [s].
         max_missing: Stop when more than this share of the distances is missing.
-        margin: How far targets may lie outside the joints' ranges, in units of torque
-            limit / kp, the error that asks for the full torque: so policies ask for it.
-        max_change: How far targets move in a control step at most, in the same unit.
+        margin: How far targets may lie outside the joint ranges, in units of torque
+            limit / kp. This is the position error that commands full torque, which
+            policies request in this way.
+        max_change: Largest change of targets per control step, in the same unit.
 
     Raises:
-        ValueError: If the file is no exported policy, or reads what no skin tells.
+        ValueError: If the file is not an exported policy, or the policy reads signals
+            that a skin cannot provide (oracle, localization).
     """
 
     def __init__(
@@ -63,7 +65,7 @@ class Controller:
         self.reset()
 
     def reset(self) -> None:
-        """Forget what was, a stop as well: the next step begins an episode."""
+        """Clear all state, including a stop; the next step begins an episode."""
         self.stopped: str | None = None
         self._action = np.zeros(len(self._default))
         self._target: np.ndarray | None = None
@@ -91,10 +93,11 @@ class Controller:
             base_ang_vel_b: Angular velocity of the base in its frame [rad/s], ``[3]``.
             joint_pos: Joint positions in the file's order [rad], ``[J]``.
             joint_vel: Joint velocities [rad/s], ``[J]``.
-            body_age: How old these are [s].
-            distance: What the sensors measure [m], infinite for nothing, NaN where
-                missing: ``[S]``, or ``[S, K]`` for grids. A blind policy needs none.
-            skin_age: How old the distances are [s].
+            body_age: Age of these measurements [s].
+            distance: Distances measured by the sensors [m], inf for no detection, NaN
+                if missing: ``[S]``, or ``[S, K]`` for grids. Not needed by a blind
+                policy.
+            skin_age: Age of the distances [s].
         """
         w, x, y, z = base_quat  # of the rotation R; gravity_b = R^T (0, 0, -1)
         gravity_b = -2 * np.array([x * z - w * y, y * z + w * x, 0.5 - x * x - y * y])
@@ -117,7 +120,7 @@ class Controller:
         return self._target.copy()
 
     def _signal(self, distance: np.ndarray | None) -> np.ndarray:
-        """Return the signal of distances."""
+        """Return the signal computed from distances."""
         found = np.asarray(np.nan * self._range if distance is None else distance)
         if self._sensor["reduce"] == "min" and found.ndim == 2:
             found = np.fmin.reduce(found, 1)
@@ -128,14 +131,14 @@ class Controller:
         limit = np.minimum(self._range, np.finfo(float).max)
         if self._sensor["signal"] == "binary":
             return (found <= limit) * 1.0
-        # An infinite range has no scale: d reads d / (d + 1 m).
+        # An infinite range has no scale: the signal of d is d / (d + 1 m).
         share = np.where(np.isinf(self._range), 1 - 1 / (1 + found), found / limit)
         share = np.clip(share, 0, 1)
         return 1 - share if self._sensor["signal"] == "closeness" else share
 
     def _next_target(self, blocks: list[np.ndarray], last: np.ndarray) -> np.ndarray:
         """Return the policy's target, within the limits."""
-        # An episode begins with its first observation throughout.
+        # At the start of an episode, the history repeats the first observation.
         past = self._history or [blocks] * self.metadata["history"]
         self._history = [*past[1:], blocks]
         rows = [row for ages in zip(*self._history, strict=True) for row in ages]

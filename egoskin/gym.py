@@ -6,10 +6,11 @@
     env = gymnasium.make("egoskin/Dodgeball-v0", sensor={"signal": "binary"})
     envs = gymnasium.make_vec("egoskin/Dodgeball-v0", num_envs=1024)
 
-Where no line may be added, the name ``egoskin.gym:egoskin/Dodgeball-v0`` imports it.
+The name ``egoskin.gym:egoskin/Dodgeball-v0`` imports this module by itself.
 
-Contract: an observation is what the actor reads, one part after the other, as in an
-exported policy (`egoskin.policies.export`); seeds are those of `egoskin.make_env`.
+Contract: an observation is the concatenated input of the actor, in the order of an
+exported policy (`egoskin.policies.export`); seeds mean the same as in
+`egoskin.make_env`.
 """
 
 from __future__ import annotations
@@ -34,20 +35,20 @@ from egoskin.storage.serialization import from_plain, to_plain
 
 ENV_ID = "egoskin/Dodgeball-v0"
 """Name of the environment."""
-# What an info tells, beside the privileged observation.
+# Entries of an info, besides the privileged observation.
 _FLAGS = ("hit", "fallen", "diverged")
 
 
 def _config(settings: dict[str, Any]) -> EnvConfig:
-    """Return the configuration of keyword arguments: dataclasses, or dictionaries.
+    """Return the configuration for keyword arguments (dataclasses or dictionaries).
 
     Raises:
-        TypeError: If it has no such field.
-        ValueError: If a value is none.
+        TypeError: If `EnvConfig` has no such field.
+        ValueError: If a value is not valid.
     """
     fields = {field.name for field in dataclasses.fields(EnvConfig)}
     for name in settings.keys() - fields:
-        # Gymnasium's wrappers try arguments, and look for these words.
+        # Gymnasium's wrappers try out arguments and look for these words.
         raise TypeError(
             f"{ENV_ID} got an unexpected keyword argument {name!r}; it takes the "
             f"fields of EnvConfig: {', '.join(sorted(fields))}"
@@ -57,7 +58,7 @@ def _config(settings: dict[str, Any]) -> EnvConfig:
 
 
 class _Rows:
-    """What both forms share: spaces, and arrays of what the task tells.
+    """Spaces and conversion to arrays, shared by both environments.
 
     Args:
         settings: Fields of `EnvConfig`.
@@ -75,19 +76,19 @@ class _Rows:
         self.observation_space = Box(low, high)
         robot, task = config.robot_config, config.task
         kp, _ = robot.joint_gains(task.physics.gains)
-        # Farther out, a joint in its range gets its full torque all the same.
+        # Beyond these targets, a joint within its range already gets full torque.
         reach = robot.torque_limit / kp
         bounds = robot.joint_range + np.array([[-1], [1]]) * reach
         bounds = (bounds - robot.default_joint_pos) / (task.action_scale * reach)
         self.action_space = Box(*bounds.astype(np.float32))
 
     def observations(self, td: TensorDictBase) -> np.ndarray:
-        """Return the observations of all rows, ``[B, N]``; nobody else's."""
+        """Return a fresh array of the observations of all rows, ``[B, N]``."""
         parts = [_rows(td, key) for key in self.config.actor_keys]
         return np.concatenate(parts, -1)
 
     def info(self, td: TensorDictBase) -> dict[str, np.ndarray]:
-        """Return what else is told of all rows, ``[B, ...]`` each."""
+        """Return the infos of all rows, ``[B, ...]`` each."""
         flags = {key: _column(td, key) for key in _FLAGS}
         told = "privileged_observation"
         return {**flags, told: _rows(td, told).copy()}
@@ -102,39 +103,40 @@ def _bound(spec: TensorSpec, side: Literal["low", "high"]) -> np.ndarray:
 
 
 def _rows(td: TensorDictBase, key: str) -> np.ndarray:
-    """Return an entry with all batch dimensions made one, ``[B, F]``."""
+    """Return an entry with all batch dimensions flattened, ``[B, F]``."""
     value = td[key]
     assert isinstance(value, Tensor)
     return value.reshape(-1, value.shape[-1]).numpy()
 
 
 def _column(td: TensorDictBase, key: str) -> np.ndarray:
-    """Return an entry of one number for each row, ``[B]``; nobody else's."""
+    """Return a copy of an entry with one number per row, ``[B]``."""
     return _rows(td, key)[:, 0].copy()
 
 
 class DodgeballGym(gymnasium.Env[np.ndarray, np.ndarray]):
-    """One robot that must not be hit by thrown balls.
+    """One robot that has to dodge thrown balls.
 
     **Action** ``[J]``: position targets q* = q_default + scale x action, as in
-    `egoskin.envs.dodgeball.DodgeballEnv`; bounded where more asks for no more torque.
+    `egoskin.envs.dodgeball.DodgeballEnv`; the bounds are the targets beyond which the
+    torque no longer increases.
 
-    **Observation** ``[N]``: what the actor reads, ``observation`` and ``signal``.
+    **Observation** ``[N]``: the input of the actor, ``observation`` and ``signal``.
 
     **Info**: ``hit``, ``fallen``, ``diverged``: how the episode ended;
-    ``privileged_observation``: what the critic may be told in training
+    ``privileged_observation``: extra input of the critic in training
     (`egoskin.envs.observations.Privileged`).
 
-    Reward, start and end are `DodgeballEnv`'s.
+    Reward, start and end of episodes are those of `DodgeballEnv`.
 
     Args:
-        render_mode: ``rgb_array`` to be drawn, as films and Gymnasium's ``RecordVideo``
-            want it; None for no pictures.
+        render_mode: ``rgb_array`` to render images, for example with Gymnasium's
+            ``RecordVideo``; None for no rendering.
         settings: Fields of `egoskin.EnvConfig`, as its dataclasses or as dictionaries.
 
     Raises:
-        TypeError: If it has no such field.
-        ValueError: If they make no environment.
+        TypeError: If `EnvConfig` has no such field.
+        ValueError: If the settings are not valid.
     """
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012 (Gymnasium's)
@@ -144,7 +146,7 @@ class DodgeballGym(gymnasium.Env[np.ndarray, np.ndarray]):
             raise ValueError(f"render_mode must be 'rgb_array', got {render_mode!r}")
         self._rows = _Rows(settings)
         self.config = self._rows.config
-        """What it is made of."""
+        """Configuration of the environment."""
         self.observation_space = self._rows.observation_space
         self.action_space = self._rows.action_space
         self.render_mode = render_mode
@@ -159,8 +161,8 @@ class DodgeballGym(gymnasium.Env[np.ndarray, np.ndarray]):
         """Return the first observation of the next episode, and its info.
 
         Args:
-            seed: Begin with the first episode of this seed, in [0, 2**32).
-            options: None are known.
+            seed: Start with the first episode of this seed, in [0, 2**32).
+            options: Not used.
         """
         super().reset(seed=seed)
         if seed is not None or self._env is None:
@@ -191,17 +193,17 @@ class DodgeballGym(gymnasium.Env[np.ndarray, np.ndarray]):
         )
 
     def render(self) -> np.ndarray | None:
-        """Return the picture of now, ``[360, 640, 3]`` uint8; None without a mode.
+        """Return the current image, ``[360, 640, 3]`` uint8, or None without a mode.
 
         Raises:
-            RenderingError: If no OpenGL context can be made.
+            RenderingError: If no OpenGL context can be created.
         """
         if self.render_mode is None:
             return None
         if self._env is None:
             raise gymnasium.error.ResetNeeded("call reset before render")
         if self._painter is None:
-            # Who asks for no pictures needs no OpenGL.
+            # Imported here: OpenGL is needed only for rendering.
             from egoskin.viewer.offscreen import painter_of
 
             self._painter = painter_of(self.config, self._rows.skin, size=(640, 360))
@@ -211,7 +213,7 @@ class DodgeballGym(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._painter.draw(now, detecting, time=self._age / hz).image
 
     def close(self) -> None:
-        """Free what pictures needed."""
+        """Free the resources of the renderer."""
         if self._painter is not None:
             self._painter.__exit__()
             self._painter = None
@@ -222,25 +224,25 @@ class DodgeballGym(gymnasium.Env[np.ndarray, np.ndarray]):
 
 
 class DodgeballVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
-    """Robots that must not be hit by thrown balls, ``num_envs`` of them.
+    """A batch of ``num_envs`` robots that have to dodge thrown balls.
 
-    What each of them acts on and is told is `DodgeballGym`'s. An episode that ends is
-    followed by the next in the same step: its last observation and info are those of
-    ``final_obs`` and ``final_info``. The simulations run in processes, so call it under
-    ``if __name__ == "__main__":``.
+    Actions, observations and infos of each robot are those of `DodgeballGym`. When an
+    episode ends, the next one starts in the same step; the last observation and info
+    are in ``final_obs`` and ``final_info``. The simulations run in worker processes,
+    so use it under ``if __name__ == "__main__":``.
 
     Args:
         num_envs: Number of robots.
         num_workers: Processes; by default the largest divisor of ``num_envs`` not
-            above the cores. No result depends on it.
+            above the number of cores. Results do not depend on it.
         settings: Fields of `egoskin.EnvConfig`, as its dataclasses or as dictionaries.
 
     Raises:
-        TypeError: If it has no such field.
-        ValueError: If they make no environment.
+        TypeError: If `EnvConfig` has no such field.
+        ValueError: If the settings are not valid.
     """
 
-    # TorchRL asks for the attribute, Gymnasium for the metadata.
+    # TorchRL reads the attribute, Gymnasium reads the metadata.
     autoreset_mode = AutoresetMode.SAME_STEP
     metadata = {"render_modes": [], "autoreset_mode": autoreset_mode}  # noqa: RUF012
 
@@ -251,7 +253,7 @@ class DodgeballVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._num_workers = check_num_workers(num_envs, num_workers)
         self._rows = _Rows(settings)
         self.config = self._rows.config
-        """What it is made of."""
+        """Configuration of the environment."""
         self.single_observation_space = self._rows.observation_space
         self.single_action_space = self._rows.action_space
         self.observation_space = batch_space(self._rows.observation_space, num_envs)
@@ -264,8 +266,8 @@ class DodgeballVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """Return the first observations, ``[num_envs, N]``, and their infos.
 
         Args:
-            seed: Begin with the first episodes of this seed, in [0, 2**32).
-            options: None are known.
+            seed: Start with the first episodes of this seed, in [0, 2**32).
+            options: Not used.
         """
         super().reset(seed=seed)
         if seed is not None or self._env is None:
@@ -317,7 +319,7 @@ class DodgeballVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def _info(
         self, td: TensorDictBase, which: np.ndarray | None = None
     ) -> dict[str, Any]:
-        """Return the infos of some robots as Gymnasium has them, by default of all."""
+        """Return the infos of some robots in Gymnasium's format (default: all)."""
         which = np.ones(self.num_envs, dtype=bool) if which is None else which
         infos: dict[str, Any] = {}
         for key, value in self._rows.info(td).items():
@@ -326,13 +328,13 @@ class DodgeballVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return infos
 
     def close_extras(self, **kwargs: Any) -> None:
-        """End the processes."""
+        """Stop the worker processes."""
         if self._env is not None:
             self._env.close()
 
 
 def _seed(seed: int | None, generator: np.random.Generator) -> int:
-    """Return a seed of the task's draws, from Gymnasium's."""
+    """Return the seed of the task, drawn from Gymnasium's generator if None."""
     if seed is None:
         return int(generator.integers(2**32))
     check_seed(seed)

@@ -1,4 +1,4 @@
-"""What to add to the error for a name that is not known."""
+"""Suggestions for unknown names in error messages."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from collections.abc import Iterable
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Return ``", did you mean 'torso_link'?"``, or nothing if none is like it.
+    """Return ``", did you mean 'torso_link'?"``, or "" if no name is similar.
 
     Args:
-        name: What was given.
-        known: The names there are.
+        name: The unknown name.
+        known: The valid names.
     """
     near = difflib.get_close_matches(name, list(known), n=1)
     return f", did you mean {near[0]!r}?" if near else ""

@@ -1,7 +1,7 @@
-"""What ends a script from outside: Ctrl-C, a batch system, a terminal that closes.
+"""Signals that end a script: Ctrl-C, a batch system, a closed terminal.
 
-A script calls `end_quietly` before it imports the rest, which takes seconds: an
-exception would come out of the midst of another package, with its traceback.
+A script calls `end_quietly` before its other imports, which take seconds: without it,
+Ctrl-C during an import prints a traceback from within another package.
 """
 
 from __future__ import annotations
@@ -17,30 +17,30 @@ ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def end_quietly() -> None:
-    """Let Ctrl-C end this process at once, with one line: nothing is to tidy up yet.
+    """Let Ctrl-C end this process at once, with one line and without cleanup.
 
-    Import this before torch: egoskin says how torch's threads wait.
+    Import this before torch: egoskin configures how torch's threads wait.
     """
     take(end_now, signal.SIGINT)
 
 
 def take(handler: signal._HANDLER, *numbers: int) -> None:
-    """Handle signals, but for those that are ignored (nohup, a job of a shell)."""
+    """Set a signal handler, except for ignored signals (nohup, background jobs)."""
     for number in numbers:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, handler)
 
 
 def end_now(number: int, frame: FrameType | None = None) -> None:
-    """Handle a signal: end this process at once, with one line."""
+    """Signal handler: end this process at once, with one line."""
     say("stopped")
     os._exit(128 + number)
 
 
 def end_next_time() -> None:
-    """Let Ctrl-C or SIGTERM end this process at once, now that it is ending.
+    """Let a further Ctrl-C or SIGTERM end this process at once.
 
-    A terminal that closes says so twice.
+    SIGHUP is ignored: a closing terminal sends it twice.
     """
     take(end_now, signal.SIGINT, signal.SIGTERM)
     take(signal.SIG_IGN, signal.SIGHUP)
@@ -48,9 +48,10 @@ def end_next_time() -> None:
 
 @functools.cache
 def say(text: str) -> None:
-    """Write a line to stderr, the first time it is said.
+    """Write a line to stderr; a repeated text is not written again.
 
-    A handler of signals may at any time: `print` may be at work, and nobody listen.
+    Safe in signal handlers: it does not use `print`, which may have been interrupted,
+    and ignores a closed stderr.
     """
     with suppress(OSError):
         os.write(2, ("\n" * os.isatty(2) + text + "\n").encode())

@@ -1,4 +1,4 @@
-"""The one place where environment, sensors and observations meet."""
+"""Build environments from the task, the sensors and the observations."""
 
 from __future__ import annotations
 
@@ -36,39 +36,39 @@ from egoskin.sensors.pipeline import SensorPipeline, masks_all
 from egoskin.storage.tensor_file import part, prefixed
 from egoskin.transform import StatefulTransform
 
-# More agents than this are a slip of the keyboard.
+# Larger numbers are taken to be typing errors.
 _MOST_AGENTS, _MOST_WORKERS = 2**20, 1024
-# Memory of the simulation of one agent, and what workers share beside the tensors: it
-# is a page for each tensor at least [bytes].
+# Memory of the simulation of one agent, and the memory that workers share besides the
+# tensors (at least a page for each tensor) [bytes].
 _SIMULATION, _SHARED_EXTRA = 12_000, 2**20
 Trainable = WorkerPool | TransformedEnv
-"""All rows of a run: in workers, or in this process."""
-# What the networks read of the transforms' results; the others stay as well.
+"""Environment with all rows of a run, in workers or in this process."""
+# Outputs of the transforms that the networks read.
 _NETWORK_KEYS = ("observation", "privileged_observation", "signal")
 
 
 @dataclass(frozen=True, kw_only=True)
 class EnvConfig:
-    """Robot, task, skin, sensors: everything an environment is made of."""
+    """Robot, task, skin and sensors of an environment."""
 
     robot: Robot = "h1_2"
-    """Robot by name, or one of your own: a folder with robot.toml, or my_robot.py:ROBOT
+    """Robot by name, or your own: a folder with robot.toml, or my_robot.py:ROBOT
     (docs/your-robot.md)."""
     task: DodgeballConfig = dataclasses.field(default_factory=DodgeballConfig)
     """The dodgeball task."""
     skin: SkinConfig = dataclasses.field(default_factory=SkinConfig)
-    """Where the sensors sit."""
+    """Placement of the sensors."""
     sensor: SensorConfig = dataclasses.field(default_factory=SensorConfig)
-    """What they measure."""
+    """Measurement of the sensors."""
     privileged: Literal["objects", "velocity"] = "objects"
-    """What the critic alone sees: also the balls, or (the paper's) the velocity."""
+    """Extra critic input: velocity, balls and more, or only the velocity (paper)."""
     previous_action: bool = False
-    """Whether the actor, too, observes its action of the step before."""
+    """Whether the actor also observes its previous action."""
     history: Annotated[int, Interval(ge=1, le=256)] = 1
-    """Observations of this many steps, the present one included."""
+    """Number of observed steps, including the current one."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for a history out of bounds, or what the robot lacks."""
+        """Raise ValueError if the history or the gains are not valid."""
         check_bounds(self)
         self.robot_config.joint_gains(self.task.physics.gains)
 
@@ -79,17 +79,17 @@ class EnvConfig:
 
     @property
     def standard(self) -> str:
-        """Version of the standard throw that it trains on, "custom" if none."""
+        """Version of the standard throw of the task, or "custom"."""
         return standard_of(self.task)
 
     def pipeline(self, skin: Skin | None = None) -> SensorPipeline:
-        """Return what the sensors are, measure and signal.
+        """Return the sensor pipeline: placement, measurement and signal.
 
         Args:
-            skin: The sensors; by default those that ``skin`` describes.
+            skin: The sensors; by default built from ``skin``.
 
         Raises:
-            ValueError: If skin, robot and configuration do not fit each other.
+            ValueError: If skin, robot and configuration are not compatible.
         """
         robot = self.robot_config
         if skin is None:
@@ -98,13 +98,13 @@ class EnvConfig:
 
     @property
     def actor_keys(self) -> list[str]:
-        """Keys the actor reads."""
+        """Keys that the actor reads."""
         blind = self.sensor.coverage == "none"
         return ["observation"] if blind else ["observation", "signal"]
 
     @property
     def critic_keys(self) -> list[str]:
-        """Keys the critic reads."""
+        """Keys that the critic reads."""
         return [*self.actor_keys, "privileged_observation"]
 
 
@@ -127,25 +127,24 @@ def make_worker_env(
     """Return the batched environment of one process, with its transforms.
 
     Args:
-        config: What the environment is made of.
-        skin: The sensors; by default those that ``config.skin`` describes.
+        config: Configuration of the environment.
+        skin: The sensors; by default built from ``config.skin``.
         num_envs: Number of rows.
-        seed: Seed of all draws.
+        seed: Seed of all random numbers.
         row_offset: Global index of the first row.
         num_threads: Physics threads.
         hold: Whether the robot is held rigid in its default pose.
-        keep_raw: Whether the raw state stays in the output.
-        bare: Whether to leave out observations and sensors (to measure what they
-            cost).
-        sparse: Whether to give the state that the sensors read, for the agent's own
-            sources, instead of the signal.
+        keep_raw: Whether to keep the raw state in the output.
+        bare: Whether to leave out observations and sensors (to measure their cost).
+        sparse: Whether to output the state that the sensors read instead of the
+            signal, for the sparse sources of the agent.
         mask: Links whose sensors detect nothing, or `egoskin.sensors.MASK_ALL`.
-        engine: What simulates.
-        device: Where it does, and all tensors are.
+        engine: Physics engine.
+        device: Device of the simulation and of all tensors.
 
     Raises:
-        ValueError: If the skin does not fit the robot, ``sparse`` is asked for with a
-            history, which is one of signals, or the engine is not installed.
+        ValueError: If the skin does not fit the robot, ``sparse`` is combined with a
+            history or a mask of some links, or the engine is not installed.
     """
     if sparse and config.history > 1:
         raise ValueError(
@@ -163,7 +162,7 @@ def make_worker_env(
         row_offset=row_offset,
         num_threads=num_threads,
         hold=hold,
-        # Only who keeps the raw state reads it.
+        # Read only from the raw state.
         tactile=keep_raw,
         engine=engine_of(engine),
         device=device,
@@ -171,7 +170,7 @@ def make_worker_env(
     transforms: list[Transform] = []
     if not bare:
         throws = config.task.throws
-        # With a history, what is new goes by other names.
+        # With a history, the current values have other names.
         suffix = "" if config.history == 1 else "_now"
         default = torch.from_numpy(robot.default_joint_pos)
         observed = [*Proprioception.STATE_KEYS]
@@ -213,7 +212,7 @@ def make_worker_env(
 
 
 def _state_keys(transform: Transform) -> list[NestedKey]:
-    """What a transform reads back at the next step."""
+    """Return the keys that a transform reads back at the next step."""
     stateful = isinstance(transform, StatefulTransform)
     return transform.state_keys if stateful else []
 
@@ -234,27 +233,28 @@ def make_env(
     """Return a ParallelEnv of ``num_workers`` processes, ``[W, num_envs / W]`` rows.
 
     Args:
-        config: What the environment is made of.
-        skin: The sensors; by default those that ``config.skin`` describes.
-        num_envs: Number of agents in all.
-        seed: Seed of all draws; results do not depend on the number of workers.
+        config: Configuration of the environment.
+        skin: The sensors; by default built from ``config.skin``.
+        num_envs: Total number of agents.
+        seed: Seed of all random numbers; results do not depend on the number of
+            workers.
         num_workers: Processes; by default the largest divisor of ``num_envs`` not
-            above the cores.
+            above the number of cores.
         num_threads: Physics threads of each worker.
         hold: Whether the robots are held rigid in their default pose.
         bare: Whether to leave out observations and sensors.
-        sparse: Whether to give the state instead of the signal, see `make_worker_env`.
+        sparse: Whether to output the state, not the signal; see `make_worker_env`.
         mask: Links whose sensors detect nothing, or `egoskin.sensors.MASK_ALL`.
 
     Raises:
-        ValueError: If the workers do not divide the agents, they do not fit this
-            machine, MuJoCo cannot make the scene, or as `make_worker_env`.
+        ValueError: If ``num_workers`` does not divide ``num_envs``, memory is too
+            small, MuJoCo cannot build the scene, or as in `make_worker_env`.
     """
     workers = check_num_workers(num_envs, num_workers)
     if skin is None:
-        # Once, not in each worker.
+        # Built once, not in each worker.
         skin = config.skin.build(config.robot_config)
-    # What cannot be made, or does not fit, is told of before the workers start.
+    # Errors in the scene and lack of memory are reported before the workers start.
     one = make_worker_env(
         config, skin, num_envs=1, seed=seed, bare=bare, sparse=sparse, mask=mask
     )
@@ -288,16 +288,16 @@ def check_fits(
     """Raise ValueError if an environment does not fit into the machine's memory.
 
     Args:
-        one: The same of a single row.
+        one: The same environment with a single row.
         num_envs: Number of agents.
-        others: What else needs memory, as `egoskin.memory.check_memory` takes it.
+        others: Other memory needs, in the format of `egoskin.memory.check_memory`.
     """
     row = sum(
         spec.shape.numel() * spec.dtype.itemsize
         for spec in one.observation_spec.values(True, True)
     )
     options = "(num_envs or episodes, history, sensors)"
-    # The state before and after a step, in the workers and in what they share.
+    # The state before and after a step, in the workers and in shared memory.
     agents = num_envs * (_SIMULATION + 4 * row)
     check_memory({f"the agents {options}": agents, **(others or {})})
     exchanged = f"what passes between the processes {options}"
@@ -312,11 +312,11 @@ def check_num_workers(
     Args:
         num_envs: Number of agents.
         num_workers: Number of workers; None for the default.
-        name: How the number of agents was called, for the error text.
+        name: Name of the number of agents, for the error text.
 
     Raises:
-        ValueError: If it does not divide the number of agents, then the text lists
-            what does; or if either is out of bounds.
+        ValueError: If it does not divide the number of agents (the text lists valid
+            values), or if either number is out of bounds.
     """
     agents, processes = (num_envs, _MOST_AGENTS), (num_workers, _MOST_WORKERS)
     for what, (number, most) in {name: agents, "num_workers": processes}.items():
@@ -355,9 +355,10 @@ def device_of(name: str) -> torch.device:
 
 
 def print_note(env: Trainable) -> None:
-    """Print what limited the simulations since the last call; see `Physics.note`.
+    """Print a note if a limit affected the simulation; see `Physics.note`.
 
-    Workers simulate with MuJoCo, which nothing limits.
+    A note covers the time since the last call. Workers use MuJoCo, which has no such
+    limits.
     """
     if isinstance(env, TransformedEnv):
         assert isinstance(env.base_env, DodgeballEnv)
@@ -366,12 +367,11 @@ def print_note(env: Trainable) -> None:
 
 
 def save_env_state(env: Trainable, root: TensorDictBase) -> dict[str, Tensor]:
-    """Return the state of all rows, to continue from bit for bit.
+    """Return the state of all rows, from which to continue bit for bit.
 
     Args:
-        env: What `make_env` or `make_worker_env` returned, stepped at least once or
-            reset.
-        root: The tensordict the next step would start from.
+        env: Result of `make_env` or `make_worker_env`, stepped or reset at least once.
+        root: The tensordict from which the next step would start.
     """
     return {
         **prefixed("simulation", env.simulation_state()),
@@ -380,11 +380,11 @@ def save_env_state(env: Trainable, root: TensorDictBase) -> dict[str, Tensor]:
 
 
 def load_env_state(env: Trainable, state: dict[str, Tensor]) -> TensorDictBase:
-    """Put an environment into a saved state; return the root tensordict to go on with.
+    """Load a saved state into an environment; return the root tensordict.
 
     Args:
-        env: A fresh environment of the same rows, in any number of workers.
-        state: What `save_env_state` returned.
+        env: A fresh environment with the same rows and any number of workers.
+        state: Result of `save_env_state`.
     """
     root = env.reset()
     env.load_simulation_state(part("simulation", state))

@@ -1,4 +1,4 @@
-"""How much memory there is, whether what is planned fits it, and errors that say no."""
+"""Available memory, checks against it, and detection of out-of-memory errors."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _CGROUP_LIMITS = (
     "/sys/fs/cgroup/memory/memory.limit_in_bytes",
 )
 _SHARED = "/dev/shm"
-# What errors of Python and PyTorch say that are of no class of their own.
+# Texts of out-of-memory errors that have no exception class of their own.
 _OUT_OF_MEMORY = (
     "can't allocate memory",
     "Cannot allocate memory",
@@ -26,10 +26,10 @@ _OUT_OF_MEMORY = (
 
 
 def machine_memory() -> int:
-    """Return the memory that this process may ever have [bytes]."""
+    """Return the largest amount of memory this process can use [bytes]."""
     limits = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]
     for path in _CGROUP_LIMITS:
-        # Absent on other systems; "max" where there is none.
+        # The file may be absent; "max" means no limit.
         with suppress(OSError, ValueError):
             limits.append(int(Path(path).read_text()))
     address_space, _ = resource.getrlimit(resource.RLIMIT_AS)
@@ -39,11 +39,11 @@ def machine_memory() -> int:
 
 
 def check_memory(needs: Mapping[str, int]) -> None:
-    """Raise ValueError if the machine cannot hold what is needed.
+    """Raise ValueError if the machine has too little memory.
 
     Args:
-        needs: Bytes that are needed for certain, by what needs them and the options
-            that decide how much.
+        needs: Minimum need in bytes, by name; the name says what needs the memory and
+            which options determine its size.
     """
     needed, there = sum(needs.values()), machine_memory()
     if needed > there:
@@ -55,15 +55,15 @@ def check_memory(needs: Mapping[str, int]) -> None:
 
 
 def check_shared_memory(needed: int, what: str) -> None:
-    """Raise ValueError if shared memory has too little room left.
+    """Raise ValueError if there is too little free shared memory.
 
-    Writing there then ends a process without a word (SIGBUS).
+    Writing beyond it would kill the process without a message (SIGBUS).
 
     Args:
-        needed: Bytes that are needed.
-        what: What for, and the options that decide how much.
+        needed: Number of bytes.
+        what: Their purpose and the options that determine their number.
     """
-    # Other systems have no such folder.
+    # Not all systems have this folder.
     if not os.path.isdir(_SHARED):
         return
     status = os.statvfs(_SHARED)
@@ -76,7 +76,7 @@ def check_shared_memory(needed: int, what: str) -> None:
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Whether an error says that there is too little memory, shared or not."""
+    """Return whether an error reports a lack of memory or shared memory."""
     if isinstance(error, (MemoryError, torch.OutOfMemoryError)):
         return True
     known = isinstance(error, (RuntimeError, OSError))

@@ -1,10 +1,10 @@
-"""A TorchRL ParallelEnv whose parent sleeps while it waits, and says what failed.
+"""A TorchRL ParallelEnv whose parent sleeps while waiting and explains failures.
 
-TorchRL's parent polls shared flags in a busy loop, which takes a core away from the
-physics; reports of a dead worker only that it is dead; and waits thousands of seconds
-for one that hangs. Everything else is TorchRL's.
+TorchRL's parent process polls shared flags in a busy loop, which takes a core away from
+the physics. It reports a dead worker without the reason, and waits thousands of seconds
+for a worker that hangs. Everything else is unchanged TorchRL.
 
-Contract: no worker and no file of a pool outlives the parent, however it ends.
+Contract: no worker and no file of a pool outlives the parent, however the parent ends.
 """
 
 from __future__ import annotations
@@ -45,39 +45,39 @@ from torchrl.envs import EnvBase, ParallelEnv, Transform, TransformedEnv
 from egoskin.interrupts import ENDING
 from egoskin.memory import is_out_of_memory
 
-# How long the parent sleeps between looks at its workers: first this share of the time
-# that the last step took, then at least this [s], and this share of the time it has
-# waited since. That adds as much to a step; more looks take CPU from the workers.
+# Sleep of the parent between polls: first this share of the duration of the last step,
+# then the larger of this time [s] and this share of the time waited so far. Polling
+# delays a step by as much; polling more often takes CPU time from the workers.
 _SURE_SHARE, _POLL, _POLL_SHARE = 0.75, 2e-4, 0.01
-# How often the parent looks at what its workers do [s].
+# Interval between checks that the workers are alive [s].
 _LOOK = 0.2
-# A worker without an answer for this long hangs [s]. Long, because one that computes,
-# compiles or waits for a core looks the same. It is counted in looks: while all are
-# suspended (SIGSTOP, a closed laptop) there are none.
+# A worker that does not answer for this long counts as hanging [s]. The limit is high
+# because a worker that computes, compiles or waits for a core looks the same. Time is
+# counted in checks, so suspension of all processes (SIGSTOP, sleep) does not count.
 HANG_LIMIT = 600.0
-# The server tells of a death soon after the channel of the dead closes [s].
+# Time in which the server reports a death after the worker's channel closes [s].
 _DEATH_NOTICE = 5.0
 
 
 T = TypeVar("T")
 
-# Exit status of a worker that would start workers itself, and what to do about it.
+# Exit status of a worker that would start workers itself, and the error message.
 _UNGUARDED = 97
 _GUARD = (
     "error: workers import the script that starts them, and this one would start them "
     'again: put what it does into a function, called under `if __name__ == "__main__":`'
 )
-# When multiprocessing removes its folder at the end: later is lower.
+# Exit priority at which multiprocessing removes its folder; lower runs later.
 _REMOVES_FOLDER = -100
-# What to end when this process ends.
+# Workers to kill when this process ends.
 _processes: weakref.WeakSet[BaseProcess] = weakref.WeakSet()
 
-# Numbers of glibc mallopt, and the threshold that every version of it takes [bytes].
+# Parameters of glibc mallopt, and a threshold that all versions accept [bytes].
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _MMAP_MOST = -1, -3, 2**25
 
 
 class WorkerError(RuntimeError):
-    """A worker died, raised or hung; the text holds its own traceback or signal."""
+    """A worker died, raised or hung; the text holds its traceback or signal."""
 
 
 def available_cores() -> int:
@@ -92,20 +92,20 @@ def default_num_workers(num_envs: int, cores: int | None = None) -> int:
 
     Args:
         num_envs: Number of agents.
-        cores: Number of cores; those this process may use by default.
+        cores: Number of cores; by default those that this process may use.
     """
     cores = available_cores() if cores is None else cores
     return max(n for n in range(1, cores + 1) if num_envs % n == 0)
 
 
 def keep_freed_memory() -> None:
-    """Let glibc's malloc keep what is freed, for this process.
+    """Make glibc's malloc keep freed memory, for this process.
 
-    Every step and update asks for the same megabytes again; to get fresh pages from
+    Every step and update allocates the same megabytes again; getting fresh pages from
     the system each time costs as much as the policy.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
-    # Other C libraries have no such function.
+    # Other C libraries do not have this function.
     if mallopt is not None:
         mallopt(_TRIM_THRESHOLD, 2**31 - 1)
         if not mallopt(_MMAP_THRESHOLD, 2**30):
@@ -113,7 +113,7 @@ def keep_freed_memory() -> None:
 
 
 class WorkerEnv(TransformedEnv):
-    """A transformed env that writes the traceback of its own failure to a file.
+    """A transformed environment that writes the traceback of a failure to a file.
 
     Args:
         env: The batched environment of this worker.
@@ -140,7 +140,7 @@ class WorkerEnv(TransformedEnv):
             return super().reset(tensordict, **kwargs)
 
     def answer(self, method: str, *args: object) -> object:
-        """Return what a method of the base environment returns."""
+        """Call a method of the base environment; return its result."""
         with _reported(self._report):
             return getattr(self.base_env, method)(*args)
 
@@ -156,12 +156,12 @@ def _reported(report: Path) -> Iterator[None]:
 
 
 class _Build:
-    """Builds the env of one worker; picklable for the worker's process."""
+    """Builds the environment of one worker; picklable for the worker process."""
 
     def __init__(self, build: Callable[[], WorkerEnv | EnvBase], report: Path) -> None:
         self._build, self._report = build, report
         self._parent = os.getpid()
-        # A worker has those of the server that forks it, which may be older.
+        # A worker inherits those of the server that forks it, which may be outdated.
         self._settings = own_settings()
 
     def __call__(self) -> WorkerEnv:
@@ -173,7 +173,7 @@ class _Build:
                 del os.environ[name]
             os.environ.update(self._settings)
             Thread(target=_end_with_parent, daemon=True).start()
-            # It ends with its parent, not after 10,000 s without a command.
+            # A worker ends with its parent, not after 10,000 s without a command.
             torchrl._utils.BATCHED_PIPE_TIMEOUT = None
         with _reported(self._report):
             env = self._build()
@@ -191,7 +191,7 @@ def own_settings() -> dict[str, str]:
 
 
 def _end_with_parent() -> None:
-    """End as soon as the parent has, which may have got a SIGKILL."""
+    """End this process as soon as the parent ends, even by SIGKILL."""
     parent = parent_process()
     assert parent is not None
     parent.join()
@@ -199,17 +199,17 @@ def _end_with_parent() -> None:
 
 
 def start_server() -> None:
-    """Start what forks the workers, if it does not run; it imports on its own time.
+    """Start the server that forks the workers, if it does not run yet.
 
-    Workers are forked from a clean server that has imported everything once: no thread
-    of this process is copied, and no import is paid for per worker.
+    The server imports all modules once, in the background. Workers are forked from it,
+    so they copy no thread of this process and do not repeat the imports.
     """
     _check_guarded()
     _temporary_folder()
     set_forkserver_preload(["egoskin.preload"])
-    # Ctrl-C, a batch system's SIGTERM and a closed terminal reach the whole group, but
-    # when to end is the parent's decision. All others inherit the signal mask. The
-    # tracker comes first: its own start unblocks what it ignores.
+    # Ctrl-C, a batch system's SIGTERM and a closed terminal reach the whole process
+    # group, but the parent decides when to end. The server and the workers inherit the
+    # signal mask. The tracker starts first: its start unblocks the signals it ignores.
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP})
     try:
         resource_tracker.ensure_running()
@@ -220,23 +220,23 @@ def start_server() -> None:
 
 
 def _check_guarded() -> None:
-    """End a worker that imports its parent's script and meets what starts workers."""
-    # The attribute is there while multiprocessing imports.
+    """End this process if it is a worker that would start workers on import."""
+    # multiprocessing sets the attribute while it imports the parent's script.
     if hasattr(current_process(), "_inheriting"):
         os._exit(_UNGUARDED)
 
 
 @functools.cache
 def _temporary_folder() -> str:
-    """Return a folder that is removed when this process ends, however it does.
+    """Return a folder that is removed when this process ends, however it ends.
 
-    It is multiprocessing's own, with the socket of the server that forks the workers.
-    A process that is killed removes nothing, so a shell waits for its end: for a line
-    if multiprocessing has removed the folder, for the end of file if nobody has. Then
-    it removes the semaphores, too, unless multiprocessing's tracker still has.
+    It is the folder of multiprocessing, with the socket of the server that forks the
+    workers. A killed process cannot remove it, so a shell waits on a pipe: it receives
+    a line if multiprocessing has removed the folder. At end of file instead, the shell
+    removes the folder, and the semaphores that multiprocessing's tracker has left.
     """
     folder = util.get_temp_dir()
-    # Of multiprocessing: what the names of this process's semaphores begin with.
+    # Prefix of the names of this process's semaphores in multiprocessing.
     name = Path(folder).name
     current_process()._config["semprefix"] = f"/{name}"
     script = """trap "" INT TERM HUP
@@ -246,26 +246,26 @@ def _temporary_folder() -> str:
         stdin=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
-        # A SIGKILL may go to the whole group.
+        # A SIGKILL may go to the whole process group.
         start_new_session=True,
     )
-    # After multiprocessing has removed the folder.
+    # Runs after multiprocessing has removed the folder.
     after = _REMOVES_FOLDER - 1
     util.Finalize(None, shell.communicate, [b"\n"], exitpriority=after)
-    # Before multiprocessing waits for them.
+    # Runs before multiprocessing waits for the workers.
     atexit.register(_kill, _processes)
     return folder
 
 
 def _kill(processes: Iterable[BaseProcess]) -> None:
-    """End workers that nobody waits for any more."""
+    """Kill the processes that are still alive."""
     for process in processes:
         if process.is_alive():
             process.kill()
 
 
 def _ready(report: Path) -> Path:
-    """File that says that the worker of a report has built its env."""
+    """Return the marker file of a worker that has built its environment."""
     return report.with_suffix(".ready")
 
 
@@ -273,7 +273,7 @@ class WorkerPool(ParallelEnv):
     """A ParallelEnv of batched environments, one process each.
 
     Args:
-        builders: What builds the transformed environment of each worker.
+        builders: Functions that build the transformed environment of each worker.
     """
 
     def __init__(self, builders: Sequence[Callable[[], EnvBase]]) -> None:
@@ -287,7 +287,7 @@ class WorkerPool(ParallelEnv):
             [_Build(b, self._report(i)) for i, b in enumerate(builders)],
             mp_start_method="forkserver",
         )
-        # TorchRL lowers the parent's threads for good when the workers start.
+        # TorchRL permanently lowers the parent's threads when the workers start.
         self.num_threads = threads
 
     def simulation_state(self) -> dict[str, Tensor]:
@@ -296,7 +296,7 @@ class WorkerPool(ParallelEnv):
         return {k: torch.cat([s[k] for s in states]) for k in states[0]}
 
     def load_simulation_state(self, state: dict[str, Tensor]) -> None:
-        """Give every worker the state of all rows; each takes its own."""
+        """Send the state of all rows to every worker, which loads its own rows."""
         self._ask("load_simulation_state", state)
 
     def step_and_maybe_reset(
@@ -314,12 +314,12 @@ class WorkerPool(ParallelEnv):
             return super().reset(tensordict, **kwargs)
 
     def _ask(self, method: str, *args: object) -> list:
-        """Return what a method of every worker's environment answers."""
+        """Call a method of every worker's environment; return the results."""
         if self.is_closed:
             self.start()
         channels = self.parent_channels
         with self._death_explained():
-            # Tensors travel in shared memory: a message never fills the channel.
+            # Tensors are sent in shared memory, so a message never fills the channel.
             for channel in channels:
                 channel.send(("answer", ((method, *args), {})))
             self._wait(range(len(channels)), lambda worker: channels[worker].poll())
@@ -329,7 +329,7 @@ class WorkerPool(ParallelEnv):
         return self._reports / f"worker-{worker}.txt"
 
     def _start_workers(self) -> None:
-        """Start the workers; raise if one cannot."""
+        """Start the workers; raise WorkerError if one cannot."""
         start_server()
         self._reports.mkdir(exist_ok=True)
         started = Event()
@@ -341,7 +341,7 @@ class WorkerPool(ParallelEnv):
             super()._start_workers()
             _processes.update(self._workers)
         except BaseException as error:
-            # Ctrl-C, too: nobody else knows of them.
+            # Also on Ctrl-C: nothing else would end these workers.
             _kill(set(active_children()) - others)
             if not isinstance(error, (EOFError, ConnectionError)):
                 raise
@@ -354,7 +354,7 @@ class WorkerPool(ParallelEnv):
             watch.join()
 
     def _watch_start(self, started: Event) -> None:
-        """Kill workers that hang while they start: the parent blocks on a channel."""
+        """Kill workers that hang during the start, while the parent blocks."""
         looks = 0
         while not started.wait(_LOOK):
             looks += 1
@@ -365,11 +365,11 @@ class WorkerPool(ParallelEnv):
                         process.kill()
 
     def _cleanup_failed_worker_startup(self) -> None:
-        """Raise; TorchRL calls this when a worker has ended while it was started."""
+        """Raise WorkerError; TorchRL calls this if a worker ends during its start."""
         self._explain_death()
 
     def _wait_for_workers(self, workers_range: Iterable[int]) -> None:
-        """Sleep until the workers have set their flags; raise if one cannot."""
+        """Sleep until the workers have set their flags; raise if one fails."""
         workers, flags = list(workers_range), self._shm_done_flags
         begin = time.monotonic()
         time.sleep(min(_SURE_SHARE * self._last_step, _LOOK))
@@ -379,7 +379,7 @@ class WorkerPool(ParallelEnv):
             flags[worker] = 0
 
     def _wait(self, workers: Iterable[int], answered: Callable[[int], bool]) -> None:
-        """Sleep until the workers have answered a command; raise if one cannot."""
+        """Sleep until the workers have answered a command; raise if one fails."""
         waiting, looks = list(workers), 0
         begin = looked = time.monotonic()
         while waiting := [worker for worker in waiting if not answered(worker)]:
@@ -395,7 +395,7 @@ class WorkerPool(ParallelEnv):
 
     @contextmanager
     def _death_explained(self) -> Iterator[None]:
-        """Say how a worker ended, where TorchRL or a channel only say that one did."""
+        """Report how a worker ended, where TorchRL only reports that it did."""
         if not self.is_closed:
             for worker, process in enumerate(self._workers):
                 if not process.is_alive():
@@ -405,12 +405,12 @@ class WorkerPool(ParallelEnv):
         except (EOFError, ConnectionError):
             self._explain_death()
         except KeyboardInterrupt:
-            # The next command would be given the answers to this one.
+            # Otherwise the next command would receive the answers to this one.
             self._end()
             raise
 
     def _explain_death(self) -> NoReturn:
-        """Raise, saying which worker ended and how."""
+        """Raise WorkerError with the worker that ended and the reason."""
         deadline = time.monotonic() + _DEATH_NOTICE
         while time.monotonic() < deadline:
             for worker, process in enumerate(self._workers):
@@ -435,7 +435,7 @@ class WorkerPool(ParallelEnv):
         return f"ended with exit status {code}"
 
     def _fail(self, worker: int, reason: str) -> NoReturn:
-        """End the workers and raise."""
+        """Kill the workers and raise WorkerError."""
         self._end()
         raise WorkerError(f"worker {worker} of {self.num_workers} {reason}")
 
@@ -447,7 +447,7 @@ class WorkerPool(ParallelEnv):
             process.join()
         for channel in self.parent_channels:
             channel.close()
-        # Nothing is left to close; TorchRL would wait for answers that never come.
+        # Nothing is left to close; TorchRL would wait for answers from killed workers.
         self.is_closed = True
         if self._owns_workers:
             shutil.rmtree(self._reports, ignore_errors=True)

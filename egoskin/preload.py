@@ -1,7 +1,7 @@
-"""What the server that forks the workers imports, once.
+"""Imports of the server that forks the workers, done once.
 
-It takes seconds, in which the server sees nothing. If its parent ends meanwhile, it
-must not fork, much later, what the parent had asked for: Linux then ends it.
+The imports take seconds, in which the server does not notice the end of its parent. It
+must not fork workers for a parent that has ended, so Linux then kills the server.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import ctypes
 import signal
 from importlib import import_module
 
-# prctl(2): a signal when the parent ends.
+# prctl(2) option: signal to receive when the parent ends.
 _PR_SET_PDEATHSIG = 1
 _prctl = getattr(ctypes.CDLL(None), "prctl", None)
 
@@ -18,5 +18,5 @@ if _prctl is not None:
     _prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 import_module("egoskin.make")
 if _prctl is not None:
-    # From here on it sees by itself; the thread that started it may end before.
+    # From here on the server notices by itself; the thread that started it may end.
     _prctl(_PR_SET_PDEATHSIG, 0)

@@ -1,4 +1,4 @@
-"""How far work is, readable on a terminal and in a file."""
+"""Progress reports, readable on a terminal and in a log file."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Mapping
 
-# In a file a line is written this often [s]; a terminal shows every rollout.
+# Interval between lines in a file [s]; a terminal shows every rollout.
 _FILE_INTERVAL = 10.0
 
 
@@ -23,12 +23,12 @@ def clock(seconds: float) -> str:
 
 
 class StatusLine:
-    """One line on stderr that says how far the work is.
+    """One line on stderr with the progress of the work.
 
-    On a terminal it is written over; in a file a line is written now and then.
+    On a terminal the line is overwritten; in a file a line is added every 10 s.
 
     Args:
-        text: What the work is, shown at once.
+        text: Description of the work, shown at once.
     """
 
     def __init__(self, text: str) -> None:
@@ -37,7 +37,7 @@ class StatusLine:
         self.show(text)
 
     def show(self, text: str) -> None:
-        """Show how far it is, if it is time to."""
+        """Show the progress; in a file only if the last line is old enough."""
         now = time.monotonic()
         if self._live:
             print(f"\r{text}\x1b[K", end="", file=sys.stderr, flush=True)
@@ -46,7 +46,7 @@ class StatusLine:
             self._shown = now
 
     def finish(self) -> None:
-        """Leave the line."""
+        """Clear the line on a terminal."""
         if self._live:
             print("\r\x1b[K", end="", file=sys.stderr, flush=True)
 
@@ -55,12 +55,12 @@ class ProgressLine:
     """Frames, time left, speed, survival and success of a training run.
 
     Args:
-        frames: Frames done before.
+        frames: Frames done so far.
         total: Frames at the end.
 
     Attributes:
-        is_unread: Whether nobody reads it any more.
-        metrics: Those shown last; empty before any.
+        is_unread: Whether the output was closed by its reader.
+        metrics: Metrics of the last update; empty before the first.
     """
 
     def __init__(self, frames: int, total: int) -> None:
@@ -76,7 +76,7 @@ class ProgressLine:
         self.metrics = metrics
         now, frames = time.monotonic(), metrics["frames"]
         total = f"{self._total:,}"
-        # Before any episode was old enough there is none to tell of.
+        # NaN until an episode has lasted long enough.
         success = f"{metrics['episode/success']:6.1%}".replace("nan%", "   -")
         text = (
             f"{frames:{len(total)},.0f} / {total} frames  "
@@ -93,18 +93,18 @@ class ProgressLine:
             self._shown = now
 
     def finish(self) -> None:
-        """Leave the line."""
+        """End the line on a terminal."""
         if self._live:
             self._print("")
 
     def _print(self, text: str, end: str = "\n") -> None:
-        """Print, and note if nobody reads it: the run is to end with a checkpoint."""
+        """Print; set `is_unread` on a closed output, so that training stops."""
         if self.is_unread:
             return
         try:
             print(text, end=end, flush=True)
         except OSError as error:
-            # A closed pipe, a closed terminal.
+            # A closed pipe or a closed terminal.
             if error.errno not in (errno.EPIPE, errno.EIO):
                 raise
             self.is_unread = True

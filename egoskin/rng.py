@@ -1,9 +1,9 @@
-"""Random numbers that depend on *what* is drawn, never on when or by whom.
+"""Counter-based random numbers, independent of the order of draws.
 
 Every draw of the project is a pure function of (seed, row, episode, counter,
-stream): the counter-based generator Philox4x32-10. A worker that simulates rows
-2048 to 4095 draws for them what a single process would have drawn, so results do
-not depend on the number of workers, threads or on the order of resets.
+stream), computed by the generator Philox4x32-10. A worker that simulates rows 2048 to
+4095 draws the same numbers for them as a single process would. Results therefore do not
+depend on the number of workers or threads, or on the order of resets.
 
 Source: Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011.
 """
@@ -17,7 +17,8 @@ import torch
 from torch import Tensor
 
 _MASK = 0xFFFFFFFF
-# Bit of a seed that marks a held-out one, and of a key's second word, above any stream.
+# Bit that marks a held-out seed, and the bit for it in the key's second word, above the
+# bits of the streams.
 _HELD_OUT, _HELD_OUT_KEY = 1 << 32, 1 << 16
 # Multipliers and Weyl constants of Philox4x32, from the paper above.
 _M0, _M1 = 0xD2511F53, 0xCD9E8D57
@@ -25,7 +26,7 @@ _W0, _W1 = 0x9E3779B9, 0xBB67AE85
 
 
 class Stream(IntEnum):
-    """What a draw is for; two streams never share numbers."""
+    """Purpose of a draw; two streams never share numbers."""
 
     START = 0
     THROW = 1
@@ -52,7 +53,7 @@ def philox(counter: Tensor, key: tuple[int, int]) -> Tensor:
         # int64 products wrap modulo 2**64; shift and mask recover both halves exactly.
         p0, p1 = c0 * _M0, c2 * _M1
         high0, high1 = p0 >> 32, p1 >> 32
-        # In place: half of the time of a round is allocation.
+        # In place, because allocation takes half of the time of a round.
         c0, c1, c2, c3 = (
             high1.bitwise_and_(_MASK).bitwise_xor_(c1).bitwise_xor_(k0),
             p1.bitwise_and_(_MASK),
@@ -70,24 +71,24 @@ def check_seed(seed: int, name: str = "seed") -> None:
 
 
 def held_out(seed: int) -> int:
-    """Return the held-out twin of a seed: its draws are those of no training.
+    """Return the held-out version of a seed, whose draws no training uses.
 
     Args:
         seed: A seed that a user may choose, in [0, 2**32).
 
     Raises:
-        ValueError: If it is no 32-bit unsigned integer.
+        ValueError: If it is not a 32-bit unsigned integer.
     """
     check_seed(seed)
     return seed | _HELD_OUT
 
 
 def offset_seed(seed: int, offset: int) -> int:
-    """Return another seed, held out where this one is.
+    """Return another seed, held out if the given one is.
 
     Args:
-        seed: A seed, or what `held_out` returned.
-        offset: How far away, modulo 2**32; 0 is the same seed.
+        seed: A seed, or the result of `held_out`.
+        offset: Offset to add, modulo 2**32; 0 gives the same seed.
     """
     return ((seed + offset) & _MASK) | (seed & _HELD_OUT)
 
@@ -96,11 +97,11 @@ def stream_key(seed: int, stream: Stream) -> tuple[int, int]:
     """Return the two words of the generator's key.
 
     Args:
-        seed: A seed in [0, 2**32), or what `held_out` returned.
+        seed: A seed in [0, 2**32), or the result of `held_out`.
         stream: Purpose of the draws.
 
     Raises:
-        ValueError: If the seed is neither.
+        ValueError: If the seed is neither of them.
     """
     own = seed & ~_HELD_OUT
     check_seed(own)
@@ -118,13 +119,13 @@ def random_words(
     """Return four random 32-bit words for each element, a function of the arguments.
 
     Args:
-        seed: Run seed, in [0, 2**32), or what `held_out` returned.
+        seed: Run seed, in [0, 2**32), or the result of `held_out`.
         stream: Purpose of the draw.
         row: Global agent row, ``[*B]`` int64.
         episode: Episode of that row, ``[*B]`` int64.
         counter: Index within the episode (a step, or the n-th throw),
             ``[*B]`` int64.
-        block: Which four words of that draw, ``[*B]`` int64.
+        block: Index of the four words within the draw, ``[*B]`` int64.
 
     Returns:
         Random words in [0, 2**32), ``[4, *B]`` int64.
@@ -147,13 +148,13 @@ def uniform(
     """Return uniform numbers in [0, 1), a pure function of the arguments.
 
     Args:
-        seed: Run seed, in [0, 2**32), or what `held_out` returned.
+        seed: Run seed, in [0, 2**32), or the result of `held_out`.
         stream: Purpose of the draw.
         row: Global agent row, ``[*B]`` int64.
         episode: Episode of that row, ``[*B]`` int64.
         counter: Index within the episode (a step, or the n-th throw),
             ``[*B]`` int64.
-        size: How many numbers for each element of the batch.
+        size: Number of values for each element of the batch.
 
     Returns:
         Multiples of 2**-24 in [0, 1), ``[*B, size]`` float32.
@@ -190,10 +191,11 @@ def _normal_quantiles(dtype: torch.dtype, device: torch.device) -> Tensor:
 
 
 def standard_normal(half: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
-    """Return standard normal numbers for 16-bit ones: 2**16 quantiles, +-4.3 at most.
+    """Return standard normal numbers from 16-bit ones: 2**16 quantiles within +-4.3.
 
-    A table, so that a number's bits depend on nothing but its 16 bits: functions like
-    ``log`` round differently in the body and in the tail of a vectorised loop.
+    They are read from a table, so that each result depends only on its 16 bits:
+    functions like ``log`` round differently in the body and in the tail of a vectorised
+    loop.
 
     Args:
         half: Numbers in [0, 2**16), ``[*B]`` int64.

@@ -1,4 +1,4 @@
-"""Numbers that round alike everywhere: on any machine, compiled or not."""
+"""Functions with identical rounding on any machine, compiled or not."""
 
 from __future__ import annotations
 
@@ -9,32 +9,33 @@ from torch import Tensor
 
 
 def exact_sqrt(x: Tensor) -> Tensor:
-    """Return the correctly rounded square root, which PyTorch's own is not.
+    """Return the correctly rounded square root.
 
-    PyTorch takes that of Intel's MKL where it has it, in which one float32 root in
-    seven is off by the last bit; compiled, it is exact. Double precision, rounded, is
-    exact for float32 in either.
+    PyTorch's own float32 root is not: it uses Intel's MKL if available, in which one
+    root in seven is off by the last bit; in compiled code it is exact. A root in double
+    precision, rounded to float32, is always exact.
 
     Args:
-        x: Any tensor; float64 is as exact as PyTorch.
+        x: Any tensor; for float64 the result is that of PyTorch.
     """
     if torch.compiler.is_compiling() or x.dtype != torch.float32:
         return x.sqrt()
     return x.double().sqrt_().float()
 
 
-# pi/2 = HIGH + MIDDLE + LOW: a few bits each in the first two (Cephes), so that their
-# products with a small integer are exact.
+# pi/2 = HIGH + MIDDLE + LOW. The first two have only a few bits each (Cephes), so that
+# their products with a small integer are exact.
 _HIGH, _MIDDLE, _LOW = 1.5703125, 4.837512969970703125e-4, 7.54978995489188216e-8
 
 
 def sincos(x: Tensor) -> tuple[Tensor, Tensor]:
-    """Return (sine, cosine) to the last bit or two, by sums and products alone.
+    """Return (sine, cosine), accurate to the last bit or two.
 
-    PyTorch's own differ between compiled code, vector code and the tail of an array.
+    Only sums and products are used: PyTorch's functions differ between compiled code,
+    vector code and the tail of an array.
 
     Args:
-        x: Angles [rad] of joints: up to some hundreds.
+        x: Joint angles [rad], up to some hundreds.
     """
     # x = n pi/2 + r, |r| <= pi/4
     n = (x * (2 / math.pi)).round()

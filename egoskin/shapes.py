@@ -1,24 +1,27 @@
-"""Object shapes: the MuJoCo geom, the signed distance and the ray hit, side by side.
+"""Object shapes: MuJoCo geom, signed distance and ray intersection of each shape.
 
-A shape knows nothing of sensors or tasks. Everything that a new one needs (what is
-simulated, what a sensor measures) is in this file. All shapes offer the same:
+Shapes do not depend on sensors or tasks. A new shape is added in this file alone: its
+simulation and its measurement by sensors are both here. All shapes have the same
+methods:
 
-- ``signed_distance(x, y, z)``: from points to the surface [m], negative inside.
-- ``closest_point(x, y, z)``: of the solid, three coordinates [m]; a point inside is its
-  own.
+- ``signed_distance(x, y, z)``: distance from points to the surface [m], negative
+  inside.
+- ``closest_point(x, y, z)``: closest point of the solid, three coordinates [m]; for a
+  point inside, the point itself.
 - ``ray_interval(px, py, pz, dx, dy, dz)``: where the line through p along d enters and
   leaves the solid [m], signed, measured from p; (inf, -inf) for a miss. The surface
-  belongs to the solid. `first_hit` turns it into what a beam measures.
-- ``bounding_radius``: of the sphere around the origin that holds the solid [m].
-- ``half_height``: how far the solid reaches above and below the origin, along z [m].
+  belongs to the solid. `first_hit` converts it to the measurement of a beam.
+- ``bounding_radius``: radius of the sphere around the origin that contains the solid
+  [m].
+- ``half_height``: extent of the solid above and below the origin, along z [m].
 - ``add_geom(body, **attributes)``: adds the shape to a MuJoCo specification.
 
-Coordinates are in the frame of the object [m], directions have length 1, all of them
-tensors of one floating type (float32 or float64) that broadcast together to ``[*B]``.
+Coordinates are in the object frame [m] and directions have length 1. All are tensors of
+one floating type (float32 or float64) that broadcast together to ``[*B]``.
 
-A NaN in a point or a direction makes its results NaN, never a miss: comparisons put it
-on the branch that computes. Only + - * /, exact square roots, abs, min, max and
-comparisons are used, which round in one way: compiled code gives the same bits.
+A NaN in a point or a direction gives NaN results, never a miss: comparisons send NaN to
+the branch that computes. Only + - * /, exact square roots, abs, min, max and
+comparisons are used. Their rounding is unique, so compiled code gives the same bits.
 """
 
 from __future__ import annotations
@@ -34,12 +37,12 @@ from torch import Tensor
 from egoskin.hints import did_you_mean
 from egoskin.rounding import exact_sqrt
 
-# Keeps 0/0 out as a summand or a least value; any length or its square dwarfs it, and
-# float32 holds it.
+# Avoids 0/0, as a summand or a lower bound. It is negligible against any length or its
+# square, and representable in float32.
 _TINY = 1e-30
-# Bisections and Newton steps towards an ellipsoid's closest point: they reach the
-# rounding of float64 for semi-axes up to 100 : 1, measured near the inner planes, where
-# Newton alone takes 16 steps. Outside, 2 steps fewer would do.
+# Bisections and Newton steps for the closest point of an ellipsoid. They reach float64
+# rounding for semi-axes up to 100 : 1, measured near the inner planes, where Newton
+# alone takes 16 steps. Outside the solid, 2 steps fewer would be enough.
 _BISECTIONS, _NEWTON_STEPS = 6, 5
 
 Point = tuple[Tensor, Tensor, Tensor]
@@ -47,11 +50,11 @@ Interval = tuple[Tensor, Tensor]
 
 
 def first_hit(enter: Tensor, leave: Tensor) -> Tensor:
-    """Return how far along a beam the solid is met.
+    """Return the distance along a beam to its first intersection with the solid.
 
     Args:
         enter: Where the beam's line enters the solid [m], ``[*B]``.
-        leave: Where it leaves [m], ``[*B]``, both as of ``ray_interval``.
+        leave: Where it leaves [m], ``[*B]``; both as returned by ``ray_interval``.
 
     Returns:
         Distance to the first intersection [m], ``[*B]``: 0 for an origin in the solid,
@@ -73,12 +76,12 @@ class Sphere:
 
     @property
     def bounding_radius(self) -> float:
-        """Radius of the sphere around the origin that holds the solid [m]."""
+        """Radius of the sphere around the origin that contains the solid [m]."""
         return self.radius
 
     @property
     def half_height(self) -> float:
-        """How far the solid reaches above and below the origin [m]."""
+        """Extent of the solid above and below the origin, along z [m]."""
         return self.radius
 
     def add_geom(self, body: mujoco.MjsBody, **attributes: object) -> mujoco.MjsGeom:
@@ -90,7 +93,7 @@ class Sphere:
         )
 
     def signed_distance(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
-        """Signed distance from points to the surface, negative inside.
+        """Return the signed distance from points to the surface, negative inside.
 
         Args:
             x: First coordinate of the points in the object frame [m], ``[*B]``.
@@ -104,37 +107,37 @@ class Sphere:
         return exact_sqrt(x * x + y * y + z * z) - self.radius
 
     def closest_point(self, x: Tensor, y: Tensor, z: Tensor) -> Point:
-        """Closest point of the solid [m], three ``[*B]``; see the module."""
-        # At the centre r / 0 = inf, which the minimum makes 1.
+        """Return the closest point of the solid [m], three ``[*B]``; see the module."""
+        # At the centre r / 0 = inf, which is clamped to 1.
         scale = (self.radius / exact_sqrt(x * x + y * y + z * z)).clamp(max=1.0)
         return x * scale, y * scale, z * scale
 
     def ray_interval(
         self, px: Tensor, py: Tensor, pz: Tensor, dx: Tensor, dy: Tensor, dz: Tensor
     ) -> Interval:
-        """Where lines enter and leave the solid [m], two ``[*B]``; see the module."""
+        """Return where lines enter and leave [m], two ``[*B]``; see the module."""
         return _ball_interval(self.radius, (px, py, pz), (dx, dy, dz))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Box:
-    """A box, its faces across the axes."""
+    """An axis-aligned box."""
 
     half_extents: tuple[float, float, float]
     """Half of each edge [m]."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for lengths that are not three, positive and finite."""
+        """Raise ValueError unless there are three positive, finite lengths."""
         _check_lengths("half_extents", self.half_extents, 3)
 
     @property
     def bounding_radius(self) -> float:
-        """Radius of the sphere around the origin that holds the solid [m]."""
+        """Radius of the sphere around the origin that contains the solid [m]."""
         return math.hypot(*self.half_extents)
 
     @property
     def half_height(self) -> float:
-        """How far the solid reaches above and below the origin [m]."""
+        """Extent of the solid above and below the origin, along z [m]."""
         return self.half_extents[2]
 
     def add_geom(self, body: mujoco.MjsBody, **attributes: object) -> mujoco.MjsGeom:
@@ -144,7 +147,7 @@ class Box:
         )
 
     def signed_distance(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
-        """Signed distance to the surface [m], ``[*B]``; see the module."""
+        """Return the signed distance to the surface [m], ``[*B]``; see the module."""
         hx, hy, hz = self.half_extents
         # q = |p| - h; d = |max(q, 0)| + min(max_i q_i, 0)
         qx, qy, qz = x.abs() - hx, y.abs() - hy, z.abs() - hz
@@ -153,8 +156,8 @@ class Box:
         return exact_sqrt(ox * ox + oy * oy + oz * oz) + inside
 
     def closest_point(self, x: Tensor, y: Tensor, z: Tensor) -> Point:
-        """Closest point of the solid [m], three ``[*B]``; see the module."""
-        # Each coordinate is found alone; 0, or NaN, tells it of a NaN in the others.
+        """Return the closest point of the solid [m], three ``[*B]``; see the module."""
+        # Coordinates are computed separately; the mark (0 or NaN) spreads a NaN to all.
         total = x + y + z
         mark = total - total
         hx, hy, hz = self.half_extents
@@ -163,7 +166,7 @@ class Box:
     def ray_interval(
         self, px: Tensor, py: Tensor, pz: Tensor, dx: Tensor, dy: Tensor, dz: Tensor
     ) -> Interval:
-        """Where lines enter and leave the solid [m], two ``[*B]``; see the module."""
+        """Return where lines enter and leave [m], two ``[*B]``; see the module."""
         hx, hy, hz = self.half_extents
         sides = _overlap(_slab_interval(hx, px, dx), _slab_interval(hy, py, dy))
         return _overlap(sides, _slab_interval(hz, pz, dz))
@@ -171,12 +174,12 @@ class Box:
 
 @dataclass(frozen=True, kw_only=True)
 class Capsule:
-    """A cylinder along z with a half ball on either end."""
+    """A cylinder along z with a hemisphere at each end."""
 
     radius: float
     """Radius [m]."""
     half_length: float
-    """Half the length of the cylinder, without the half balls [m]."""
+    """Half the length of the cylinder, without the hemispheres [m]."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for lengths that are not positive and finite."""
@@ -185,12 +188,12 @@ class Capsule:
 
     @property
     def bounding_radius(self) -> float:
-        """Radius of the sphere around the origin that holds the solid [m]."""
+        """Radius of the sphere around the origin that contains the solid [m]."""
         return self.radius + self.half_length
 
     @property
     def half_height(self) -> float:
-        """How far the solid reaches above and below the origin [m]."""
+        """Extent of the solid above and below the origin, along z [m]."""
         return self.radius + self.half_length
 
     def add_geom(self, body: mujoco.MjsBody, **attributes: object) -> mujoco.MjsGeom:
@@ -202,31 +205,32 @@ class Capsule:
         )
 
     def signed_distance(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
-        """Signed distance to the surface [m], ``[*B]``; see the module."""
-        # d = |p - a| - r, with a the closest point of the axis
+        """Return the signed distance to the surface [m], ``[*B]``; see the module."""
+        # d = |p - a| - r, where a is the closest point on the axis
         z = z - z.clamp(-self.half_length, self.half_length)
         return exact_sqrt(x * x + y * y + z * z) - self.radius
 
     def closest_point(self, x: Tensor, y: Tensor, z: Tensor) -> Point:
-        """Closest point of the solid [m], three ``[*B]``; see the module."""
+        """Return the closest point of the solid [m], three ``[*B]``; see the module."""
         axis = z.clamp(-self.half_length, self.half_length)
         across = z - axis
         length = exact_sqrt(x * x + y * y + across * across)
         scale = (self.radius / length).clamp(max=1.0)
-        # Inside, z itself: axis + across may round.
+        # Inside, z itself, because axis + across may be rounded.
         height = torch.where(length <= self.radius, z, axis + across * scale)
         return x * scale, y * scale, height
 
     def ray_interval(
         self, px: Tensor, py: Tensor, pz: Tensor, dx: Tensor, dy: Tensor, dz: Tensor
     ) -> Interval:
-        """Where lines enter and leave the solid [m], two ``[*B]``; see the module."""
-        # A disc in the plane across, met at a slower pace. Along the axis nothing moves
-        # there: the pace is kept from 0, and the disc is then met for ever or never.
+        """Return where lines enter and leave [m], two ``[*B]``; see the module."""
+        # Projected onto the xy plane, the cylinder is a disc and the line moves at a
+        # lower speed, the pace. For a line along the axis the pace is 0; it is kept
+        # positive, and the line is then always or never inside the disc.
         pace = exact_sqrt((dx * dx + dy * dy).clamp(min=_TINY))
         disc = _ball_interval(self.radius, (px, py), (dx / pace, dy / pace))
         side = (disc[0] / pace, disc[1] / pace)
-        # The solid is convex: the line is in it from the first part met to the last.
+        # The solid is convex: the line is inside from its first entry to its last exit.
         enter, leave = _overlap(side, _slab_interval(self.half_length, pz, dz))
         for height in (pz - self.half_length, pz + self.half_length):
             ball = _ball_interval(self.radius, (px, py, height), (dx, dy, dz))
@@ -236,23 +240,23 @@ class Capsule:
 
 @dataclass(frozen=True, kw_only=True)
 class Ellipsoid:
-    """An ellipsoid, its axes along the coordinates."""
+    """An axis-aligned ellipsoid."""
 
     semi_axes: tuple[float, float, float]
     """Half of each axis [m]."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for lengths that are not three, positive and finite."""
+        """Raise ValueError unless there are three positive, finite lengths."""
         _check_lengths("semi_axes", self.semi_axes, 3)
 
     @property
     def bounding_radius(self) -> float:
-        """Radius of the sphere around the origin that holds the solid [m]."""
+        """Radius of the sphere around the origin that contains the solid [m]."""
         return max(self.semi_axes)
 
     @property
     def half_height(self) -> float:
-        """How far the solid reaches above and below the origin [m]."""
+        """Extent of the solid above and below the origin, along z [m]."""
         return self.semi_axes[2]
 
     def add_geom(self, body: mujoco.MjsBody, **attributes: object) -> mujoco.MjsGeom:
@@ -264,25 +268,26 @@ class Ellipsoid:
         )
 
     def signed_distance(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
-        """Signed distance to the surface [m], ``[*B]``; see the module.
+        """Return the signed distance to the surface [m], ``[*B]``; see the module.
 
-        Found by iteration. On semi-axes from 0.02 m to 2 m, inside and up to 3 m
-        away, in planes and axes too, it is off by at most 1e-6 m in float32 and
-        1e-12 m in float64; farther away, by as much of the distance.
+        Computed by iteration. For semi-axes from 0.02 m to 2 m and points inside or up
+        to 3 m away, also in symmetry planes and on axes, the error is at most 1e-6 m in
+        float32 and 1e-12 m in float64; farther away, at most that fraction of the
+        distance.
         """
         least = min(self.semi_axes) ** 2
         u = self._multiplier(x, y, z)
         s = u - least
-        # The dual of min |p - x|^2 with x on the surface, greatest at the root:
-        # d^2 = s (sum_i p_i^2 / (a_i^2 + s) - 1). An error of s enters squared, and no
-        # direction is needed where that is ill-defined (the centre, inner planes).
+        # The dual of min |p - x|^2 with x on the surface, which is maximal at the root:
+        # d^2 = s (sum_i p_i^2 / (a_i^2 + s) - 1). The error of s enters squared, and no
+        # direction is needed, which is ill-defined at the centre and inner planes.
         cx, cy, cz = (u + (a * a - least) for a in self.semi_axes)
         squared = s * (x * x / cx + y * y / cy + z * z / cz - 1.0)
         distance = exact_sqrt(squared.clamp(min=0.0))
         return torch.where(s < 0, -distance, distance)
 
     def closest_point(self, x: Tensor, y: Tensor, z: Tensor) -> Point:
-        """Closest point of the solid [m], three ``[*B]``; see the module."""
+        """Return the closest point of the solid [m], three ``[*B]``; see the module."""
         least = min(self.semi_axes) ** 2
         u = self._multiplier(x, y, z)
         # x_i = p_i a_i^2 / (a_i^2 + s)
@@ -295,12 +300,12 @@ class Ellipsoid:
         )
 
     def _multiplier(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
-        """Least squared semi-axis plus Lagrange's multiplier of the closest point.
+        """Return the shifted Lagrange multiplier u of the closest point.
 
         The surface's closest point to p is x_i = p_i a_i^2 / (a_i^2 + s). It lies on
-        the surface if G = sum_i (a_i p_i / (a_i^2 + s))^2 = 1, for one s only with all
-        denominators positive. The unknown is u = s + min_i a_i^2, which stays exact
-        near the pole at 0.
+        the surface if G = sum_i (a_i p_i / (a_i^2 + s))^2 = 1, which holds for only one
+        s with all denominators positive. The unknown is u = s + min_i a_i^2, which
+        stays exact near the pole at 0.
 
         Source: Moré and Sorensen, "Computing a trust region step", SIAM J. Sci. Stat.
         Comput. 4(3), 1983: 1 / sqrt(G) is concave and nearly linear.
@@ -320,12 +325,12 @@ class Ellipsoid:
             squares = (rx * rx, ry * ry, rz * rz)
             return (ix, iy, iz), squares, squares[0] + squares[1] + squares[2]
 
-        # The root's bounds: there one term of G alone is 1; there G would be 1 with all
-        # e at their least, 0.
+        # Bounds of the root. Low: the largest u at which a single term of G is 1. High:
+        # the u at which G would be 1 if all e were 0, their minimum.
         low = (wx - ex).maximum(wy - ey).maximum(wz - ez).clamp(min=_TINY)
         high = exact_sqrt(wx * wx + wy * wy + wz * wz)
         for _ in range(_BISECTIONS):
-            # Of the exponents: near inner planes the root is anywhere down to 0.
+            # Bisects exponents: near inner planes the root may be arbitrarily small.
             middle = exact_sqrt(low * high).clamp(min=_TINY)
             *_, g = terms(middle)
             low = torch.where(g > 1.0, middle, low)
@@ -341,7 +346,7 @@ class Ellipsoid:
     def ray_interval(
         self, px: Tensor, py: Tensor, pz: Tensor, dx: Tensor, dy: Tensor, dz: Tensor
     ) -> Interval:
-        """Where lines enter and leave the solid [m], two ``[*B]``; see the module."""
+        """Return where lines enter and leave [m], two ``[*B]``; see the module."""
         # Scaled along the axes, the ellipsoid is the unit ball.
         kx, ky, kz = (1.0 / a for a in self.semi_axes)
         dx, dy, dz = kx * dx, ky * dy, kz * dz
@@ -355,7 +360,7 @@ class Ellipsoid:
 
 
 Shape = Sphere | Box | Capsule | Ellipsoid
-"""Any shape; they share the methods that the module lists."""
+"""Any shape; all have the methods listed in the module docstring."""
 
 
 def shape_of(kind: str, size: Sequence[float]) -> Shape:
@@ -363,12 +368,12 @@ def shape_of(kind: str, size: Sequence[float]) -> Shape:
 
     Args:
         kind: ``sphere``, ``box``, ``capsule`` or ``ellipsoid``.
-        size: The geom's size [m], as MuJoCo orders it; what the kind does not use is
-            ignored, as MuJoCo does.
+        size: Size of the geom [m], in MuJoCo's order; values that the kind does not
+            use are ignored, as in MuJoCo.
 
     Raises:
-        ValueError: If the kind is none of these, or a size is missing, not positive or
-            not finite.
+        ValueError: If the kind is unknown, or a size is missing, not positive or not
+            finite.
     """
     needed = {"sphere": 1, "capsule": 2, "box": 3, "ellipsoid": 3}
     if kind not in needed:
@@ -387,7 +392,7 @@ def shape_of(kind: str, size: Sequence[float]) -> Shape:
 
 
 def _check_lengths(name: str, lengths: Sequence[float], count: int) -> None:
-    """Raise ValueError unless there are so many lengths, all positive and finite."""
+    """Raise ValueError unless there are ``count`` positive, finite lengths."""
     if len(lengths) != count:
         raise ValueError(f"{name} must hold {count} lengths, got {lengths}")
     if not all(length > 0 and math.isfinite(length) for length in lengths):
@@ -398,10 +403,10 @@ def _check_lengths(name: str, lengths: Sequence[float], count: int) -> None:
 def _ball_interval(
     radius: float, p: tuple[Tensor, ...], d: tuple[Tensor, ...]
 ) -> Interval:
-    """Where lines enter and leave a ball around the origin, or a disc (in the plane).
+    """Return where lines enter and leave a ball (3D) or disc (2D) around the origin.
 
-    By the perpendicular distance: the discriminant of the textbook's quadratic
-    subtracts squares of the distance to the ball, which here never enter.
+    Uses the perpendicular distance. The textbook discriminant would subtract squares of
+    the distance to the ball, which loses precision far away.
 
     Args:
         radius: Radius [m].
@@ -416,7 +421,7 @@ def _ball_interval(
     q = tuple(pi + t * di for pi, di in zip(p, d, strict=True))
     squared = radius * radius - _dot(q, q)
     half = exact_sqrt(squared)
-    # A miss leaves half NaN, and takes neither end from it.
+    # For a miss, half is NaN and is not used.
     misses = squared < 0
     return (
         torch.where(misses, torch.inf, t - half),
@@ -425,18 +430,19 @@ def _ball_interval(
 
 
 def _dot(a: tuple[Tensor, ...], b: tuple[Tensor, ...]) -> Tensor:
-    """Sum of the products of two or three coordinates, ``[*B]``."""
+    """Return the dot product of two or three coordinates, ``[*B]``."""
     total = a[0] * b[0] + a[1] * b[1]
     return total if len(a) == 2 else total + a[2] * b[2]
 
 
 def _slab_interval(half: float, p: Tensor, d: Tensor) -> Interval:
-    """Where lines enter and leave the slab |p| <= half, unordered only by NaN.
+    """Return where lines enter and leave the slab |p| <= half, in order unless NaN.
 
-    A line along the slab is in it from -inf to inf, or (equal infinities) never.
+    For a line parallel to the slab this is -inf to inf if it is inside, and two equal
+    infinities if not.
     """
-    # On a face and along it the distance to it is 0: kept from 0 * inf = NaN by a
-    # summand that rounds away elsewhere, and that puts the face into the slab.
+    # For a line within a face, 0 * inf = NaN is avoided by a summand that is rounded
+    # away in all other cases. It also makes the face belong to the slab.
     inverse = 1.0 / d
     first = (-half - p - _TINY) * inverse
     second = (half - p + _TINY) * inverse
@@ -444,7 +450,7 @@ def _slab_interval(half: float, p: Tensor, d: Tensor) -> Interval:
 
 
 def _overlap(a: Interval, b: Interval) -> Interval:
-    """The part that two intervals share, (inf, -inf) if none."""
+    """Return the intersection of two intervals, (inf, -inf) if it is empty."""
     enter, leave = a[0].maximum(b[0]), a[1].minimum(b[1])
     empty = enter > leave
     return (

@@ -1,8 +1,8 @@
-"""Features that are almost all the same: rows of a few others, and a layer of them.
+"""Sparse features with a default value, and a linear layer for them.
 
-A full ray grid gives thousands of readings for each row, of which one in 250 found
-anything. Kept as lists it takes 1 % of the memory, and the first layer of a network 1 %
-of the time; its weights are those of the dense layer.
+A full ray grid gives thousands of readings per row, of which one in 250 detects
+anything. In sparse form it takes 1 % of the memory, and the first layer of a network
+1 % of the time; the weights are those of the dense layer.
 """
 
 from __future__ import annotations
@@ -21,13 +21,14 @@ from torch.nn.functional import embedding_bag
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SparseRows:
-    """A matrix ``[B, size]`` whose entries are ``default``, but for a few.
+    """A matrix ``[B, size]`` whose entries are ``default`` except for a few.
 
-    Those of row b are number ``offsets[b]`` to ``offsets[b + 1]``.
+    The stored entries of row b are those from ``offsets[b]`` to ``offsets[b + 1]``,
+    exclusive.
     """
 
     offsets: Tensor
-    """Where the entries of each row begin, and the end, ``[B + 1]`` int64."""
+    """Start of the entries of each row, and the end, ``[B + 1]`` int64."""
     column: Tensor
     """Column of each entry, ``[n]`` int64."""
     value: Tensor
@@ -35,7 +36,7 @@ class SparseRows:
     size: int
     """Number of columns."""
     default: float
-    """What all others are."""
+    """Value of all entries that are not stored."""
 
     def __len__(self) -> int:
         """Return the number of rows ``B``."""
@@ -43,7 +44,7 @@ class SparseRows:
 
     @staticmethod
     def cat(parts: Sequence[SparseRows]) -> SparseRows:
-        """Return the rows of several matrices of one kind, one after the other."""
+        """Return the concatenated rows of matrices with equal size and default."""
         counts = torch.cat([part.offsets.diff() for part in parts])
         return replace(
             parts[0],
@@ -53,18 +54,18 @@ class SparseRows:
         )
 
     def select(self, rows: Tensor) -> SparseRows:
-        """Return some rows, ``[n]`` int64, in their order."""
+        """Return the rows with the given indices, ``[n]`` int64, in that order."""
         start = self.offsets[rows]
         counts = self.offsets[rows + 1] - start
         offsets = offsets_of(counts)
-        # Entry i of the result is entry i - offsets[b] + start[b] of this.
+        # Entry i of the result is entry i - offsets[b] + start[b] of this matrix.
         shift = torch.repeat_interleave(start - offsets[:-1], counts)
         entry = shift + torch.arange(len(shift), device=shift.device)
         column, value = self.column[entry], self.value[entry]
         return replace(self, offsets=offsets, column=column, value=value)
 
     def to(self, device: torch.device) -> SparseRows:
-        """Return it on a device."""
+        """Return the matrix on a device."""
         return replace(
             self,
             offsets=self.offsets.to(device),
@@ -84,7 +85,7 @@ class SparseRows:
         return matrix.index_put_((self._row, self.column), self.value)
 
     def linear(self, weight: Tensor, bias: Tensor | None) -> Tensor:
-        """Return what a linear layer makes of the matrix, ``[B, out]``.
+        """Return the output of a linear layer for the matrix, ``[B, out]``.
 
         Args:
             weight: Weights of the layer, ``[out, size]``.
@@ -92,7 +93,7 @@ class SparseRows:
         """
         result = _Linear.apply(weight, self)
         assert isinstance(result, Tensor)
-        # A constant input is one more bias.
+        # A constant input acts as another bias.
         constant = self.default * weight.sum(1) if self.default else None
         for shift in (constant, bias):
             result = result if shift is None else result + shift
@@ -106,14 +107,14 @@ class SparseRows:
 
     @property
     def _excess(self) -> Tensor:
-        """By how much each entry differs from the default."""
+        """Difference of each entry from the default."""
         return self.value - self.default if self.default else self.value
 
     @cached_property
     def _by_column(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Row and excess of each entry, column by column, and where columns begin."""
+        """Row and excess of each entry, sorted by column, and the column offsets."""
         if self.column.is_cpu:
-            # A radix sort for 16 bits: several times as fast as PyTorch's.
+            # NumPy uses a radix sort for 16 bits, several times as fast as PyTorch.
             bits = np.uint16 if self.size <= 2**16 else np.int64
             keys = self.column.numpy().astype(bits)
             order = torch.from_numpy(np.argsort(keys, kind="stable"))
@@ -124,10 +125,10 @@ class SparseRows:
 
 
 class SparseSource(Protocol):
-    """Computes sparse rows from what an environment gives."""
+    """Computes sparse rows from the output of an environment."""
 
     in_keys: list[str]
-    """Keys it reads."""
+    """Keys that the source reads."""
     size: int
     """Number of columns."""
 
@@ -137,12 +138,12 @@ class SparseSource(Protocol):
 
 
 def offsets_of(counts: Tensor) -> Tensor:
-    """Return where groups of these sizes begin, and the end, ``[n + 1]``."""
+    """Return the starts of groups with these sizes, and the end, ``[n + 1]``."""
     return torch.cat((counts.new_zeros(1), counts.cumsum(0)))
 
 
 def _sums(table: Tensor, index: Tensor, scale: Tensor, offsets: Tensor) -> Tensor:
-    """Return sums of scaled rows of a table, one for each group."""
+    """Return the sum of scaled rows of a table for each group."""
     return embedding_bag(
         index,
         table,
@@ -154,7 +155,7 @@ def _sums(table: Tensor, index: Tensor, scale: Tensor, offsets: Tensor) -> Tenso
 
 
 class _Linear(torch.autograd.Function):
-    """The entries' part of the layer. PyTorch's gradient takes ten times as long."""
+    """Layer output of the entries; PyTorch's gradient takes ten times as long."""
 
     @staticmethod
     def forward(ctx: torch.autograd.function.FunctionCtx, *args: object) -> Tensor:

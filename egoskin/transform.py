@@ -1,8 +1,8 @@
-"""The shape that the transforms of the project share, without state and with it.
+"""Base classes of the project's TorchRL transforms, with and without state.
 
-Contract: a row of the result depends on the same row of the inputs, and of the state,
-alone. On a partial reset only the rows that reset are computed; the environment fills
-the others in.
+Contract: a row of the result depends only on the same row of the inputs and of the
+state. On a partial reset only the rows that reset are computed; the environment fills
+in the others.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class _KeyedTransform(Transform):
 
     @abstractmethod
     def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
-        """Return the spec of each out key, ``[*B, ...]``, from the input's spec."""
+        """Return the spec of each out key, ``[*B, ...]``, given the input spec."""
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Return the spec with the out keys added."""
@@ -50,7 +50,7 @@ class _KeyedTransform(Transform):
     def _read(
         self, tensordict: TensorDictBase, keys: Sequence[NestedKey]
     ) -> list[Tensor]:
-        """Return entries with all batch dimensions made one, ``[B, ...]`` each."""
+        """Return entries with all batch dimensions flattened, ``[B, ...]`` each."""
         missing = [k for k in keys if k not in tensordict.keys(True)]
         if missing:
             raise KeyError(
@@ -64,15 +64,15 @@ class _KeyedTransform(Transform):
         return [x.reshape(-1, *x.shape[len(batch) :]) for x in values]
 
     def _write(self, tensordict: TensorDictBase, values: Sequence[Tensor]) -> None:
-        """Set the out keys, from ``[B, ...]`` each."""
+        """Write the values, ``[B, ...]`` each, to the out keys."""
         batch = tensordict.batch_size
         for key, value in zip(self.out_keys, values, strict=True):
             tensordict.set(key, value.reshape(*batch, *value.shape[1:]))
 
     def _check_one_each(self, method: str, results: object) -> None:
-        """Raise TypeError for a result that is not one for each out key.
+        """Raise TypeError unless there is one result for each out key.
 
-        One tensor, or spec, alone would be taken for its rows.
+        A single tensor or spec would otherwise be iterated over its rows.
         """
         if isinstance(results, tuple | list) and len(results) == len(self.out_keys):
             return
@@ -89,12 +89,12 @@ class _KeyedTransform(Transform):
         """Return the rows of a partial reset; None if all rows reset.
 
         Args:
-            tensordict: What the reset was asked with; holds ``_reset [*B, 1]`` or not.
+            tensordict: Input of the reset, with or without ``_reset [*B, 1]``.
             total: Number of rows ``B``.
 
         Returns:
-            The rows that reset ``[n]``, and the same padded: the rows to compute (at
-            least one, so that shapes are known).
+            The rows that reset ``[n]``, and the same rows padded, which are the rows to
+            compute (at least one, so that shapes are known).
         """
         mask = tensordict.get("_reset", None)
         if mask is None or mask.all():
@@ -104,7 +104,7 @@ class _KeyedTransform(Transform):
 
 
 def _spread(values: Tensor, rows: Tensor, total: int) -> Tensor:
-    """Return values of some rows ``[n, ...]``, padded, in zeros ``[total, ...]``."""
+    """Scatter padded values of some rows ``[n, ...]`` into zeros ``[total, ...]``."""
     full = values.new_zeros(total, *values.shape[1:])
     full[rows] = values[: len(rows)]
     return full
@@ -113,17 +113,17 @@ def _spread(values: Tensor, rows: Tensor, total: int) -> Tensor:
 class RowTransform(_KeyedTransform):
     """A TorchRL transform that maps each row of its inputs to a row of its outputs.
 
-    Works inside a worker, around a ParallelEnv, and by calling it on any TensorDict
-    with any leading dimensions (a stored batch with time, for example).
+    It works inside a worker, around a ParallelEnv, and when called on a TensorDict with
+    any leading dimensions (for example, a stored batch with time).
 
     Args:
-        in_keys: Keys read; written only if they are out keys, too.
+        in_keys: Keys read; written only if they are also out keys.
         out_keys: Keys written.
     """
 
     @abstractmethod
     def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
-        """Return one tensor for each out key, from one for each in key.
+        """Compute one tensor per out key from one tensor per in key.
 
         Args:
             inputs: Tensors ``[B, ...]`` with a single batch dimension.
@@ -163,18 +163,19 @@ class RowTransform(_KeyedTransform):
 class StatefulTransform(_KeyedTransform):
     """A TorchRL transform whose results depend on its own earlier results.
 
-    The state is some of the results. It lives in the tensordict (in the observation
-    *and* in the state spec, so that it travels to workers and back), is never written
-    in place, and starts anew in the rows that reset: from a stored tensordict
-    everything continues bit for bit. Nothing downstream may exclude a state key.
+    The state is a subset of the results. It is kept in the tensordict (in the
+    observation *and* in the state spec, so that it is sent to workers and back), is
+    never written in place, and is initialised again in rows that reset. Everything
+    continues bit for bit from a stored tensordict. Later transforms must not exclude a
+    state key.
 
-    Works inside a worker, around a ParallelEnv, and by calling it on a stored
+    It works inside a worker, around a ParallelEnv, and when called on a stored
     TensorDict, see `forward`.
 
     Args:
         in_keys: Keys read; never written.
         out_keys: Keys written.
-        state_keys: Those of the out keys that the next step reads back.
+        state_keys: The out keys that the next step reads back.
     """
 
     def __init__(
@@ -186,8 +187,8 @@ class StatefulTransform(_KeyedTransform):
         super().__init__(in_keys, out_keys)
         assert set(state_keys) <= set(out_keys)
         self.state_keys = list(state_keys)
-        # The state written last, as a reference. TorchRL tells a reset after a step
-        # nothing but which rows reset; what ended there is known from here.
+        # Reference to the last state written. On a reset after a step, TorchRL only
+        # passes which rows reset; this is the state at the end of their episodes.
         self._last: list[Tensor] | None = None
 
     @abstractmethod
@@ -200,10 +201,10 @@ class StatefulTransform(_KeyedTransform):
         """Return the first values of an episode, one tensor for each out key.
 
         Args:
-            rows: Which rows of this environment these are, ``[B]`` int64.
+            rows: Indices of the rows in this environment, ``[B]`` int64.
             inputs: One tensor ``[B, ...]`` for each in key.
-            before: The state at the end of the episode before, one tensor
-                ``[B, ...]`` for each state key; None before the first episode.
+            before: The state at the end of the previous episode, one tensor
+                ``[B, ...]`` for each state key; None for the first episode.
 
         Returns:
             Tensors ``[B, ...]``.
@@ -216,10 +217,10 @@ class StatefulTransform(_KeyedTransform):
         """Return the values of the next step, one tensor for each out key.
 
         Args:
-            rows: Which rows of this environment these are, ``[B]`` int64.
+            rows: Indices of the rows in this environment, ``[B]`` int64.
             inputs: One tensor ``[B, ...]`` for each in key, of the next step.
-            state: The state one step before, one tensor ``[B, ...]`` for each state
-                key; not to be written to.
+            state: The state of the previous step, one tensor ``[B, ...]`` for each
+                state key; must not be modified.
 
         Returns:
             Tensors ``[B, ...]``.
@@ -237,7 +238,7 @@ class StatefulTransform(_KeyedTransform):
         return state_spec
 
     def _state_of(self, values: Sequence[Tensor]) -> list[Tensor]:
-        """Return those of the values that are the state."""
+        """Return the values of the state keys."""
         by_key = dict(zip(self.out_keys, values, strict=True))
         return [by_key[key] for key in self.state_keys]
 
@@ -271,7 +272,7 @@ class StatefulTransform(_KeyedTransform):
             values = [_spread(x, rows, total) for x in started]
         state = self._state_of(values)
         if partial is not None and before is not None:
-            # The other rows keep theirs, for when they are reset.
+            # The other rows keep their state until they are reset.
             rows, _ = partial
             state = [
                 old.index_copy(0, rows, new[rows])
@@ -285,12 +286,12 @@ class StatefulTransform(_KeyedTransform):
         """Write the out keys into a stored tensordict, step by step.
 
         Time is the last batch dimension, ``[*B, T]``. Episodes start at the first
-        step and where ``is_init`` says so or, without it, after ``("next", "done")``.
-        The entries under ``next`` stay as they are.
+        step and where ``is_init`` is true or, without it, after ``("next", "done")``.
+        The entries under ``next`` are not changed.
 
         Raises:
             ValueError: If there is no batch dimension.
-            KeyError: If nothing tells where episodes start, or an in key is missing.
+            KeyError: If ``is_init`` and ``done`` are both missing, or an in key is.
         """
         batch = tensordict.batch_size
         if not batch:

@@ -1,1 +1,1 @@
-"""Actor, critic and PPO. They know TensorDict keys and nothing of robots or tasks."""
+"""Actor, critic and PPO; they use TensorDict keys, independent of robot and task."""

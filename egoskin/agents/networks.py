@@ -1,7 +1,7 @@
 """Actor and critic networks.
 
-Each network takes a *list* of keys. Their tensors are never concatenated: the first
-layer is a sum of one linear map for each key, which equals one linear map of the
+Each network reads a *list* of keys. Their tensors are never concatenated: the first
+layer is the sum of one linear map per key, which equals a linear map of the
 concatenation.
 """
 
@@ -22,7 +22,7 @@ from egoskin.agents.normalizers import RunningNorm, SignalNorm
 from egoskin.bounds import POSITIVE, Interval, check_bounds
 from egoskin.sparse import SparseRows, SparseSource
 
-# Keys whose values are a skin's signals.
+# Keys of the skin's signals.
 _SIGNAL_KEYS = ("signal",)
 
 
@@ -33,16 +33,16 @@ class NetworkConfig:
     hidden: Annotated[tuple[int, ...], Interval(ge=1, le=4096)] = (32, 32)
     """Units of the hidden layers, the same for actor and critic."""
     init_std: Annotated[float, POSITIVE] = 0.8
-    """Standard deviation of the action at the start."""
+    """Initial standard deviation of the action."""
     std_bounds: Annotated[tuple[float, float], POSITIVE] = (0.1, 1.0)
-    """The standard deviation never leaves these bounds."""
+    """Lower and upper bound of the standard deviation."""
     normalize: Literal["body", "all"] = "all"
-    """Running normalisation of all but the skin's signals, or of everything. Signals
-    have one mean and deviation for all sensors, which keeps what differs, and weigh
-    as much together, be they three or thousands."""
+    """Running normalisation of all inputs except the skin's signals, or of all inputs.
+    Signals share one mean and deviation, which keeps differences between sensors; their
+    total weight does not depend on their number."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for sizes and bounds that make no network."""
+        """Raise ValueError for invalid sizes or bounds."""
         check_bounds(self)
         low, high = self.std_bounds
         if not 0 < low <= self.init_std <= high:
@@ -55,7 +55,7 @@ class NetworkConfig:
 
 
 class KeyedMLP(nn.Module):
-    """A multilayer perceptron with ELU whose input is spread over several tensors.
+    """A multilayer perceptron with ELU whose input consists of several tensors.
 
     Args:
         sizes: Features of each input.
@@ -68,7 +68,7 @@ class KeyedMLP(nn.Module):
         self, sizes: Sequence[int], hidden: Sequence[int], out: int, out_gain: float
     ) -> None:
         super().__init__()
-        # One orthogonal matrix over all inputs, as for their concatenation.
+        # One orthogonal matrix for all inputs, as for their concatenation.
         joined = torch.empty(hidden[0], sum(sizes))
         nn.init.orthogonal_(joined, gain=2**0.5)
         inputs = [nn.Linear(n, hidden[0], bias=i == 0) for i, n in enumerate(sizes)]
@@ -83,7 +83,7 @@ class KeyedMLP(nn.Module):
         self.tail = nn.Sequential(*layers)
 
     def forward(self, *inputs: Tensor | SparseRows) -> Tensor:
-        """Return the outputs, ``[*B, out]``, from one ``[*B, size]`` for each input."""
+        """Return the outputs, ``[*B, out]``, given each input as ``[*B, size]``."""
         first, *others = (
             _apply(layer, x) for x, layer in zip(inputs, self.inputs, strict=True)
         )
@@ -91,7 +91,7 @@ class KeyedMLP(nn.Module):
 
 
 def _apply(layer: nn.Module, x: Tensor | SparseRows) -> Tensor:
-    """Return what a linear layer makes of features, ``[*B, out]``."""
+    """Return the output of a linear layer for dense or sparse features."""
     assert isinstance(layer, nn.Linear)
     if isinstance(x, SparseRows):
         return x.linear(layer.weight, layer.bias)
@@ -111,8 +111,8 @@ class GaussianHead(nn.Module):
     Args:
         body: Network of the mean.
         size: Number of actions.
-        init_std: Standard deviation at the start.
-        std_bounds: Its bounds.
+        init_std: Initial standard deviation.
+        std_bounds: Bounds of the standard deviation.
     """
 
     def __init__(
@@ -134,14 +134,15 @@ class GaussianHead(nn.Module):
 
     @torch.no_grad()
     def bound_std(self) -> None:
-        """Bring the standard deviation back into its bounds, after each step."""
+        """Clamp the standard deviation to its bounds; called after each step."""
         self.log_std.clamp_(*self._bounds)
 
 
 class SharedStdNormal(IndependentNormal):
     """Independent Gaussians whose standard deviations are the same in every row.
 
-    Its logarithm, and divisions by it, are those of one row: a tenth of an update.
+    Logarithms and reciprocals are computed for one row only, which saves a tenth of the
+    time of an update.
     """
 
     def _row(self) -> Tensor:
@@ -149,7 +150,7 @@ class SharedStdNormal(IndependentNormal):
         return scale.reshape(-1, scale.shape[-1])[0]
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Return the log-density of actions ``[*B, J]``, ``[*B]``."""
+        """Return the log-density ``[*B]`` of actions ``[*B, J]``."""
         row = self._row()
         # log p = -|(a - loc) / std|^2 / 2 - sum log std - J log(2 pi) / 2
         z = (value - self.base_dist.loc) * row.reciprocal()
@@ -164,21 +165,21 @@ class SharedStdNormal(IndependentNormal):
 
 
 class Agent(nn.Module):
-    """Actor, critic and the normalisers of what they read.
+    """Actor, critic and the normalisers of their inputs.
 
-    `sense` gives what they read, and `encode` makes ``("inputs", key)`` of each key of
-    that, once for both of them and for all passes over a rollout. From the inputs of
-    ``actor_keys`` the actor writes ``loc``, ``scale``, ``action``,
+    `sense` returns the features, and `encode` normalises each key of them to
+    ``("inputs", key)``, once for both networks and for all passes over a rollout. From
+    the inputs of ``actor_keys`` the actor writes ``loc``, ``scale``, ``action``,
     ``action_log_prob``; from those of ``critic_keys`` the critic writes
     ``state_value``.
 
     Args:
         sizes: Number of features of each key.
-        actor_keys: What the actor reads.
-        critic_keys: What the critic reads.
+        actor_keys: Keys that the actor reads.
+        critic_keys: Keys that the critic reads.
         num_actions: ``J``.
         config: Size and initialisation.
-        sources: What computes keys that the environment does not give, as sparse rows.
+        sources: Sparse sources of the keys that the environment does not output.
     """
 
     def __init__(
@@ -210,7 +211,7 @@ class Agent(nn.Module):
         def network(keys: Sequence[str], out: int, gain: float) -> KeyedMLP:
             return KeyedMLP([sizes[k] for k in keys], config.hidden, out, gain)
 
-        # A small last layer: the first actions stay near the default pose.
+        # A small last layer keeps the first actions near the default pose.
         self.head = GaussianHead(
             network(actor_keys, num_actions, 0.01),
             num_actions,
@@ -224,9 +225,9 @@ class Agent(nn.Module):
             in_keys=["loc", "scale"],
             out_keys=["action"],
             distribution_class=SharedStdNormal,
-            # TorchRL's default is the mean, with which PPO learns nothing.
+            # TorchRL's default is the mean, which does not explore.
             default_interaction_type=InteractionType.RANDOM,
-            # A check of every number, at every call, for what cannot happen.
+            # The check of all values at every call is slow and never fails here.
             distribution_kwargs={"validate_args": False},
             return_log_prob=True,
             log_prob_key="action_log_prob",
@@ -251,10 +252,10 @@ class Agent(nn.Module):
         )
 
     def sense(self, tensordict: TensorDictBase) -> TensorDict:
-        """Return the features that the networks read, as they are, by key.
+        """Return the features that the networks read, by key, not normalised.
 
         Args:
-            tensordict: Holds ``read_keys``, ``[B]``.
+            tensordict: Contains ``read_keys``, ``[B]``.
         """
         given = [key for key in self.critic_keys if key not in self.sources]
         features = TensorDict(
@@ -267,10 +268,10 @@ class Agent(nn.Module):
         return features
 
     def encode(self, features: TensorDictBase) -> TensorDict:
-        """Return what the networks read, under ``("inputs", key)``.
+        """Return the normalised network inputs, under ``("inputs", key)``.
 
         Args:
-            features: What `sense` returned, or what the actor needs of it, ``[B]``.
+            features: Result of `sense`, or the part that the actor needs, ``[B]``.
         """
         inputs = TensorDict(batch_size=features.batch_size, device=features.device)
         for key in (k for k in self.critic_keys if k in features.keys()):
@@ -287,5 +288,5 @@ class Agent(nn.Module):
 
 
 def input_keys(keys: Sequence[str]) -> list[NestedKey]:
-    """Return the keys under which `Agent.encode` writes what the networks read."""
+    """Return the keys under which `Agent.encode` writes the network inputs."""
     return [("inputs", key) for key in keys]

@@ -1,4 +1,4 @@
-"""Normalisers of what the networks read, by running statistics."""
+"""Normalisers of the network inputs, using running statistics."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ class RunningNorm(nn.Module):
     """Normalises features by the running mean and variance of all data seen.
 
     Statistics are kept in float64 and change only in `update`, never in a forward
-    pass: collection and learning see the same input.
+    pass, so collection and learning use the same inputs.
 
     Args:
         size: Number of features.
     """
 
-    # Normalised values beyond this many standard deviations are cut off.
+    # Normalised values are clipped to this many standard deviations.
     LIMIT = 10.0
     count: Tensor
     mean: Tensor
@@ -35,25 +35,25 @@ class RunningNorm(nn.Module):
         self.register_buffer("var", torch.ones(size, dtype=torch.float64))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return (x - mean) / std, times the gain and cut off, ``[*B, F]``."""
+        """Return (x - mean) / std, times the gain and clipped, ``[*B, F]``."""
         shift, scale, limit = self.constants(x.dtype)
         return ((x - shift) * scale).clamp(-limit, limit)
 
     def constants(self, dtype: torch.dtype) -> tuple[Tensor, Tensor, float]:
-        """Return shift and scale, ``[F]`` or ``[1]`` each, and limit of `forward`."""
+        """Return shift and scale of `forward`, ``[F]`` or ``[1]``, and its limit."""
         scale = self._gain * (self.var + 1e-8).rsqrt()
         return self.mean.to(dtype), scale.to(dtype), self._limit
 
     @torch.no_grad()
     def update(self, x: Tensor) -> None:
-        """Take a batch of data into the statistics, ``[*B, F]``."""
+        """Update the statistics with a batch of data, ``[*B, F]``."""
         x = x.reshape(-1, len(self.mean)).double()
         mean = x.mean(0)
         # Several times as fast as x.var(0).
         self._merge(float(len(x)), mean, (x - mean).square_().mean(0))
 
     def _merge(self, n: float, mean: Tensor, var: Tensor) -> None:
-        """Take mean and variance of n more into the statistics."""
+        """Update the statistics with mean and variance of n further samples."""
         total = self.count + n
         delta = mean - self.mean
         # Chan et al., parallel variance: M2 = M2a + M2b + delta^2 na nb / n.
@@ -66,37 +66,37 @@ class RunningNorm(nn.Module):
 class SignalNorm(RunningNorm):
     """Normalises a skin's signals by one mean and variance for all sensors.
 
-    What differs between sensors still does, and a sparse grid stays sparse. All
-    signals together have the variance ``WEIGHT``, be they three or thousands.
+    This keeps differences between sensors, and a sparse grid stays sparse. The total
+    variance of all signals is ``WEIGHT``, whatever their number.
 
     Args:
         features: Number of signals, ``F``.
     """
 
-    # That of 64 sensors of one number each; the actor knows 48 of its body.
+    # As for 64 sensors with one value each; the body gives the actor 48 values.
     WEIGHT = 64.0
 
     def __init__(self, features: int) -> None:
         super().__init__(1)
         self._gain = math.sqrt(self.WEIGHT / features)
-        # What is rare among thousands of beams is far from their mean: it stays.
+        # A rare detection among thousands of beams is far from the mean; not clipped.
         self._limit = self.LIMIT * max(self._gain, 1.0)
 
     def sparse(self, rows: SparseRows) -> SparseRows:
-        """Return what `forward` would, as sparse rows."""
+        """Return the result of `forward` for sparse rows, as sparse rows."""
         default = self(rows.value.new_full((1,), rows.default))
         return replace(rows, value=self(rows.value), default=float(default))
 
     @torch.no_grad()
     def update(self, x: Tensor | SparseRows) -> None:
-        """Take a batch of data into the statistics, ``[*B, F]``."""
+        """Update the statistics with a batch of data, ``[*B, F]``."""
         if isinstance(x, Tensor):
-            # In parts: a rollout of full grids takes gigabytes in float64.
+            # In parts, since a rollout of full grids takes gigabytes in float64.
             for part in x.reshape(-1, 1).split(2**22):
                 super().update(part)
             return
         values, n = x.value.double(), float(len(x) * x.size)
-        # All others are the default.
+        # All other values are the default.
         rest = n - len(values)
         mean = ((values.sum() + rest * x.default) / n).reshape(1)
         deviation = rest * (x.default - mean).square()

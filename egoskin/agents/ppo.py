@@ -22,12 +22,13 @@ from egoskin.agents.normalizers import RunningNorm
 from egoskin.bounds import COUNT, NOT_NEGATIVE, POSITIVE, SHARE, Interval, check_bounds
 from egoskin.sparse import SparseRows
 
-# Adaptive learning rate: bounds, and the largest factor of one update.
+# Adaptive learning rate: bounds, and the largest change factor per update.
 _LR_BOUNDS, _LR_FACTOR = (1e-5, 1e-2), 1.5
-# The divergence of an update is estimated on this many frames.
+# Number of frames on which the KL divergence of an update is estimated.
 _KL_FRAMES = 4096
-# Shares of a minibatch, whose gradients threads compute. Fixed: the last bits of their
-# sum depend on it. More would be smaller than what it costs to call PyTorch.
+# Number of shares of a minibatch whose gradients are computed in threads. It is fixed,
+# since the last bits of their sum depend on it. With more shares, the overhead of
+# calling PyTorch would dominate.
 _SHARES = 4
 
 
@@ -35,8 +36,8 @@ class NonFiniteError(RuntimeError):
     """A loss, gradient or weight is not finite; the agent must not be saved.
 
     Args:
-        text: What is not finite.
-        batch: The data it was met on.
+        text: Description of the value that is not finite.
+        batch: The data on which it occurred.
     """
 
     def __init__(self, text: str, batch: TensorDictBase) -> None:
@@ -55,37 +56,37 @@ class PPOConfig:
     network: NetworkConfig = field(default_factory=NetworkConfig)
     """Size and initialisation of actor and critic."""
     rollout_steps: Annotated[int, Interval(ge=1, le=100_000)] = 16
-    """Control steps each agent collects for one update."""
+    """Control steps per agent and update."""
     ppo_epochs: Annotated[int, Interval(ge=1, le=1000)] = 5
     """Passes over a rollout."""
     num_mini_batches: Annotated[int, COUNT] = 4
     """Minibatches in each pass."""
     gamma: Annotated[float, SHARE] = 0.995
-    """Discount for each control step."""
+    """Discount per control step."""
     gae_lambda: Annotated[float, SHARE] = 0.8
-    """Decay of the generalised advantage estimate that the actor learns from."""
+    """Decay of the generalised advantage estimate for the actor."""
     value_lambda: Annotated[float | None, SHARE] = 0.95
-    """Decay of the estimate that the critic learns from; None is gae_lambda."""
+    """Decay of the estimate for the critic's targets; None: gae_lambda."""
     noise_correlation: Annotated[float, Interval(ge=0, lt=1)] = 0.5
-    """Correlation of the exploration noise with that of the step before, within a
-    rollout (white noise at 60 Hz hardly moves a body)."""
+    """Correlation of the exploration noise between consecutive steps of a rollout
+    (white noise at 60 Hz hardly moves a body)."""
     noise_correlation_start: Annotated[int, NOT_NEGATIVE] = 16_000_000
-    """Frames before which the noise is white all the same."""
+    """Frames up to which the noise is white nevertheless."""
     clip_epsilon: Annotated[float, Interval(gt=0, le=1)] = 0.2
-    """Clip range of the probability ratio (its lower bound must have a logarithm)."""
+    """Clip range of the probability ratio (at most 1, for the log of 1 - epsilon)."""
     entropy_coeff: Annotated[float, NOT_NEGATIVE] = 0.003
-    """Weight of the entropy bonus at the start."""
+    """Initial weight of the entropy bonus."""
     entropy_frames: Annotated[int | None, COUNT] = 65_536_000
-    """It falls linearly to zero over this many frames; None keeps it."""
+    """Frames over which the entropy weight falls linearly to zero; None: constant."""
     critic_coeff: Annotated[float, POSITIVE] = 1.0
     """Weight of the value loss."""
     learning_rate: Annotated[float, POSITIVE] = 1e-3
-    """Adam's learning rate at the start."""
+    """Initial learning rate of Adam."""
     desired_kl: Annotated[float | None, POSITIVE] = 0.02
-    """Adapt it from update to update until one moves the policy by this divergence;
-    None keeps it."""
+    """KL divergence per update to which the learning rate is adapted; None: constant
+    learning rate."""
     max_grad_norm: Annotated[float, POSITIVE] = 1.0
-    """Gradient norm to clip at, for actor and critic separately."""
+    """Gradient norm limit, for actor and critic separately."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for values outside their ranges."""
@@ -117,10 +118,10 @@ def add_advantages(
     """Write ``advantage`` (normalised over the rollout) and ``value_target``.
 
     Args:
-        rollout: What `collect` returned, ``[T, N]``.
+        rollout: Result of `collect`, ``[T, N]``.
         gamma: Discount.
-        gae_lambda: Decay of the estimate.
-        value_lambda: Decay of the estimate that makes the targets; None for the same.
+        gae_lambda: Decay of the advantage estimate.
+        value_lambda: Decay of the estimate for the value targets; None for the same.
     """
 
     def estimate(decay: float) -> tuple[Tensor, Tensor]:
@@ -143,17 +144,17 @@ def add_advantages(
 
 
 class PPO:
-    """The update: TorchRL's clipped loss, Adam, adaptive learning rate.
+    """PPO update with TorchRL's clipped loss, Adam and an adaptive learning rate.
 
-    On a CPU threads of its own take shares of a minibatch: on networks this small,
-    PyTorch's threads would wait for each other more than they work. The number of
-    shares is fixed, so the result does not depend on the number of threads, as long as
-    the caller lets PyTorch itself use one (sums of long tensors depend on it).
+    On a CPU, a thread pool computes the gradients of shares of a minibatch: on networks
+    this small, PyTorch's own threads would mostly wait for each other. The number of
+    shares is fixed, so results do not depend on the number of threads, provided that
+    the caller limits PyTorch to one thread (sums of long tensors depend on that).
 
     Args:
-        agent: What is trained.
-        config: How.
-        num_threads: Threads that take the shares, if the agent is on a CPU.
+        agent: The agent to train.
+        config: Hyperparameters.
+        num_threads: Threads for the shares, if the agent is on a CPU.
     """
 
     def __init__(self, agent: Agent, config: PPOConfig, num_threads: int = 1) -> None:
@@ -165,11 +166,11 @@ class PPO:
             entropy_bonus=True,
             entropy_coeff=config.entropy_coeff,
             critic_coeff=config.critic_coeff,
-            # A metric of the whole rollout, not of each minibatch.
+            # Computed for the whole rollout, not for each minibatch.
             log_explained_variance=False,
             loss_critic_type="l2",
             normalize_advantage=False,
-            # Threads share the networks: no parameter is swapped in and out.
+            # Threads share the networks, so parameters must not be swapped in and out.
             functional=False,
         )
         self.loss.set_keys(sample_log_prob="action_log_prob")
@@ -195,15 +196,15 @@ class PPO:
             group["lr"] = rate
 
     def state(self) -> dict[str, Tensor]:
-        """Return the state of the optimiser by name."""
+        """Return the tensors of the optimiser state by name."""
         states = self.optimizer.state_dict()["state"].items()
         return {f"{i}/{key}": v for i, state in states for key, v in state.items()}
 
     def load_state(self, tensors: Mapping[str, Tensor], learning_rate: float) -> None:
-        """Put the optimiser into a state that `state` returned.
+        """Load a state of the optimiser that `state` returned.
 
         Raises:
-            ValueError: If it is that of other networks; nothing is loaded then.
+            ValueError: If it does not match the networks; nothing is loaded then.
         """
         content = self.optimizer.state_dict()
         expected, found = {}, {}
@@ -213,7 +214,7 @@ class PPO:
                 expected[f"{i}/{moment}"] = (vector.shape, vector.dtype)
         for name, value in tensors.items():
             found[name] = (value.shape, value.dtype)
-        # Before the first step there is none.
+        # Before the first step the state is empty.
         if found and found != expected:
             raise ValueError(
                 "the state of the optimiser is one of other networks, or of an older "
@@ -226,11 +227,11 @@ class PPO:
         self.learning_rate = learning_rate
 
     def update(self, rollout: TensorDict, frames: int = 0) -> dict[str, float]:
-        """Improve the agent on a rollout, then take it into the normalisers.
+        """Update the agent on a rollout, then update the normalisers with it.
 
         Args:
-            rollout: What `collect` returned, ``[T, N]``.
-            frames: Frames learnt from before it.
+            rollout: Result of `collect`, ``[T, N]``.
+            frames: Number of frames trained on before this rollout.
 
         Returns:
             Metrics by name.
@@ -279,19 +280,19 @@ class PPO:
         """Take one step of the optimiser on a minibatch.
 
         Args:
-            data: What `update` keeps of a rollout, ``[n]``.
-            index: The rows that are the minibatch, ``[m]`` int64.
+            data: Entries of a rollout that `update` selects, ``[n]``.
+            index: Rows of the minibatch, ``[m]`` int64.
 
         Returns:
             Metrics by name.
 
         Raises:
-            NonFiniteError: If a loss or gradient, then the agent is as it was before,
-                or a weight after the step is not finite.
+            NonFiniteError: If a loss or gradient is not finite (the agent is unchanged
+                then), or if a weight is not finite after the step.
         """
         shares = index.chunk(self.shares)
-        # The loss sets these global modes while it runs, and then what it met before:
-        # threads that overlap would leave the next rollout without exploration.
+        # The loss sets these global modes and restores the previous ones when it ends.
+        # With overlapping threads, the next rollout would be left without exploration.
         mode = set_exploration_type(self.loss.deterministic_sampling_mode)
         with mode, set_recurrent_mode(True):
             results = list(self._pool.map(partial(self._gradients, data), shares))
@@ -309,7 +310,7 @@ class PPO:
             network.grad.copy_(part)
             norms.append(nn.utils.get_total_norm([network.grad]))
         actor_norm, critic_norm = norms
-        # A loss that is not finite may have a gradient that is zero.
+        # A non-finite loss may have a zero gradient.
         total = metrics["loss_actor"] + metrics["loss_critic"]
         if not torch.isfinite(actor_norm + critic_norm + total):
             losses = (f"{k} {float(v)}" for k, v in metrics.items() if "loss" in k)
@@ -340,7 +341,7 @@ class PPO:
         """Return the gradient and metrics of the mean loss of some rows.
 
         Returns:
-            The gradient of all weights, one after the other, and metrics by name.
+            The concatenated gradient of all weights, and metrics by name.
         """
         batch = _rows(data.exclude("loc", "scale"), index)
         losses = self.loss(batch)
@@ -356,7 +357,7 @@ class PPO:
 
     @torch.no_grad()
     def _divergence(self, data: TensorDictBase, index: Tensor) -> float:
-        """Return that of the policy from the one that collected some rows."""
+        """Return the KL divergence of the policy from the one that collected rows."""
         part = _rows(data.select("inputs", "loc", "scale"), index)
         new = self.agent.head(*(part[key] for key in input_keys(self.agent.actor_keys)))
         return float(gaussian_kl(part["loc"], part["scale"], *new).mean())
@@ -364,10 +365,10 @@ class PPO:
     def _adapt_learning_rate(self, kl: float, desired: float) -> None:
         """Adapt the learning rate to the divergence of an update.
 
-        Once for each update: adapted at each minibatch, as others do, it overshoots
-        where the policy is sensitive, and swings by factors of a thousand.
+        This is done once per update. Adapted at each minibatch, as is common, the rate
+        overshoots where the policy is sensitive and varies by factors of a thousand.
         """
-        # The divergence goes with the square of the step.
+        # The divergence is proportional to the square of the step.
         factor = (desired / max(kl, 1e-12)) ** 0.5
         rate = self.learning_rate * min(max(factor, 1 / _LR_FACTOR), _LR_FACTOR)
         self.learning_rate = min(max(rate, _LR_BOUNDS[0]), _LR_BOUNDS[1])
@@ -381,15 +382,16 @@ def gaussian_kl(loc0: Tensor, scale0: Tensor, loc1: Tensor, scale1: Tensor) -> T
 
 
 def _weights(network: nn.Module) -> list[nn.Parameter]:
-    """Return what is learnt of a network."""
+    """Return the trainable parameters of a network."""
     return [p for p in network.parameters() if p.requires_grad]
 
 
 def _joint(network: nn.Module) -> nn.Parameter:
-    """Return what is learnt of a network as one vector, whose parts the layers share.
+    """Return the trainable parameters of a network as one vector.
 
-    An optimiser then takes one step, not one for each layer, for each of which it
-    wakes its threads: a twelfth of an update. Gradients are shared, too.
+    The layers and their gradients become views of it. The optimiser then takes one step
+    instead of one per layer, each of which wakes its threads; this saves a twelfth of
+    the time of an update.
     """
     weights = _weights(network)
     vector = nn.Parameter(nn.utils.parameters_to_vector(weights).detach())
@@ -402,7 +404,7 @@ def _joint(network: nn.Module) -> nn.Parameter:
 
 
 def _total(values: Iterable[Tensor]) -> Tensor:
-    """Return the sum of tensors, from the first on."""
+    """Return the sum of tensors, added in order."""
     return functools.reduce(torch.add, values)
 
 
@@ -414,7 +416,7 @@ def _sparse(value: NonTensorData) -> SparseRows:
 
 
 def _rows(data: TensorDictBase, index: Tensor) -> TensorDict:
-    """Return some rows, ``[m]``; data[index] would take four times as long."""
+    """Return some rows, ``[m]``; data[index] takes four times as long."""
     rows = TensorDict(batch_size=index.shape, device=data.device)
     for key, value in data.items():
         if isinstance(value, TensorDictBase):

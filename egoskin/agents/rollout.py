@@ -1,8 +1,8 @@
-"""Collection: what an agent meets in an environment, as PPO needs it.
+"""Collection of rollouts for PPO.
 
-Contract: a rollout keeps the values it bootstraps from, not the next observations;
-the value of a time-out is taken from the terminal observation, before the reset; and
-what a row meets does not depend on how many workers there are.
+Contract: a rollout keeps the values used for bootstrapping, not the next observations.
+The value of a time-out is that of the terminal observation, before the reset. The
+content of a row does not depend on the number of workers.
 """
 
 from __future__ import annotations
@@ -28,21 +28,22 @@ def collect(
     info_keys: Sequence[str] = (),
     noise_correlation: float = 0.0,
 ) -> tuple[TensorDict, TensorDictBase, list[TensorDict]]:
-    """Step an environment with an agent; return what PPO needs.
+    """Step an environment with an agent; return a rollout for PPO.
 
     Args:
         env: Batched environment; its batch ``[*B]`` is flattened to ``N`` rows.
-        agent: Chooses the actions, on its own device.
+        agent: Agent that chooses the actions, on its own device.
         root: Tensordict to start from.
         num_steps: Number of steps ``T``.
-        info_keys: What else to keep of what the environment says, for metrics.
-        noise_correlation: Of the noise with that of the step before.
+        info_keys: Further keys of the environment to return, for metrics.
+        noise_correlation: Correlation of the noise between consecutive steps.
 
     Returns:
-        The rollout ``[T, N]`` with the agent's ``inputs``, what it normalises, and
-        ``action``, ``action_log_prob``, ``loc``, ``scale``, ``state_value``,
-        ``next_state_value``, ``reward``, ``done``, ``terminated``, on its device; the
-        tensordict to go on from; and for each step the entries asked for.
+        The rollout ``[T, N]`` on the agent's device, with the agent's ``inputs``, the
+        features that it normalises, ``action``, ``action_log_prob``, ``loc``,
+        ``scale``, ``state_value``, ``next_state_value``, ``reward``, ``done``,
+        ``terminated``; the tensordict to continue from; and the entries of
+        ``info_keys`` for each step.
     """
     device = agent.head.log_std.device
     shape = (num_steps, root.numel(), len(agent.head.log_std))
@@ -72,19 +73,19 @@ def collect(
 def correlated_noise(
     shape: tuple[int, int, int], correlation: float, device: torch.device | None = None
 ) -> Tensor:
-    """Return standard normal noise, ``[T, N, J]``, that goes on from step to step.
+    """Return standard normal noise that is correlated in time, ``[T, N, J]``.
 
-    Each step's action is distributed as with white noise, and has that
-    log-probability: what is learnt is what a shift that lasts as long would do.
+    The action of each step has the same distribution and log-probability as with white
+    noise. PPO then learns the effect of an action shift that lasts several steps.
 
     Args:
         shape: Steps, rows, actions.
-        correlation: With the noise of the step before; 0 is white.
-        device: Device that draws it, with a generator of its own.
+        correlation: Correlation with the noise of the previous step; 0 is white noise.
+        device: Device that draws the noise, with its own generator.
     """
     noise = torch.randn(shape, device=device)
     if correlation:
-        # AR(1), whose variance stays 1.
+        # AR(1) process with variance 1.
         noise[1:] *= (1 - correlation**2) ** 0.5
         for before, after in zip(noise, noise[1:], strict=False):
             after.add_(before, alpha=correlation)
@@ -92,10 +93,10 @@ def correlated_noise(
 
 
 def _act(agent: Agent, state: TensorDictBase, noise: Tensor) -> TensorDict:
-    """Return what an agent reads of a state ``[n]``, and its noisy actions.
+    """Return an agent's inputs and noisy actions for a state ``[n]``.
 
-    That is ``inputs``, what it normalises, ``loc``, ``scale``, ``action`` and
-    ``action_log_prob``.
+    The entries are ``inputs``, the features that the agent normalises, ``loc``,
+    ``scale``, ``action`` and ``action_log_prob``.
     """
     features = _sense(agent, state)
     frame = agent.encode(features)
@@ -104,17 +105,17 @@ def _act(agent: Agent, state: TensorDictBase, noise: Tensor) -> TensorDict:
     frame["action"] = frame["loc"] + frame["scale"] * noise
     likelihood = agent.actor.build_dist_from_params(frame)
     frame["action_log_prob"] = likelihood.log_prob(frame["action"])
-    # For the statistics.
+    # For the statistics of the normalisers.
     return frame.update(features.select(*agent.norms))
 
 
 def _readable(agent: Agent, root: TensorDictBase) -> TensorDictBase:
-    """Return what an agent's senses read of an environment's output, ``[n]``."""
+    """Return the environment output that `Agent.sense` reads, ``[n]``."""
     return root.select(*agent.read_keys).reshape(-1)
 
 
 def _sense(agent: Agent, state: TensorDictBase) -> TensorDict:
-    """Return what the agent's networks read of a state ``[n]``, on its device."""
+    """Return the features of a state ``[n]``, on the agent's device."""
     return agent.sense(state.to(agent.head.log_std.device))
 
 
@@ -129,7 +130,7 @@ def _timed_out(steps: TensorDictBase) -> Tensor:
 
 
 def _joined(frames: Sequence[TensorDict]) -> TensorDict:
-    """Return frames ``[n]`` one after the other, ``[N]``."""
+    """Return concatenated frames ``[n]``, as ``[N]``."""
     if len(frames) == 1:
         return frames[0]
     joined = TensorDict(batch_size=[sum(map(len, frames))], device=frames[0].device)

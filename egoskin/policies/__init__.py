@@ -1,1 +1,1 @@
-"""A trained policy as a file."""
+"""Policy files and their export."""

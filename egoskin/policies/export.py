@@ -1,8 +1,8 @@
-"""A policy as an ONNX file: a graph, and as JSON all that a robot must know of it.
+"""Export a policy as an ONNX file: a graph, and JSON metadata for the robot.
 
 Contract: the graph has one input, ``observation [1, N]``, and one output, ``action
-[1, J]``, both float32; the normalisation is inside. The JSON is the metadata named
-`METADATA`. `egoskin.deploy` reads both without the rest of this package.
+[1, J]``, both float32; it includes the normalisation. The JSON is the metadata entry
+named `METADATA`. `egoskin.deploy` reads both without the rest of this package.
 """
 
 from __future__ import annotations
@@ -23,26 +23,26 @@ if TYPE_CHECKING:
     import onnx
 
 METADATA = "egoskin"
-"""Name of the metadata."""
-# Of 2020: onnxruntime 1.6 and TensorRT 8 read it. Nothing newer is needed.
+"""Name of the metadata entry."""
+# Versions of 2020, which onnxruntime 1.6 and TensorRT 8 can read.
 _OPSET, _IR_VERSION = 13, 7
-# Largest difference from PyTorch, in units of max(1, |action|): |action| is the largest
-# of all joints and of all observations of a size, for float32 itself rounds by a share
-# of what is summed, also where the sum happens to be small.
+# Largest difference from PyTorch, in units of max(1, |action|). |action| is the largest
+# over all joints and all observations of a size, because float32 rounding errors are
+# relative to the summands, even where their sum is small.
 _TOLERANCE = 1e-5
-# Sizes of the observations that are compared, tiny to absurd, and how many of each.
+# Sizes of the compared observations, tiny to unrealistic, and the number of each.
 _SIZES, _OF_EACH = tuple(10.0**power for power in range(-3, 7)), 100
 
 
 def observation_parts(policy: Policy) -> list[dict[str, Any]]:
-    """Return what the input of the graph is made of, in order.
+    """Return the parts of the graph input, in order.
 
     Args:
         policy: The policy.
 
     Returns:
-        ``name``, ``width``, ``unit`` and ``age`` of each part; the age is how many
-        control steps ago it was observed, more than 0 only with a history.
+        ``name``, ``width``, ``unit`` and ``age`` of each part. The age is the number of
+        control steps since the observation; it is above 0 only with a history.
     """
     config = policy.env_config
     joints = policy.policy_spec.num_actions
@@ -71,14 +71,14 @@ def observation_parts(policy: Policy) -> list[dict[str, Any]]:
 
 
 def metadata(policy: Policy, commit: str | None) -> dict[str, Any]:
-    """Return what a robot must know to run a policy, as JSON values.
+    """Return the metadata that a robot needs to run a policy, as JSON values.
 
-    Joints are in the order of ``joints`` throughout; poses of sensors are in the frames
-    of their links.
+    All joint values are in the order of ``joints``. Sensor poses are in the frames of
+    their links.
 
     Args:
         policy: The policy.
-        commit: Commit of the package that exports it, if it is known.
+        commit: Commit of the exporting package, if known.
     """
     config, robot = policy.env_config, policy.env_config.robot_config
     physics = config.task.physics
@@ -109,7 +109,7 @@ def metadata(policy: Policy, commit: str | None) -> dict[str, Any]:
         "previous_action": config.previous_action,
         "observation": observation_parts(policy),
         "sensor": to_plain(config.sensor),
-        # Of each sensor in the order of the skin: numbers it has in the signal.
+        # Number of signal values of each sensor, in the order of the skin.
         "readings": readings.tolist(),
         "range": [to_plain(value) for value in pipeline.skin.range.tolist()],
         "skin": pipeline.skin.to_dict(),
@@ -121,7 +121,7 @@ def to_onnx(policy: Policy, commit: str | None = None) -> onnx.ModelProto:
 
     Args:
         policy: The policy.
-        commit: Commit of the package that exports it, if it is known.
+        commit: Commit of the exporting package, if known.
     """
     import onnx
     from onnx import helper, numpy_helper
@@ -151,7 +151,7 @@ def to_onnx(policy: Policy, commit: str | None = None) -> onnx.ModelProto:
         helper.make_node("Max", ["scaled", "low"], ["above_low"]),
         helper.make_node("Min", ["above_low", "high"], ["hidden_0"]),
     ]
-    # The first layer is a sum over the keys: one layer of what is side by side here.
+    # The first layer is a sum over the keys; here it acts on the concatenation.
     first = [layer for layer in body.inputs if isinstance(layer, nn.Linear)]
     layers = [(torch.cat([layer.weight for layer in first], 1), first[0].bias)]
     layers += [(x.weight, x.bias) for x in body.tail if isinstance(x, nn.Linear)]
@@ -191,13 +191,13 @@ def to_onnx(policy: Policy, commit: str | None = None) -> onnx.ModelProto:
 def largest_difference(
     content: bytes, policy: Policy, observations: torch.Tensor
 ) -> float:
-    """Return how far onnxruntime is from PyTorch, in units of ``max(1, |action|)``.
+    """Return the deviation of onnxruntime from PyTorch, over ``max(1, |action|)``.
 
-    ``|action|`` is the largest of all joints and observations.
+    ``|action|`` is the largest over all joints and observations.
 
     Args:
         content: The ONNX file.
-        policy: What it was made of.
+        policy: The exported policy.
         observations: Inputs of the graph, ``[n, N]`` float32, all of one size.
     """
     import onnxruntime
@@ -219,14 +219,14 @@ def largest_difference(
 
 
 def sample_observations(policy: Policy, n: int, size: float) -> torch.Tensor:
-    """Return random observations of a size, ``[n, N]``.
+    """Return random observations of a given size, ``[n, N]``.
 
-    Signals that are shares stay shares, 0 and 1 more often than not.
+    Signals without unit stay in [0, 1]; more than half of them are 0 or 1.
 
     Args:
         policy: The policy.
-        n: How many.
-        size: Standard deviation of everything else, in its unit.
+        n: Number of observations.
+        size: Standard deviation of all other parts, in their units.
     """
     generator = torch.Generator().manual_seed(0)
     parts = []
@@ -238,21 +238,21 @@ def sample_observations(policy: Policy, n: int, size: float) -> torch.Tensor:
 
 
 def export_onnx(policy: Policy, commit: str | None = None) -> tuple[bytes, float]:
-    """Return a policy as an ONNX file, and how far that is from PyTorch.
+    """Return a policy as an ONNX file, and its deviation from PyTorch.
 
     Args:
         policy: The policy.
-        commit: Commit of the package that exports it, if it is known.
+        commit: Commit of the exporting package, if known.
 
     Raises:
-        ValueError: If it is farther than ``1e-5 max(1, |action|)``.
+        ValueError: If the deviation exceeds ``1e-5 max(1, |action|)``.
     """
     content = to_onnx(policy, commit).SerializeToString()
     difference = max(
         largest_difference(content, policy, sample_observations(policy, _OF_EACH, size))
         for size in _SIZES
     )
-    # The comparison is also False for NaN.
+    # Written so that NaN fails, too.
     if not difference <= _TOLERANCE:
         raise ValueError(
             f"the exported policy differs from PyTorch by {difference:.1e} x "

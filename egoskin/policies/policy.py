@@ -1,7 +1,8 @@
-"""Trained policies as self-contained files, for people who never train.
+"""Trained policies as self-contained files.
 
-A policy file holds weights, normaliser, skin, sensor and task. A checkpoint of a run
-holds the same and more, and is read alike. Some policies come with the package.
+A policy file contains weights, normaliser, skin, sensor and task. A checkpoint of a run
+contains the same and more, and is read in the same way. Some policies come with the
+package.
 """
 
 from __future__ import annotations
@@ -28,16 +29,16 @@ from egoskin.storage.tensor_file import load_tensors, part, prefixed, save_tenso
 
 CHECKPOINT_NAME = "checkpoint.safetensors"
 """Name of the latest checkpoint in a run folder."""
-# Names of what a policy file leaves out start with it.
+# Prefix of the tensor names that a policy file leaves out.
 _CRITIC = "critic."
-# Signals that are not normalised are metres, or shares of their range.
+# Signals that are not normalised are in metres, or fractions of the range.
 _LARGEST_SIGNAL = 1e6
 _SHIPPED = Path(__file__).parents[1] / "assets" / "policies"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class PolicySpec:
-    """Everything needed to build an agent and the environment it was made for."""
+    """Everything needed to build an agent and its environment."""
 
     env: EnvConfig
     """Robot, task, sensors."""
@@ -46,13 +47,13 @@ class PolicySpec:
     network: NetworkConfig
     """Size of the networks."""
     sizes: Mapping[str, int]
-    """Number of features of each key read."""
+    """Number of features of each key that the networks read."""
     num_actions: int
     """Number of actions ``J``."""
     frames: int = 0
-    """Environment steps it was trained for."""
+    """Number of environment steps of the training."""
     engine: Engine = "mujoco"
-    """What simulated in its training."""
+    """Physics engine used in training."""
 
     @classmethod
     def of(
@@ -66,11 +67,11 @@ class PolicySpec:
         """Return the specification for an environment.
 
         Args:
-            config: What the environment was made of.
-            skin: Its skin.
+            config: Configuration of the environment.
+            skin: Skin of the environment.
             network: Size of the networks.
             env: The environment.
-            sources: What computes the keys that it does not give.
+            sources: Sparse sources of the keys that it does not output.
         """
         spec = env.observation_spec
         return cls(
@@ -88,7 +89,7 @@ class PolicySpec:
         """Return a fresh agent.
 
         Args:
-            sources: What computes keys that its environment does not give.
+            sources: Sparse sources of the keys that its environment does not output.
         """
         return Agent(
             self.sizes,
@@ -100,12 +101,12 @@ class PolicySpec:
         )
 
     def check_claims(self, tensors: Mapping[str, Tensor], what: str) -> None:
-        """Raise ValueError unless tensors are those of an agent of these sizes.
+        """Raise ValueError unless tensors match an agent with these sizes.
 
-        It takes no memory for the agent, however large it claims to be.
+        The agent is not allocated, so wrong sizes cannot exhaust the memory.
 
         Args:
-            tensors: Those of the file that the specification is from.
+            tensors: Tensors of the file that holds the specification.
             what: Name of the file.
         """
         hidden = self.network.hidden
@@ -135,10 +136,10 @@ class PolicySpec:
 
     @classmethod
     def from_header(cls, header: Mapping[str, Any], what: str) -> PolicySpec:
-        """Return the specification that `header` described.
+        """Return the specification from the result of `header`.
 
         Raises:
-            ValueError: If it is no such description.
+            ValueError: If the header is not valid.
         """
         if not isinstance(header, Mapping):
             raise ValueError(f"{what} holds no policy: it must be an object")
@@ -173,10 +174,10 @@ class PolicySpec:
 
 
 def sparse_sources(config: EnvConfig, skin: Skin) -> dict[str, SparseSource]:
-    """Return what computes the keys that are better learnt from as sparse rows.
+    """Return the sources of the keys that are used in sparse form in training.
 
     Args:
-        config: What the environment is made of.
+        config: Configuration of the environment.
         skin: The sensors.
     """
     if config.history > 1:
@@ -186,19 +187,19 @@ def sparse_sources(config: EnvConfig, skin: Skin) -> dict[str, SparseSource]:
 
 
 def agent_tensors(agent: Agent) -> dict[str, Tensor]:
-    """Return all parameters and buffers of an agent by name, each once."""
+    """Return all parameters and buffers of an agent by name."""
     return {**dict(agent.named_parameters()), **dict(agent.named_buffers())}
 
 
 def check_agent_tensors(
     own: Mapping[str, Tensor], tensors: Mapping[str, Tensor], what: str
 ) -> None:
-    """Raise ValueError unless tensors are those of an agent, or of one without critic.
+    """Raise ValueError unless tensors match an agent, with or without its critic.
 
     Args:
-        own: What `agent_tensors` returned for the agent.
-        tensors: What is to be loaded.
-        what: Where it came from, for the error text, which names the tensor.
+        own: Result of `agent_tensors` for the agent.
+        tensors: Tensors to load.
+        what: Origin of the tensors, for the error text, which names the tensor.
     """
     missing = own.keys() - tensors.keys()
     if not any(name.startswith(_CRITIC) for name in tensors):
@@ -211,7 +212,7 @@ def check_agent_tensors(
 def check_like(
     own: Mapping[str, Tensor], tensors: Mapping[str, Tensor], what: str
 ) -> None:
-    """Raise ValueError if a tensor is unknown or of another shape or type than ours."""
+    """Raise ValueError if a tensor is unknown or has another shape or type."""
     for name, value in tensors.items():
         if name not in own:
             raise ValueError(f"{what}: tensor {name!r} is none that is known here")
@@ -228,11 +229,11 @@ def _kind(value: Tensor) -> str:
 
 @torch.no_grad()
 def load_agent_tensors(agent: Agent, tensors: Mapping[str, Tensor], what: str) -> None:
-    """Copy tensors into an agent; without any of its critic, that stays as it is.
+    """Copy tensors into an agent; the critic is unchanged if they do not include it.
 
     Raises:
-        ValueError: If a name, shape or type does not fit, or a tensor is missing; the
-            agent is then as it was.
+        ValueError: If a name, shape or type does not match, or a tensor is missing; the
+            agent is then unchanged.
     """
     own = agent_tensors(agent)
     check_agent_tensors(own, tensors, what)
@@ -242,19 +243,19 @@ def load_agent_tensors(agent: Agent, tensors: Mapping[str, Tensor], what: str) -
 
 @torch.no_grad()
 def check_finite(agent: Agent, what: str) -> None:
-    """Raise ValueError if an agent can give an action that is not finite.
+    """Raise ValueError if an agent could output an action that is not finite.
 
     Args:
         agent: The agent, loaded.
-        what: Where it came from, for the error text.
+        what: Origin of the agent, for the error text.
     """
     for name, value in agent_tensors(agent).items():
-        # All is computed in float32, however it is kept.
+        # Computations use float32, whatever the stored type.
         if not value.float().isfinite().all():
             raise ValueError(f"{what} is damaged: tensor {name!r} is not finite")
         if name.endswith(".var") and (value < 0).any():
             raise ValueError(f"{what} is damaged: tensor {name!r} is negative")
-    # No sum is larger than that of the magnitudes, with all inputs at their largest.
+    # The sum of the magnitudes, with all inputs at their maximum, bounds every sum.
     body = copy.deepcopy(agent.head.body)
     for weight in body.parameters():
         weight.abs_()
@@ -286,13 +287,13 @@ def save_policy(path: Path, agent: Agent, spec: PolicySpec) -> None:
 class Policy(TensorDictModuleBase):
     """A trained actor that writes its mean action.
 
-    A TensorDict module like any other: for ``env.rollout``, a TorchRL collector,
-    ``TensorDictSequential``, `torch.compile`, `torch.vmap`. Called with the tensors of
-    ``in_keys`` in their order, it returns the action.
+    It is a regular TensorDict module, usable with ``env.rollout``, TorchRL collectors,
+    ``TensorDictSequential``, `torch.compile` and `torch.vmap`. When called with the
+    tensors of ``in_keys``, in that order, it returns the action.
 
     Args:
         agent: Agent whose actor is used; its parameters no longer require gradients.
-        policy_spec: What it was made for.
+        policy_spec: Specification of the agent and its environment.
     """
 
     def __init__(self, agent: Agent, policy_spec: PolicySpec) -> None:
@@ -300,7 +301,7 @@ class Policy(TensorDictModuleBase):
         self.policy_spec = policy_spec
         self.in_keys, self.out_keys = agent.actor_keys, ["action"]
         self.head = agent.head.requires_grad_(False)
-        """Network of the action."""
+        """Network that outputs the action distribution."""
         self.norms = nn.ModuleDict(
             {key: agent.norms[key] for key in agent.actor_keys if key in agent.norms}
         )
@@ -313,12 +314,12 @@ class Policy(TensorDictModuleBase):
 
     @property
     def skin(self) -> Skin:
-        """The skin it was trained with."""
+        """The skin the policy was trained with."""
         return self.policy_spec.skin
 
     @property
     def spec(self) -> Composite:
-        """TorchRL's spec of what it writes."""
+        """TorchRL spec of the output."""
         weight = self.head.log_std
         return Composite(
             action=Unbounded(weight.shape, device=weight.device, dtype=weight.dtype)
@@ -332,9 +333,8 @@ class Policy(TensorDictModuleBase):
         of the policy's parameters.
 
         Raises:
-            KeyError: If a key is missing; the text names what is needed.
-            ValueError: If a key holds another number of features than it was trained
-                with.
+            KeyError: If a key is missing; the text names the required keys.
+            ValueError: If a key has another number of features than in training.
         """
         return tensordict.set("action", self._mean(tensordict))
 
@@ -386,12 +386,12 @@ def load_policy(path: str | Path) -> Policy:
     """Return the policy of a policy file, a checkpoint, a run folder or a name.
 
     Args:
-        path: The file, or a run folder (its latest checkpoint); or, where there is no
-            such file, one of `shipped_policies`.
+        path: A file, a run folder (for its latest checkpoint) or, if there is no such
+            path, one of `shipped_policies`.
 
     Returns:
         A module that reads `Policy.in_keys` of a TensorDict and writes the mean
-        ``action``; `Policy.env_config` and `Policy.skin` say what it was made for.
+        ``action``. `Policy.env_config` and `Policy.skin` hold its environment and skin.
 
     Raises:
         ValueError: If there is no policy; the text says why.
@@ -401,9 +401,9 @@ def load_policy(path: str | Path) -> Policy:
 
 
 def load_critic(path: str | Path) -> Critic | None:
-    """Return the critic that was trained with a policy; None if the file holds none.
+    """Return the critic that was trained with a policy; None if the file has none.
 
-    Checkpoints of runs hold one, policy files do not.
+    Checkpoints of runs contain a critic, policy files do not.
 
     Args:
         path: As in `load_policy`.
@@ -419,7 +419,7 @@ def policy_file(path: str | Path) -> Path:
     """Return the file that `load_policy` reads.
 
     Raises:
-        ValueError: If there is none; the text says why.
+        ValueError: If there is no such file; the text says why.
     """
     path = Path(path)
     if not path.exists():
@@ -438,7 +438,7 @@ def policy_file(path: str | Path) -> Path:
 
 
 def _load_agent(path: Path) -> tuple[Agent, PolicySpec, bool]:
-    """Return the agent of a file, what it was made for, and if its critic is there."""
+    """Return the agent of a file, its specification, and whether it has a critic."""
     tensors, header = load_tensors(path)
     spec = PolicySpec.from_header(header.get("policy", {}), str(path))
     own = part("agent", tensors)

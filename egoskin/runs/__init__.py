@@ -1,1 +1,1 @@
-"""A training run as a folder: configuration, trainer, metrics."""
+"""Training runs: run folder, configuration, trainer and metrics."""

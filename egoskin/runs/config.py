@@ -1,4 +1,4 @@
-"""What a training is made of, and how a command line says it."""
+"""Configuration of a training, and its command line."""
 
 from __future__ import annotations
 
@@ -28,52 +28,52 @@ from egoskin.storage.serialization import (
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig:
-    """Train a robot to dodge balls by what its skin feels."""
+    """Train a robot to dodge balls with a skin of proximity sensors."""
 
     env: Annotated[EnvConfig, tyro.conf.arg(name="")] = field(default_factory=EnvConfig)
     """Robot, task, skin, sensors."""
     ppo: PPOConfig = field(default_factory=PPOConfig)
     """Networks and PPO."""
     standard: Standard | None = None
-    """Version of the standard throw: sets throws and ends. None: 2, the defaults. A
-    throw or end given beside it makes the task custom."""
+    """Version of the standard throw: sets throws and ends of episodes. None: 2, the
+    defaults. Changing a throw or end in addition makes the task custom."""
     seed: int = 0
-    """Seed of everything random: throws, starts, networks, actions."""
+    """Seed of all random numbers: throws, starts, networks, actions."""
     total_frames: Annotated[int, COUNT] = 65_536_000
     """Environment steps of the whole run (the paper's 1000 epochs)."""
     num_envs: int = 4096
     """Agents simulated in parallel."""
     num_workers: int | None = None
-    """Processes that simulate; None: the largest divisor of num_envs <= cores. Engine
-    warp needs none."""
+    """Simulation processes; None: the largest divisor of num_envs <= cores. Not used by
+    engine warp."""
     engine: Engine = "mujoco"
-    """What simulates: MuJoCo on the CPU; MuJoCo Warp on the device, made for a GPU
+    """Physics engine: MuJoCo on the CPU, or MuJoCo Warp on the device, made for a GPU
     (extra gpu)."""
     device: str = "cpu"
     """Device of the learner, and of engine warp ("cpu", "cuda", "cuda:1")."""
     learner_threads: Annotated[int | None, COUNT] = None
-    """Threads of the learner; None: one for each core."""
+    """Threads of the learner; None: one per core."""
     run_dir: Path | None = None
     """Folder of the run; None: a new one under runs/, named after time and sensor."""
     snapshot_frames: Annotated[int, COUNT] = 5_000_000
-    """Environment steps between the policies kept for learning curves."""
+    """Environment steps between the policies saved for learning curves."""
     film_every: Annotated[int | None, COUNT] = None
     """Environment steps between small films of the policy, in films/ of the run folder;
-    None: none."""
+    None: no films."""
     log: Literal["files", "wandb"] = "files"
-    """Where metrics go: metrics.csv and TensorBoard files; wandb: Weights & Biases, too
+    """Where metrics go: metrics.csv and TensorBoard files; wandb: also Weights & Biases
     (extra wandb)."""
     checkpoint_interval: Annotated[float, POSITIVE] = 60.0
-    """A checkpoint is at most this old [s]."""
+    """Maximum age of the latest checkpoint [s]."""
     config: Path | None = None
-    """config.json of a run to repeat: what it holds are the defaults, and the skin must
-    come out the same."""
+    """config.json of a run to repeat: its values are the defaults, and the skin must be
+    the same."""
     resume: Path | None = None
-    """Run folder to go on with; changed may be --total-frames, to a later end, and what
-    changes no result: workers, threads, when checkpoints and policies are kept."""
+    """Run folder to resume. Only --total-frames (to a later end) may change, and what
+    changes no result: workers, threads, intervals of checkpoints and policies."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for values with which no run can start."""
+        """Raise ValueError for invalid values."""
         check_bounds(self)
         check_seed(self.seed)
         check_num_workers(self.num_envs, self.num_workers)
@@ -100,7 +100,7 @@ class TrainConfig:
 
     @property
     def frames_per_batch(self) -> int:
-        """Environment steps of one rollout."""
+        """Number of environment steps per rollout."""
         return self.num_envs * self.ppo.rollout_steps
 
     @property
@@ -109,7 +109,7 @@ class TrainConfig:
         return self.learner_threads or available_cores()
 
     def check_machine(self) -> None:
-        """Raise ValueError for what this machine lacks: the device, the engine."""
+        """Raise ValueError if this machine lacks the device or the engine."""
         self.learner_device()
         engine_of(self.engine)
 
@@ -123,7 +123,7 @@ class TrainConfig:
 
 
 CALL_FIELDS = ("run_dir", "resume", "config", "standard")
-"""Fields that say how a run was called: its stored configuration leaves them out."""
+"""Fields of the command line only; the stored configuration omits their values."""
 MACHINE_FIELDS = frozenset(
     (
         *CALL_FIELDS,
@@ -135,26 +135,26 @@ MACHINE_FIELDS = frozenset(
         "checkpoint_interval",
     )
 )
-"""Fields that say how a run was called, where it is computed and what is kept of it:
-they change no result, to the last bit, and may change at a resume. The device is none
-of them: sums on another one round otherwise."""
+"""Fields for the call, the machine and the saved files of a run. They may change on
+resume, because results do not depend on them, bit for bit. The device is not included:
+rounding of sums differs between devices."""
 SKIN_HASH = "skin_sha256"
-"""What config.json holds beside the configuration: the hash of the skin."""
+"""Key of the hash of the skin in config.json, beside the configuration."""
 
 
 def parse_config(args: list[str]) -> TrainConfig:
     """Return the configuration of a command line.
 
-    With ``--config FILE`` a stored configuration is the default. With ``--resume RUN``
-    that of the run is, and no field but ``total_frames`` and `MACHINE_FIELDS` may
-    differ from it.
+    With ``--config FILE``, the defaults come from a stored configuration. With
+    ``--resume RUN``, they come from the run, and only ``total_frames`` and
+    `MACHINE_FIELDS` may differ from it.
 
     Args:
         args: Arguments, without the program's name.
 
     Raises:
-        ValueError: If a field is changed that may not be, or the end lies before the
-            one planned.
+        ValueError: If a field is changed that must not change, or the end is before the
+            planned one.
     """
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     for name in ("--resume", "--config", "--standard"):
@@ -168,7 +168,7 @@ def parse_config(args: list[str]) -> TrainConfig:
         raise ValueError("--resume goes on with a run, --config repeats one: not both")
     path = Path(given.resume)
     stored = load_config(path)
-    # What the file lacks was filled with today's defaults.
+    # Fields missing in the file were filled with the current defaults.
     file, before = path / "config.json", to_plain(stored)
     absent = changed_fields(read_config(file)[0], before)
     if lacking := [name for name in absent if name not in MACHINE_FIELDS]:
@@ -197,13 +197,13 @@ def parse_config(args: list[str]) -> TrainConfig:
 
 
 def _default_of(given: argparse.Namespace) -> TrainConfig:
-    """Return what a new run is made of where its command line says nothing.
+    """Return the default configuration of a new run.
 
     Args:
-        given: What it says of ``config`` and ``standard``, each a text or None.
+        given: Options ``config`` and ``standard``, each a text or None.
 
     Raises:
-        ValueError: If there is no such configuration, or both are given.
+        ValueError: If the configuration does not exist, or both are given.
     """
     if given.config is not None:
         if given.standard is not None:
@@ -227,10 +227,10 @@ def load_config(path: Path, *, quiet: bool = False) -> TrainConfig:
 
     Args:
         path: The folder.
-        quiet: Whether to say nothing of a file without a seal.
+        quiet: Whether to accept a file without a seal silently.
 
     Raises:
-        ValueError: If it is none, or its configuration is damaged.
+        ValueError: If it is not a run folder, or its configuration is damaged.
     """
     file = path / "config.json"
     if not file.is_file():
@@ -241,14 +241,14 @@ def load_config(path: Path, *, quiet: bool = False) -> TrainConfig:
 def read_config(
     file: Path, *, quiet: bool = False
 ) -> tuple[dict[str, Any], str | None]:
-    """Return (configuration in the present format, hash of the skin if it holds one).
+    """Return (configuration in the current format, hash of the skin or None).
 
     Args:
         file: The file.
-        quiet: Whether to say nothing of one without a seal.
+        quiet: Whether to accept a file without a seal silently.
 
     Raises:
-        ValueError: If it is damaged, or has options that are no more.
+        ValueError: If it is damaged, or has options that no longer exist.
     """
     content, number = read_sealed(file, quiet=quiet)
     skin = content.pop(SKIN_HASH, None)

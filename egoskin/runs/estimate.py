@@ -1,4 +1,4 @@
-"""How long a training will take here, before it starts."""
+"""Estimate of the duration of a training on this machine."""
 
 from __future__ import annotations
 
@@ -10,28 +10,29 @@ from egoskin.make import check_num_workers, make_worker_env
 from egoskin.runs.config import TrainConfig
 from egoskin.sensors import Skin
 
-# What is stepped: agents, and rollouts of some steps. The first warms up; in the last
-# robots fall, as they do in training.
+# Numbers of agents, of steps per rollout and of rollouts. The first rollout is warm-up;
+# in the last ones robots fall, as in training.
 _AGENTS, _STEPS, _ROLLOUTS = 256, 12, 3
 
 
 def estimate_seconds(config: TrainConfig, skin: Skin, frames: int) -> float:
-    """Return about how long some environment steps of a training take here [s].
+    """Estimate the time for environment steps of a training on this machine [s].
 
-    The environments of a few agents are stepped for a second: so few are slower for
-    each agent than a worker's, by about what learning takes. Networks far larger than
-    the default's, and cores that others use later, make it longer.
+    The environments of a few agents are stepped for a second. So few agents take more
+    time per agent than in a worker, by about the time of learning. Training takes
+    longer if networks are far larger than the default or if other processes use the
+    cores.
 
     Args:
         config: The training.
         skin: Its skin.
-        frames: Environment steps.
+        frames: Number of environment steps.
     """
     agents = min(_AGENTS, config.num_envs)
     threads, times = torch.get_num_threads(), []
     torch.set_num_threads(1)
     try:
-        # Random actions are drawn here, and the training must not notice.
+        # Random actions drawn here must not change the random state of the training.
         with torch.random.fork_rng(devices=[]):
             env = make_worker_env(config.env, skin, num_envs=agents, seed=0)
             state = env.reset()

@@ -1,7 +1,7 @@
-"""TensorBoard files, written at once and without a thread.
+"""TensorBoard files, written synchronously without a thread.
 
-torch's own writer hands events to a thread, which on a full disk dies with a traceback
-of its own; here an error is raised where it happens, as an OSError.
+torch's writer passes events to a thread, which dies with its own traceback on a full
+disk. Here the error is raised in the caller, as an OSError.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ _PREFIX = "events.out.tfevents."
 
 
 class EventFile:
-    """A new file of scalars in a run folder.
+    """A new TensorBoard file of scalars in a run folder.
 
     Args:
         folder: The folder.
-        frames: Environment steps done before; TensorBoard forgets what older files
-            hold after these.
+        frames: Environment steps done so far; TensorBoard discards later steps from
+            older files.
     """
 
     def __init__(self, folder: Path, frames: int) -> None:
-        # TensorBoard reads files in the order of their names: this must be the last,
-        # though the clock was set back.
+        # TensorBoard reads files in the order of their names: this one must come last,
+        # even if the clock was set back.
         times = [_time_of(path.name) for path in folder.glob(f"{_PREFIX}*")]
         now = max([time.time_ns(), *(ns + 1 for ns in times)])
         name = f"{_PREFIX}{now:019d}.{socket.gethostname()}.{os.getpid()}"
         self._path = folder / name
-        # Unbuffered: nothing is left that closing could fail to write.
+        # Unbuffered, so that closing has nothing left to write and cannot fail.
         file = open(self._path, "xb", buffering=0)  # noqa: SIM115
         self._writer = RecordWriter(file)
         start = SessionLog(status=SessionLog.START)
@@ -60,7 +60,7 @@ class EventFile:
         try:
             self._writer.write(event.SerializeToString())
         except OSError as error:
-            # The system's own text of a full disk names no file.
+            # The system's error text for a full disk does not name the file.
             raise OSError(error.errno, error.strerror, str(self._path)) from error
 
     def close(self) -> None:
@@ -69,6 +69,6 @@ class EventFile:
 
 
 def _time_of(name: str) -> int:
-    """Return the time in the name of a file of events [ns], 0 if there is none."""
+    """Return the time in the name of an event file [ns], 0 if there is none."""
     time_ns = name.removeprefix(_PREFIX).partition(".")[0]
     return int(time_ns) if time_ns.isdecimal() and len(time_ns) == 19 else 0

@@ -1,6 +1,6 @@
-"""Small films of a policy while it is trained, each made by a process of its own.
+"""Small films of a policy during training, each made by a separate process.
 
-Training goes on meanwhile, and a film that fails costs a line on stderr.
+Training continues meanwhile; if a film fails, a note is printed to stderr.
 """
 
 from __future__ import annotations
@@ -12,12 +12,13 @@ from pathlib import Path
 from types import TracebackType
 
 _SIZE, _FPS = ("480", "270"), "20"
-# The longest of this many episodes tells more than any one; of it the first seconds.
+# A film shows the first seconds of the longest of this many episodes, which is more
+# informative than a random one.
 _EPISODES, _SECONDS = "4", "5"
 
 
 class FilmMaker:
-    """Makes films in the folder ``films`` of a run, one after the other.
+    """Makes films in the folder ``films`` of a run, one after another.
 
     Args:
         folder: The run folder.
@@ -37,20 +38,20 @@ class FilmMaker:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        """Let the last film be finished, if training ended well; else stop it."""
+        """Finish the last film if training ended normally; otherwise stop it."""
         if kind is not None and self._process is not None:
             self._process.terminate()
         self._finish()
 
     def start(self, policy: Path) -> None:
-        """Begin the film of a policy file; one still being made is finished first."""
+        """Start the film of a policy file, after waiting for the previous film."""
         self._finish()
         self._folder.mkdir(exist_ok=True)
         self._film = self._folder / f"{policy.stem}.mp4"
         command = [sys.executable, "-m", "egoskin", "film", str(policy)]
         command += ["--out", str(self._film), "--standard", "run", "--fps", _FPS]
         command += ["--size", *_SIZE, "--longest-of", _EPISODES, "--seconds", _SECONDS]
-        # The package may be imported from a clone, from anywhere.
+        # The package may be imported from a clone, in any working directory.
         path = [str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH")]
         self._process = subprocess.Popen(
             command,
@@ -59,7 +60,7 @@ class FilmMaker:
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             text=True,
-            # Ctrl-C is for the training, which then ends this.
+            # Ctrl-C must only reach the training, which then ends this process.
             start_new_session=True,
         )
 

@@ -1,20 +1,20 @@
-"""A training run is a folder: configuration, metrics, checkpoints, policies.
+"""The folder of a training run: configuration, metrics, checkpoints, policies.
 
     config.json              the resolved configuration
     skin.json                the sensors
     versions.json            packages, machine, git state, command of each start
     metrics.csv              one line for each rollout; TensorBoard files beside it
-    checkpoint.safetensors   everything needed to go on, at most a minute old
-    policies/<frames>.safetensors   self-contained policies, from the first on
-    films/<frames>.mp4, .png   films of them, if asked for
-    not-finite-<frames>.safetensors   an update that failed, for ``egoskin replay``
-    lock                     held by the process that trains
+    checkpoint.safetensors   everything needed to resume, at most a minute old
+    policies/<frames>.safetensors   self-contained policies, from the start on
+    films/<frames>.mp4, .png   films of the policies, if requested
+    not-finite-<frames>.safetensors   a failed update, for ``egoskin replay``
+    lock                     locked by the training process
 
-Contract: a checkpoint is written atomically, metrics written after it are dropped on
-resume, and one process trains at a time, so that a log has neither a gap nor a
-repetition. A checkpoint holds the configuration it was trained with, a hash of the
-skin, and both logs: a run whose files were edited, exchanged or damaged either goes on
-as if they had not been, or does not.
+Contract: checkpoints are written atomically, metrics written after the checkpoint are
+dropped on resume, and only one process trains at a time, so that logs have no gaps or
+repetitions. A checkpoint contains the configuration of the training, a hash of the skin
+and both logs. A run whose files were edited, exchanged or damaged either continues as
+if they were unchanged, or does not continue.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ _PACKAGES += ("pytorch-kinematics", "gymnasium")
 _WARP_PACKAGES = ("mujoco-warp", "warp-lang")
 
 
-# Where a checkpoint keeps the metrics.
+# Name of the metrics tensor in a checkpoint.
 _METRICS = "log/metrics"
 
 
@@ -102,17 +102,17 @@ class Run:
         self._events: EventFile | None = None
         self._wandb: WandbLog | None = None
         self._skin_hash = ""
-        # The logs up to now: a line for each rollout, an entry for each start.
+        # The logs so far: a line for each rollout, an entry for each start.
         self._metrics = ""
         self._starts: list[dict[str, Any]] = []
 
     @classmethod
     def create(cls, config: TrainConfig) -> Run:
-        """Return a new run folder that holds the configuration and the skin.
+        """Create a run folder with the configuration and the skin; return the run.
 
         Raises:
-            ValueError: If the folder holds anything already, the skin is none or not
-                that of the run to repeat, or there is too little memory.
+            ValueError: If the folder is not empty, the skin is not valid or not that of
+                the run to repeat, or there is too little memory.
         """
         skin = config.env.skin.build(config.env.robot_config)
         _check_repeats(config, skin)
@@ -135,21 +135,21 @@ class Run:
         except OSError as error:
             raise named(error, run.skin_path) from error
         run._skin_hash = content_hash(read_json(run.skin_path))
-        # Last: a folder with a configuration can be resumed.
+        # Written last, because a folder with a configuration can be resumed.
         run.write_config()
         return run
 
     @classmethod
     def open(cls, path: Path) -> Run:
-        """Return an existing run folder.
+        """Open an existing run folder.
 
         Raises:
-            ValueError: If it is none.
+            ValueError: If it is not a run folder.
         """
         return cls(path, load_config(path))
 
     def write_config(self) -> None:
-        """Write the configuration (again, with a later end) and the skin's hash."""
+        """Write the configuration (again with a later end) and the skin's hash."""
         content = to_plain(self.config)
         for name in CALL_FIELDS:
             content[name] = None
@@ -160,7 +160,7 @@ class Run:
         """Return the skin the run was started with.
 
         Raises:
-            ValueError: If there is none, or it is another.
+            ValueError: If it is missing or has changed.
         """
         skin = Skin.load(self.skin_path)
         self._skin_hash = content_hash(read_json(self.skin_path))
@@ -173,13 +173,13 @@ class Run:
         return skin
 
     def _trained_with(self) -> dict[str, Any]:
-        """Return what decides the run's results: its configuration, the skin's hash."""
+        """Return the configuration and skin hash that determine the results."""
         free = MACHINE_FIELDS | {"total_frames"}
         content = {k: v for k, v in to_plain(self.config).items() if k not in free}
         return {**content, SKIN_HASH: self._skin_hash}
 
     def _check_trained_with(self, before: Mapping[str, Any]) -> None:
-        """Raise ValueError if a checkpoint was trained with anything else."""
+        """Raise ValueError if a checkpoint was trained with another setup."""
         changed = changed_fields(dict(before), self._trained_with())
         if SKIN_HASH in changed:
             raise ValueError(
@@ -197,13 +197,13 @@ class Run:
         """Return versions, machine, git state and command of each start so far.
 
         Raises:
-            ValueError: If the file that says so is damaged.
+            ValueError: If the file of this log is damaged.
         """
         if not self._versions_path.exists():
             return []
         content, what = read_json(self._versions_path), str(self._versions_path)
         if isinstance(content, list):
-            # So it was in format 1.
+            # Format 1.
             return unseal({"starts": content}, what)[0]["starts"]
         if not isinstance(content, dict) or "sha256" not in content:
             raise ValueError(f"{what} is damaged or was edited")
@@ -212,7 +212,7 @@ class Run:
     def record_start(self) -> None:
         """Add versions, machine, git state and command of this start to the log."""
         try:
-            # What was started after the latest checkpoint is in the file alone.
+            # Starts after the latest checkpoint are only in the file.
             starts = self.starts() or self._starts
             if starts[: len(self._starts)] != self._starts:
                 raise ValueError(f"{self._versions_path} is that of another run")
@@ -234,7 +234,7 @@ class Run:
         write_file(self._versions_path, sealed_json({"starts": self._starts}))
 
     def _put_aside(self, path: Path, why: str) -> None:
-        """Rename a damaged log, over no other file, and say so."""
+        """Rename a damaged log without overwriting a file, and print a note."""
         names = (f"{path.stem}-damaged-{i}{path.suffix}" for i in itertools.count(1))
         free = next(n for n in map(path.with_name, names) if not os.path.lexists(n))
         path.rename(free)
@@ -242,20 +242,20 @@ class Run:
 
     @property
     def skin_path(self) -> Path:
-        """The skin the run was started with."""
+        """Path of the skin of the run."""
         return self.path / "skin.json"
 
     @property
     def checkpoint_path(self) -> Path:
-        """The latest checkpoint."""
+        """Path of the latest checkpoint."""
         return self.path / CHECKPOINT_NAME
 
     def policy_path(self, frames: int) -> Path:
-        """The policy kept after a number of environment steps."""
+        """Return the path of the policy saved after a number of environment steps."""
         return self.path / "policies" / f"{frames:012d}.safetensors"
 
     def dump_path(self, frames: int) -> Path:
-        """Where an update that is not finite is written, after a number of steps."""
+        """Return the path for an update that is not finite, after a number of steps."""
         return self.path / f"not-finite-{frames:012d}.safetensors"
 
     @property
@@ -268,10 +268,12 @@ class Run:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Keep other processes from training this run; the system ends it with ours.
+        """Lock the run against training by other processes.
+
+        The operating system releases the lock when this process ends.
 
         Raises:
-            ValueError: If one does already.
+            ValueError: If another process is training it.
         """
         path = self.path / "lock"
         flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
@@ -293,11 +295,11 @@ class Run:
             os.close(descriptor)
 
     def is_new(self) -> bool:
-        """Whether there is nothing to go on from, though it may have been started."""
+        """Return whether there is nothing to resume, even if the run was started."""
         return not (self.checkpoint_path.exists() or self._metrics_path.exists())
 
     def how_to_go_on(self) -> str:
-        """Return what to do after a stop or a failure."""
+        """Return advice on how to continue after a stop or a failure."""
         if not (self.path / "config.json").is_file():
             return (
                 f"{self.path} is gone: start a new run or, if it was only renamed, "
@@ -308,7 +310,7 @@ class Run:
     def save_checkpoint(
         self, tensors: Mapping[str, Tensor], header: Mapping[str, Any]
     ) -> None:
-        """Replace the checkpoint; it holds all logs so far, and what was trained."""
+        """Replace the checkpoint, including all logs so far and the training setup."""
         log = np.frombuffer(self._metrics.encode(), np.uint8).copy()
         save_tensors(
             self.checkpoint_path,
@@ -317,16 +319,16 @@ class Run:
         )
 
     def load_checkpoint(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Return what `save_checkpoint` wrote last, and take the logs from it.
+        """Return the tensors and header of the checkpoint, and load the logs from it.
 
         Raises:
             ValueError: If it is damaged, or was trained with another configuration or
-                skin; the text names them.
+                skin; the text names the differences.
         """
         self.load_skin()
         tensors, header = load_tensors(self.checkpoint_path)
         what = str(self.checkpoint_path)
-        # Checkpoints of format 1 hold none of these.
+        # Checkpoints of format 1 do not contain these.
         if "config" in header:
             config = _a(dict, header.pop("config"), "config", what)
             self._check_trained_with(config)
@@ -338,10 +340,10 @@ class Run:
         return tensors, header
 
     def metrics(self) -> str:
-        """Return the log of the rollouts up to the latest checkpoint, as CSV.
+        """Return the metrics up to the latest checkpoint, as CSV.
 
         Raises:
-            ValueError: If there is none, or the checkpoint is damaged.
+            ValueError: If there are none, or the checkpoint is damaged.
         """
         if self.checkpoint_path.exists():
             tensors, _ = load_tensors(self.checkpoint_path)
@@ -352,10 +354,10 @@ class Run:
         return self._metrics_path.read_text()
 
     def start_metrics(self, frames: int) -> None:
-        """Open the logs, dropping what was logged after a number of frames.
+        """Open the logs, dropping entries after a number of frames.
 
-        The folder of the policies, if somebody removed it, is made again, and so is the
-        log of metrics if somebody removed, edited or damaged it.
+        The folder of the policies is created again if it was removed, and so is the log
+        of metrics if it was removed, edited or damaged.
         """
         policies = self.path / "policies"
         if policies.is_symlink():
@@ -398,7 +400,7 @@ class Run:
         try:
             append(self._metrics_path, line.getvalue().encode())
         except FileNotFoundError:
-            # The first line, or somebody removed the file.
+            # This is the first line, or the file was removed.
             write_file(self._metrics_path, self._metrics.encode())
         self._events.log(metrics)
         if self._wandb is not None:
@@ -413,13 +415,13 @@ class Run:
 
 
 def _check_repeats(config: TrainConfig, skin: Skin) -> None:
-    """Raise ValueError if the run to repeat had another skin by the same options."""
+    """Raise ValueError if the run to repeat had another skin with the same options."""
     if config.config is None:
         return
     content, before = read_config(config.config)
     if content["env"]["skin"] != to_plain(config.env.skin):
         return
-    # As a file holds it.
+    # In the form of a stored file.
     now = json.loads(json.dumps(skin.to_dict(), default=str))
     if before not in (None, content_hash(now)):
         raise ValueError(
@@ -430,9 +432,9 @@ def _check_repeats(config: TrainConfig, skin: Skin) -> None:
 
 
 def _check_fits(config: TrainConfig, skin: Skin) -> None:
-    """Raise ValueError if sensors or a training do not fit the skin or the memory.
+    """Raise ValueError if sensors do not fit the skin or memory is too small.
 
-    That is found now, not in a worker.
+    This is checked here, before the workers start.
     """
     sources = sparse_sources(config.env, skin)
     one = make_worker_env(
@@ -444,7 +446,7 @@ def _check_fits(config: TrainConfig, skin: Skin) -> None:
     weights = sum(value.numel() for value in agent_tensors(agent).values())
     read = sum(size for key, size in spec.sizes.items() if key not in sources)
     others = {
-        # Weights, two moments and gradients, of four shares and all, in float32.
+        # Weights, two moments, and gradients in total and of four shares, in float32.
         "the networks (ppo.network.hidden)": 32 * weights,
         "a rollout (num_envs, ppo.rollout_steps, history)": 4
         * read
@@ -455,7 +457,7 @@ def _check_fits(config: TrainConfig, skin: Skin) -> None:
 
 
 def _a(kind: type[T], value: Any, name: str, what: str) -> T:
-    """Return what a file holds by a name; raise ValueError if it is of another kind."""
+    """Return a value of a file; raise ValueError if it has another type."""
     if not isinstance(value, kind):
         raise ValueError(
             f"{what} is damaged or was edited: its {name} must be a {kind.__name__}, "
@@ -465,10 +467,10 @@ def _a(kind: type[T], value: Any, name: str, what: str) -> T:
 
 
 def _text(characters: Tensor, what: str) -> str:
-    """Return the text that a checkpoint keeps as a tensor of bytes.
+    """Return the text that a checkpoint stores as a tensor of bytes.
 
     Raises:
-        ValueError: If it is none.
+        ValueError: If it is not valid text.
     """
     try:
         return characters.numpy().tobytes().decode()
@@ -477,12 +479,12 @@ def _text(characters: Tensor, what: str) -> str:
 
 
 def _whole_rows(path: Path, frames: int) -> str:
-    """Return a log of metrics up to some frames, as far as it can be read."""
+    """Return the readable part of a metrics log, up to a number of frames."""
     try:
         text = read_regular(path, sys.maxsize).decode()
         first, *lines = text.splitlines(keepends=True)
         columns = first.strip().split(",")
-        # A line that a crash cut short lacks columns.
+        # A line truncated by a crash has missing columns.
         rows = [(line, line.strip().split(",")) for line in lines]
         whole = [(line, row) for line, row in rows if len(row) == len(columns)]
         place = columns.index("frames")
@@ -493,9 +495,9 @@ def _whole_rows(path: Path, frames: int) -> str:
 
 
 def git_state(source: Path) -> dict[str, Any] | None:
-    """Return the commit that a source file is of, and whether its tree was changed.
+    """Return the commit of a source file, and whether its working tree has changes.
 
-    None if no repository holds the file.
+    Returns None if the file is not in a repository.
     """
 
     def git(*args: str) -> str:
@@ -507,7 +509,7 @@ def git_state(source: Path) -> dict[str, Any] | None:
         ).stdout.strip()
 
     try:
-        # An installed copy may lie inside a repository of something else.
+        # An installed copy may be inside an unrelated repository.
         git("ls-files", "--error-unmatch", str(source))
         return {
             "commit": git("rev-parse", "HEAD"),

@@ -1,7 +1,7 @@
-"""Survival of agents that are still alive: the Kaplan-Meier estimate.
+"""Kaplan-Meier estimate of survival, including agents that are still alive.
 
-The mean length of the episodes that have *ended* misleads while training: short ones
-end first. The hazard at each age, over all agents of that age, does not.
+During training, the mean length of the episodes that have *ended* is biased, because
+short ones end first. The hazard at each age, over all agents of that age, is not.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from torch import Tensor
 class SurvivalCurve:
     """Running Kaplan-Meier estimate over the latest rollouts.
 
-    Ages count from a moment in the episode, age 0, such as the first throw. What ends
-    an episode before or at that moment makes age 0 less than certain.
+    Ages count from a moment in the episode, age 0, such as the first throw. If episodes
+    end before or at that moment, the survival at age 0 is below 1.
 
     Args:
         max_steps: Age at which episodes are truncated [control steps].
-        memory: Weight of the past at each `decay`; 0.9 remembers ten rollouts.
+        memory: Factor on past counts at each `decay`; 0.9 remembers ten rollouts.
     """
 
     def __init__(self, max_steps: int, memory: float = 0.9) -> None:
@@ -27,7 +27,7 @@ class SurvivalCurve:
         self.ended = torch.zeros(max_steps + 1, dtype=torch.float64)
 
     def decay(self) -> None:
-        """Let the past fade, once for each rollout."""
+        """Discount past counts; called once per rollout."""
         self.at_risk *= self._memory
         self.ended *= self._memory
 
@@ -40,26 +40,26 @@ class SurvivalCurve:
             terminated: Whether the step ended the episode (not by time), ``[N]``.
         """
         size = len(self.at_risk)
-        # Of the way to age 0 the steps that get there count, and those that end it.
+        # Up to age 0, only the steps that reach it or end the episode count.
         counts = (age >= 0) | terminated
         at_risk, ended = age[counts].clamp(min=0), age[terminated].clamp(min=0)
         self.at_risk += torch.bincount(at_risk, minlength=size)
         self.ended += torch.bincount(ended, minlength=size)
 
     def curve(self) -> Tensor:
-        """Return the probability to survive each age, ``[max_steps + 1]``.
+        """Return the probability of surviving each age, ``[max_steps + 1]``.
 
-        NaN from the first age that no agent has reached.
+        Values are NaN from the first age that no agent has reached.
         """
-        # S(t) = prod_{a <= t} (1 - ended(a) / at_risk(a)); age 0 is certain where
-        # episodes begin with it.
+        # S(t) = prod_{a <= t} (1 - ended(a) / at_risk(a)); S(0) = 1 if episodes begin
+        # at age 0.
         hazard = self.ended / self.at_risk
         if not self.at_risk[0]:
             hazard[0] = 0.0
         return (1 - hazard).cumprod(0)
 
     def probability(self, steps: int) -> float:
-        """Return the probability to survive an age; NaN if none has reached it."""
+        """Return the probability of surviving an age; NaN if none has reached it."""
         return float(self.curve()[steps])
 
     def mean(self) -> float:

@@ -1,8 +1,8 @@
-"""Training: rollouts, updates, checkpoints, and how to go on from one.
+"""Training: rollouts, updates, checkpoints and resuming.
 
-Contract: a run of 2n rollouts equals n and a resumed n, bit for bit, in everything a
-checkpoint holds and in the metrics but for times; and nothing that is not finite ever
-replaces a checkpoint.
+Contract: a run of 2n rollouts equals n rollouts and n resumed ones, bit for bit, in the
+content of the checkpoint and in all metrics except times. A state that is not finite
+never replaces a checkpoint.
 """
 
 from __future__ import annotations
@@ -54,34 +54,34 @@ from egoskin.sparse import SparseSource
 from egoskin.storage.serialization import from_plain, to_plain
 from egoskin.storage.tensor_file import part, prefixed, save_tensors
 
-# What the metrics of an episode are made of.
+# Keys from which the episode metrics are computed.
 METRIC_KEYS = (*keys_read_by("trainer"), "reward", "terminated")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Progress:
-    """How far a training has come: what a checkpoint holds beside tensors."""
+    """Progress of a training, stored in a checkpoint beside the tensors."""
 
     frames: Annotated[int, NOT_NEGATIVE]
-    """Environment steps learnt from."""
+    """Number of environment steps trained on."""
     wall_s: Annotated[float, NOT_NEGATIVE]
-    """Time that took [s]."""
+    """Wall time of the training [s]."""
     learning_rate: Annotated[float, POSITIVE]
-    """Present learning rate."""
+    """Current learning rate."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for numbers that no training comes to."""
+        """Raise ValueError for invalid values."""
         check_bounds(self)
 
 
 class Trainer:
-    """Everything that a checkpoint holds, and how to go on from it.
+    """Trains the agent of a run; saves and loads its state.
 
     Args:
         run: The run to train, with its configuration.
-        env: What `make_training_env` returned for it.
+        env: Result of `make_training_env` for the run.
         skin: The run's skin.
-        sources: What computes the keys that the environment does not give.
+        sources: Sparse sources of the keys that the environment does not output.
     """
 
     def __init__(
@@ -105,13 +105,13 @@ class Trainer:
         self.root: TensorDictBase = TensorDict()
 
     def start(self) -> None:
-        """Begin a new run: first observations, first policy, first checkpoint."""
+        """Start a new run: reset, and save the first policy and checkpoint."""
         self.root = self.env.reset()
         self.keep_policy()
         self.save()
 
     def iterate(self) -> dict[str, float]:
-        """Collect a rollout, improve the agent on it; return the metrics.
+        """Collect a rollout, update the agent on it and return the metrics.
 
         Raises:
             NonFiniteError: If the update is not finite; the text says how to replay it.
@@ -142,13 +142,13 @@ class Trainer:
             "time/wall_s": self.wall_s,
             "time/steps_per_s": self.config.frames_per_batch / (end - start),
             "time/collect_share": (collected - start) / (end - start),
-            # Once from the device, for all metrics.
+            # Copied from the device once, for all metrics.
             **self._episode_metrics(TensorDict.maybe_dense_stack(infos).cpu()),
             **{f"ppo/{name}": value for name, value in learned.items()},
         }
 
     def _episode_metrics(self, infos: TensorDictBase) -> dict[str, float]:
-        """What the environment said during a rollout, ``[T, N]``."""
+        """Return metrics from the environment outputs of a rollout, ``[T, N]``."""
         self.survival.decay()
         for info in infos:
             age = info["episode_step"] - info["first_throw_step"]
@@ -157,7 +157,7 @@ class Trainer:
         hz = task.physics.control_hz
         ended = float(infos["terminated"].sum())
         terms = infos["reward_terms"].mean(0).mean(0).tolist()
-        # A ball that hits may throw the robot over: each end has one cause.
+        # A hit may make the robot fall; each end is attributed to one cause.
         hit = infos["hit"]
         fallen = infos["fallen"] & ~hit
 
@@ -179,7 +179,7 @@ class Trainer:
         }
 
     def keep_policy(self) -> None:
-        """Keep the present policy for learning curves."""
+        """Save the current policy for learning curves."""
         save_policy(self.run.policy_path(self.frames), self.agent, self._spec_now())
 
     def save(self) -> None:
@@ -198,8 +198,8 @@ class Trainer:
         """Continue from a checkpoint of the run.
 
         Raises:
-            ValueError: If it is that of another agent or environment, then nothing is
-                loaded; or if it holds numbers with which no policy acts.
+            ValueError: If it belongs to another agent or environment (nothing is loaded
+                then), or if it contains values with which no policy can act.
         """
         what = str(self.run.checkpoint_path)
         names = [field.name for field in dataclasses.fields(Progress)]
@@ -225,7 +225,7 @@ class Trainer:
             torch.set_rng_state(tensors["random_state"])
 
     def dump(self, error: NonFiniteError) -> Path:
-        """Write what `egoskin replay` needs to meet an error again; return where."""
+        """Write a file to reproduce an error with `egoskin replay`; return its path."""
         path = self.run.dump_path(self.frames)
         ppo = self.config.ppo
         now = ppo.entropy_coeff_at(self.frames)
@@ -243,15 +243,15 @@ class Trainer:
         return path
 
     def _learner_tensors(self) -> dict[str, Tensor]:
-        """Agent and optimiser."""
+        """Return the tensors of agent and optimiser."""
         return {
             **prefixed("agent", agent_tensors(self.agent)),
             **prefixed("optimizer", self.ppo.state()),
         }
 
     def _other_tensors(self) -> dict[str, Tensor]:
-        """What else a checkpoint holds: environment, survival, random state."""
-        # Noise and minibatches are drawn where the learner is.
+        """Return the other checkpoint tensors: environment, survival, random state."""
+        # Noise and minibatches are drawn on the device of the learner.
         random_state = torch.get_rng_state()
         if self.device.type == "cuda":
             random_state = torch.cuda.get_rng_state(self.device)
@@ -268,26 +268,26 @@ class Trainer:
 
 @contextmanager
 def open_trainer(run: Run, num_threads: int = 1) -> Iterator[Trainer]:
-    """Yield the trainer of a run, at its start or its checkpoint; close all after.
+    """Yield the trainer of a run, at its start or checkpoint; close it afterwards.
 
-    PyTorch itself then uses one thread, so that nothing depends on the machine's cores;
-    the learner has threads of its own, see `egoskin.agents.ppo.PPO`.
+    PyTorch is set to one thread, so that results do not depend on the number of cores.
+    The learner has its own threads, see `egoskin.agents.ppo.PPO`.
 
     Args:
-        run: A new run or one to go on with.
+        run: A new run or one to resume.
         num_threads: Physics threads of each worker; results do not depend on it.
 
     Raises:
-        ValueError: If the run is being trained already, or cannot be gone on with.
+        ValueError: If the run is already being trained, or cannot be resumed.
     """
     config = run.config
     torch.set_num_threads(1)
     with run.locked():
-        # What cannot be read is told of before the workers start.
+        # Unreadable files are reported before the workers start.
         skin = run.load_skin()
         checkpoint = None if run.is_new() else run.load_checkpoint()
         if config.engine == "mujoco":
-            # It imports while the rest is made.
+            # The server imports while the rest is built.
             start_server()
         sources = sparse_sources(config.env, skin)
         env = make_training_env(config, skin, bool(sources), num_threads)
@@ -309,16 +309,16 @@ def open_trainer(run: Run, num_threads: int = 1) -> Iterator[Trainer]:
 def make_training_env(
     config: TrainConfig, skin: Skin, sparse: bool, num_threads: int = 1
 ) -> Trainable:
-    """Return the environment of a training: in workers, or here on the device.
+    """Return the environment of a training: in workers, or in this process.
 
     Args:
         config: The training.
         skin: Its skin.
-        sparse: Whether it gives the state instead of the signal.
+        sparse: Whether to output the state instead of the signal.
         num_threads: Physics threads of each worker.
 
     Raises:
-        ValueError: As `make_env`, or if the engine cannot make the scene.
+        ValueError: As in `make_env`, or if the engine cannot build the scene.
     """
     shared: dict[str, Any] = {
         "num_envs": config.num_envs,
@@ -345,12 +345,12 @@ def train(
     stop: Callable[[], bool] = lambda: False,
     show: Callable[[dict[str, float]], None] = lambda metrics: None,
 ) -> None:
-    """Iterate to the end or to a stop, with checkpoints, kept policies and metrics.
+    """Train until the end or a stop, with checkpoints, saved policies and metrics.
 
     Args:
-        trainer: What is trained, to the end that its run plans.
-        stop: Whether to stop after the present rollout.
-        show: What to do with the metrics of each rollout.
+        trainer: The trainer; its run's configuration sets the end.
+        stop: Returns whether to stop after the current rollout.
+        show: Called with the metrics of each rollout.
     """
     config, run = trainer.config, trainer.run
     saved_at = time.monotonic()
@@ -367,7 +367,7 @@ def train(
             if to_film:
                 films.start(run.policy_path(trainer.frames))
             now = time.monotonic()
-            # The next rollout must fit in as well.
+            # The next rollout must also fit into the interval.
             if now - saved_at + 1.5 * (now - start) > config.checkpoint_interval:
                 trainer.save()
                 saved_at = now
@@ -376,5 +376,5 @@ def train(
 
 
 def _passes(interval: int | None, before: int, now: int) -> bool:
-    """Whether a multiple of an interval lies after one number and not after another."""
+    """Return whether a multiple of an interval lies in (before, now]."""
     return interval is not None and before // interval < now // interval

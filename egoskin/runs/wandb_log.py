@@ -1,4 +1,4 @@
-"""Metrics at Weights & Biases, beside those in the run folder (extra wandb)."""
+"""Logging of metrics to Weights & Biases (extra wandb)."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import Any
 
 
 class WandbLog:
-    """A run at Weights & Biases, gone on with where a training is.
+    """A run at Weights & Biases, resumed when the training is resumed.
 
     Args:
-        folder: The run folder; its name is that of the run.
-        start: What is recorded of the training's first start: it tells runs of one
-            name apart.
+        folder: The run folder; its name is the name of the run.
+        start: Record of the training's first start; it distinguishes runs with the
+            same name.
         config: The configuration.
 
     Raises:
@@ -42,11 +42,11 @@ class WandbLog:
     def log(self, metrics: Mapping[str, float]) -> None:
         """Append the metrics of a rollout; "frames" is the x axis.
 
-        What was logged before and after a checkpoint that is gone on with is dropped
-        there: it is the same.
+        Metrics logged again after resuming from a checkpoint are dropped by Weights &
+        Biases; they are the same.
         """
         self._run.log(dict(metrics), step=int(metrics["frames"]))
 
     def close(self) -> None:
-        """Send what is left."""
+        """Send the remaining data and end the run."""
         self._run.finish()
