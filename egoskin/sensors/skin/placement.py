@@ -22,9 +22,8 @@ from egoskin.sensors.skin.skin import FARTHEST, Skin
 
 # Candidates per sensor for sample elimination (Yuksel 2015, section 4).
 _CANDIDATES = 5
-# Darts thrown per square of the spacing. A full cover has 0.70 sensors per square; with
-# this many darts, less than 1 % of the surface is farther than the spacing from a
-# sensor.
+# Darts thrown per square of the spacing. A full cover has 0.70 sensors per square, and
+# then less than 1 % of the surface is farther than the spacing from a sensor.
 _DARTS_PER_SQUARE = 40
 # Largest number of darts to find as many sensors as fit: some minutes on meshes. For a
 # given number of sensors more are thrown, in batches of this size.
@@ -197,8 +196,8 @@ def _num_darts(area: float, spacing: float, num_sensors: int | None) -> int:
     """
     darts = math.ceil(_DARTS_PER_SQUARE * area / spacing**2)
     if num_sensors is not None:
-        # 100 per sensor suffice: if that is the smaller number, the sensors take little
-        # more than half of the places.
+        # If 100 per sensor are fewer, the sensors are little more than half of those
+        # that fit.
         return min(darts, 100 * num_sensors)
     if darts > _MAX_DARTS:
         finest = math.sqrt(_DARTS_PER_SQUARE * area / _MAX_DARTS)
@@ -322,7 +321,7 @@ def place_sensors(
             break
         points = surface.sample(
             min(_MAX_DARTS, number - first),
-            # A different random stream for each batch.
+            # A different random stream for each batch, whatever the seed.
             seed + (first << 64),
             weights,
             stand_off,

@@ -326,7 +326,7 @@ class Skin:
         return list(groups.values())
 
     def reach(self) -> np.ndarray:
-        """Return the largest distance each sensor of a `resolved` skin sees [m], ``[S]``.
+        """Return the largest distance that each sensor sees [m], ``[S]``; NaN if unset.
 
         It exceeds the range for slanted beams that measure depth.
         """
