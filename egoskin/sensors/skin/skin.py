@@ -326,7 +326,9 @@ class Skin:
         return list(groups.values())
 
     def reach(self) -> np.ndarray:
-        """Return the largest distance that each sensor sees [m], ``[S]``; NaN if unset.
+        """Return the largest distance at which each sensor detects [m], ``[S]``.
+
+        The skin must be `resolved`.
 
         It exceeds the range for slanted beams that measure depth.
         """

@@ -27,7 +27,8 @@ from egoskin.storage.files import read_regular
 
 # Largest file [bytes]: 100,000 sensors.
 _LARGEST = 16 * 2**20
-# Deviation from 1 up to which the length of a normal is accepted, and normalised.
+# Deviation of a normal's length from 1: accepted up to the first, normalised up to the
+# second, else an error.
 _UNIT, _ALMOST_UNIT = 1e-5, 0.05
 # If all sensors are nearer to their links' origins than this [m], the unit is wrong.
 _NEAREST = 0.002
@@ -64,9 +65,9 @@ def load_gentact(
         links: Links of the robot.
         primitives: The robot's shapes, for files without normals and for the distance
             of the sensors from the surface in the provenance.
-        scale: Unit of the positions [m], and of the radii except in 3-D print exports
-            with headings, whose radii are in metres. None: the unit given in brackets
-            in the header, or that of the dialect.
+        scale: Unit of the positions [m], and of the radii except in newer 3-D print
+            exports, whose radii are in metres. None: the unit given in brackets in the
+            header, or that of the dialect.
         link_map: Link of the robot by a component of the Parent path, the whole path,
             a link of the URDF, or the name of the xacro macro; takes precedence over
             the names themselves. Unused entries are listed in the provenance.
