@@ -166,7 +166,7 @@ class RaySensor(ProximitySensor):
         away = view.centre[:, self._link] - skin["offset"]
         x, y, z = self._in_sensor(away, skin["axes"])
         if not self._cull:
-            # 1, or NaN.
+            # No pair is culled: 1, or NaN.
             return 1.0 + 0.0 * x
         # Outside the range, behind the sensor, or beyond a side of the pyramid:
         # R + r - |c|, r + z, r - (|x| cos h - z sin h).
