@@ -1,7 +1,7 @@
-"""Proximity skins: where sensors sit, what they measure, which signal they give.
+"""Proximity skins: sensor placement, measurements and signals.
 
-Everything here works on TensorDicts with the keys named in `egoskin`, from this
-project's environment, another simulator, a recording or a real robot.
+Everything here works on TensorDicts with the keys listed in `egoskin`, whether they
+come from this project's environment, another simulator, a recording or a real robot.
 """
 
 from egoskin.sensors.field import FieldSensor

@@ -1,6 +1,6 @@
-"""Configuration of a skin and of what its sensors give.
+"""Configuration of a skin, its sensors and their signal.
 
-`egoskin.sensors.pipeline` makes transforms of it.
+`egoskin.sensors.pipeline` builds the transforms from it.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ class SkinConfig:
     path: Path | None = None
     """Skin file; None places sensors at random on the upper body."""
     num_sensors: Annotated[int, Interval(ge=1, le=MAX_SENSORS)] = 64
-    """Number of sensors to place (none with a file)."""
+    """Number of sensors to place (not with a file)."""
     seed: Annotated[int, NOT_NEGATIVE] = 0
-    """Seed of the placement (none with a file)."""
+    """Seed of the placement (not with a file)."""
     placement: Literal["area_uniform", "poisson_disk"] = "area_uniform"
-    """Independent points or well-spread ones; ``egoskin skin`` has more to choose."""
+    """Independent or evenly spread points; ``egoskin skin`` has more options."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for numbers out of bounds."""
@@ -39,14 +39,14 @@ class SkinConfig:
         """Return the skin, checked against the robot.
 
         Raises:
-            ValueError: If the file is no skin of this robot, or there is one and an
-                option of placing sensors, too.
+            ValueError: If the file is not a skin of this robot, or a placement option
+                is given together with a file.
         """
         if self.path is None:
             return place_sensors(
                 robot, self.num_sensors, self.seed, method=self.placement
             )
-        # Here, not at construction: runs and policies of before are still read.
+        # Checked here and not at construction: old runs and policies must still load.
         for name in ("num_sensors", "seed", "placement"):
             if getattr(self, name) != getattr(SkinConfig, name):
                 raise ValueError(
@@ -54,7 +54,7 @@ class SkinConfig:
                     f"those of the file {self.path}"
                 )
         skin = Skin.load(self.path)
-        # Robots of one maker name their links alike.
+        # Robots of one manufacturer can have the same link names.
         if skin.robot != robot.name:
             raise ValueError(
                 f"skin file {self.path}: made for the robot {skin.robot!r}, not "
@@ -69,16 +69,16 @@ class SkinConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class SensorConfig:
-    """What the sensors of the skin measure, and what the actor observes of it.
+    """Measurements of the sensors and the signal that the actor observes.
 
-    A sensor whose skin file gives it a type or a range of its own keeps them.
+    A type or range that the skin file sets for a sensor takes precedence.
     """
 
     coverage: Literal["field", "ray", "none", "oracle"] = "field"
-    """Spherical field, grid of beams, no sensor at all (a blind robot), or no sensor
-    but the truth: position and velocity of every ball, the most that could be told."""
+    """Spherical field, grid of beams, none (a blind robot), or oracle: the true
+    position and velocity of every ball instead of sensors, an upper bound."""
     signal: Literal["localization", "proximity", "closeness", "binary"] = "proximity"
-    """Ball position if any sensor detects it; distance / range; 1 - that; in range?"""
+    """Position of nearest detected ball; distance / range; 1 - that; 1 if in range."""
     range: Annotated[float, Interval(ge=1e-3, le=math.inf)] = 2.0
     """Detection range [m], to the ball's surface; "inf" is allowed."""
     field: Field = dataclasses.field(default_factory=Field)
@@ -86,17 +86,17 @@ class SensorConfig:
     ray: Ray = dataclasses.field(default_factory=Ray)
     """Ray sensors."""
     reduce: Literal["none", "min"] = "none"
-    """Ray sensors: all beams, or the closest of each sensor's (binary: any beam)."""
+    """Ray sensors: all beams, or each sensor's minimum (binary: any beam)."""
     occlusion: bool = False
-    """Whether the robot's own body hides what lies behind it."""
+    """Whether the robot's own body hides objects behind it."""
     corruption: Literal["none", "time_of_flight", "capacitive", "acoustic"] = "none"
-    """Ideal sensors, or a model of real ones (docs/sensor-models.md), of each beam or,
-    reduced, of each sensor's closest."""
+    """Ideal sensors, or a model of real ones (docs/sensor-models.md), applied to each
+    beam or, with reduce, to each sensor's minimum."""
     keep_last: bool = False
     """Localization: keep the last position while nothing is detected."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for a range out of bounds, or what has no effect."""
+        """Raise ValueError for a range out of bounds or options without effect."""
         check_bounds(self)
         if not self.uses_skin:
             ignored = {
@@ -127,16 +127,16 @@ class SensorConfig:
 
     @property
     def uses_skin(self) -> bool:
-        """Whether the actor observes anything that the skin measures."""
+        """Whether the actor observes measurements of the skin."""
         return self.coverage in ("field", "ray")
 
     @property
     def default_coverage(self) -> Coverage:
-        """Coverage of the sensors that have none of their own."""
+        """Coverage of the sensors for which the skin sets none."""
         return self.ray if self.coverage == "ray" else self.field
 
     def label(self) -> str:
-        """Return what the actor observes, in a few words without spaces."""
+        """Return a short label of the actor's observation, without spaces."""
         if not self.uses_skin:
             return {"none": "blind", "oracle": "oracle"}[self.coverage]
         return f"{self.coverage}-{self.signal}-{self.range:g}m"

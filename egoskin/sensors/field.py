@@ -31,30 +31,31 @@ class FieldSensor(ProximitySensor):
     Reads ``base_pose [*B, 7]``, ``joint_pos [*B, J]``, ``object_pose [*B, O, 7]`` and
     ``object_active [*B, O]``. Writes ``distance [*B, S]`` [m], infinite where nothing
     is in range and NaN where the input is not finite, and ``object_detected [*B, O]``,
-    whether any sensor detects the object. A sensor inside an object reads 0. Distances
-    are those of the state given: forward kinematics from the joint positions.
+    whether any sensor detects the object. A sensor inside an object reads 0. Sensor
+    poses are computed from the joint positions by forward kinematics.
 
     A sensor with a half angle below 180 degrees sees an object if the object's
     closest point lies within that angle of the normal.
 
     Args:
-        skin: The sensors. Their own coverage and range come first.
+        skin: The sensors. A coverage or range set in the skin takes precedence.
         chain: Kinematic chain of the robot, rooted at the base.
-        objects: Shape of each object, ``O`` of them, or of the only one.
+        objects: Shape of each of the ``O`` objects, or a single shape.
         max_range: A distance is detected if it is at most this [m]; may be infinite.
-            None if all sensors have a range of their own.
-        coverage: What a sensor sees.
-        body: The robot's shapes, to hide what lies behind them: an object is seen if
-            the straight path to its closest point is free. Empty: transparent.
-        per_object: Write ``distance [*B, S, O]``, objects told apart.
-        compile: Use C++ kernels, where they can be compiled, for balls and a
-            transparent robot; results are the same (float64: to the last bit or two).
+            None if the skin sets a range for every sensor.
+        coverage: Coverage of sensors for which the skin sets none.
+        body: The robot's shapes, for occlusion: an object is seen if the straight path
+            to its closest point is free. Empty: no occlusion.
+        per_object: Write one distance per object, ``distance [*B, S, O]``.
+        compile: Use C++ kernels if they can be compiled, all objects are balls and
+            there is no occlusion; results are the same (float64: to the last bit or
+            two).
         in_keys: Keys of the four inputs, in the order above.
         out_keys: Keys of the two outputs, in the order above.
 
     Raises:
         ValueError: If the range is not positive, the skin does not fit the chain or
-            holds a sensor that is no field sensor.
+            contains a sensor that is not a field sensor.
     """
 
     _cos_half: Tensor | None
@@ -84,7 +85,7 @@ class FieldSensor(ProximitySensor):
             in_keys,
             out_keys,
         )
-        # None where every sensor sees all around.
+        # None if every sensor sees in all directions.
         cos_half = None
         if any(f.half_angle_deg < 180 for f in fields):
             angles = [math.cos(math.radians(f.half_angle_deg)) for f in fields]
@@ -95,7 +96,7 @@ class FieldSensor(ProximitySensor):
             self._use_kernels("field", cos_half=cone)
 
     def distances(self, scene: Scene) -> Tensor:
-        """Return readings of each object [m], ``[O, B, S]``."""
+        """Return the readings of each object [m], ``[O, B, S]``."""
         readings = []
         for view, shape, on in zip(
             self.views(scene), self.objects, scene.active, strict=True
@@ -112,7 +113,7 @@ class FieldSensor(ProximitySensor):
         # From each sensor to the object's centre, in the sensor's link.
         x, y, z = v = view.centre[:, self._link] - skin["offset"]
         if isinstance(shape, Sphere):
-            # |c| - r: the object's frame differs by a shift alone.
+            # |c| - r: the object's frame differs by a translation only.
             to_centre = exact_sqrt(x * x + y * y + z * z)
             distance = (to_centre - shape.radius).clamp(min=0.0)
         else:
@@ -122,7 +123,8 @@ class FieldSensor(ProximitySensor):
             way = self._to_closest(view, shape, v)
             along = n[0] * way[0] + n[1] * way[1] + n[2] * way[2]
             reach = exact_sqrt(way[0] * way[0] + way[1] * way[1] + way[2] * way[2])
-            # cos(angle) < cos(half angle); an object about the sensor is all around.
+            # cos(angle) < cos(half angle). An object that contains the sensor is always
+            # in view.
             beside = (along < skin["cos_half"] * reach) & ~(distance <= 0)
             distance = torch.where(beside, torch.inf, distance)
         # Written so that NaN stays NaN.
@@ -130,16 +132,16 @@ class FieldSensor(ProximitySensor):
         return torch.where(gone, torch.inf, distance)
 
     def _in_object(self, view: View, centre: Tensor) -> list[Tensor]:
-        """The sensors in the object's frame [m], three of ``[S, B]``."""
+        """Sensor positions in the object's frame [m], three of ``[S, B]``."""
         x, y, z = centre
         assert view.turn is not None
         turn = view.turn[:, :, self._link]
         return [-(row[0] * x + row[1] * y + row[2] * z) for row in turn]
 
     def _to_closest(self, view: View, shape: Shape, centre: Tensor) -> Sequence[Tensor]:
-        """From each sensor to the object's closest point in the link frames [m].
+        """Vector from each sensor to the object's closest point, in its link [m].
 
-        For a sphere only the direction is right, which is that to its centre.
+        For a sphere this is the vector to its centre: only the direction is correct.
         """
         if isinstance(shape, Sphere):
             return list(centre)
@@ -150,7 +152,7 @@ class FieldSensor(ProximitySensor):
         return [c[0] * x + c[1] * y + c[2] * z for c in columns]
 
     def measure(self, scene: Scene, rows: Tensor, out: Tensor) -> Tensor:
-        """Write the readings of some rows, and return the least of each object."""
+        """Write the readings of some rows; return the minimum of each object."""
         readings = self.distances(scene)
         nearest = readings
         if not self.per_object:
@@ -161,7 +163,7 @@ class FieldSensor(ProximitySensor):
     def _without_hidden(
         self, reading: Tensor, view: View, shape: Shape, scene: Scene
     ) -> Tensor:
-        """Readings ``[S, B]`` whose path to the object's closest point is free."""
+        """Readings ``[S, B]``, infinite where the path to the object is blocked."""
         sensor, row = (reading < torch.inf).nonzero().unbind(1)
         if not len(row):
             return reading

@@ -1,12 +1,12 @@
-"""Where sensors and objects are relative to each other: what all coverages share.
+"""Relative geometry of sensors and objects, shared by all coverages.
 
-All is computed as a structure of arrays with the batch last (``[S, B]``), in the order
-of the skin, by +, -, x, /, `sincos` and `exact_sqrt` (`egoskin.rounding`) alone: a
-row's result has the same bits whatever rows are computed with it, here or, for balls
-and a transparent robot, in C++ (``egoskin/sensors/kernels/kernels.cpp``).
+Computations use a structure of arrays with the batch last (``[S, B]``), sensors in the
+order of the skin, and only +, -, x, /, `sincos` and `exact_sqrt` (`egoskin.rounding`).
+The result of a row is therefore bitwise the same whatever other rows are in the batch,
+here or, for balls without occlusion, in C++ (``egoskin/sensors/kernels/kernels.cpp``).
 
 Contract: a reading of infinity means that nothing is in range; NaN in the input gives
-a reading of NaN, never one of nothing.
+a reading of NaN, never of infinity.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from egoskin.sensors.skin.skin import Skin
 from egoskin.shapes import Shape, Sphere
 from egoskin.transform import RowTransform
 
-# Margin for rounding where rows or pairs are left out [m].
+# Margin for rounding when rows are culled [m].
 _SLACK = 1e-3
 
 STATE_KEYS = ("base_pose", "joint_pos", "object_pose", "object_active")
@@ -40,23 +40,23 @@ STATE_KEYS = ("base_pose", "joint_pos", "object_pose", "object_active")
 
 
 class Scene(NamedTuple):
-    """What is computed from, the batch last."""
+    """Inputs of the computation, with the batch last."""
 
     base: Tensor
     """Pose of the base in the world, ``[7, B]``."""
     objects: Tensor
     """Poses of the objects in the world, ``[O, 7, B]``; all NaN where any input is."""
     active: Tensor
-    """Which objects are in play, ``[O, B]`` bool."""
+    """Which objects are active, ``[O, B]`` bool."""
     links: tuple[Tensor, Tensor]
     """Rotations ``[3, 3, L, B]`` and positions [m] ``[3, L, B]`` of the links in the
     base frame."""
     skin: dict[str, Tensor]
-    """Constants of the sensors in the dtype of the inputs: loops do not convert."""
+    """Constants of the sensors in the dtype of the inputs, converted only once."""
 
 
 class View(NamedTuple):
-    """One object as the links see it."""
+    """Pose of one object relative to the links."""
 
     centre: Tensor
     """Centre of the object in the link frames [m], ``[3, L, B]``."""
@@ -68,7 +68,7 @@ class View(NamedTuple):
 def product(a: Tensor, b: Tensor) -> Tensor:
     """Return the matrix product over the first two dimensions, ``[3, 3, *B]``.
 
-    Written out: a library's product may round differently for another batch.
+    Written out because a library's product may round differently for another batch.
 
     Args:
         a: ``[3, 3, *B]``.
@@ -86,16 +86,16 @@ def product(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _turned_back(rotation: Tensor, vector: Tensor) -> Tensor:
-    """Return R^T v, ``[3, *B]``, of ``[3, 3, *B]`` and ``[3, *B]``."""
+    """Return R^T v, ``[3, *B]``, for R ``[3, 3, *B]`` and v ``[3, *B]``."""
     x, y, z = vector
     return rotation[0] * x + rotation[1] * y + rotation[2] * z
 
 
 def _writable(out: Tensor | None, shape: Sequence[int], like: Tensor) -> Tensor:
-    """Return what is written to, or a new tensor.
+    """Return the given output tensor, or a new one.
 
     Raises:
-        ValueError: If it does not fit.
+        ValueError: If its shape, layout, dtype or device is wrong.
     """
     if out is None:
         return like.new_empty(shape)
@@ -114,23 +114,22 @@ def _matrix(quat: Tensor) -> Tensor:
 
 
 class ProximitySensor(RowTransform):
-    """What field and ray sensors share: keys, checks, the loop over objects.
+    """Base class of field and ray sensors: keys, checks, culling, forward kinematics.
 
     Args:
-        skin: The sensors, resolved; all of the coverage that the subclass computes.
+        skin: The sensors, resolved; all with the coverage that the subclass computes.
         chain: Kinematic chain of the robot, rooted at the base.
-        objects: Shape of each object, ``O`` of them, or of the only one.
-        num_readings: Readings of each sensor: ``()`` or ``(K,)``.
-        body: Shapes of the robot that hide what lies behind them; empty for a robot
-            that is transparent to its sensors.
-        per_object: Whether objects are told apart: readings have a last dimension
+        objects: Shape of each of the ``O`` objects, or a single shape.
+        num_readings: Shape of the readings of one sensor: ``()`` or ``(K,)``.
+        body: Shapes of the robot that occlude objects; empty for no occlusion.
+        per_object: Whether to write readings for each object, in a last dimension
             ``O``, instead of those of the nearest object.
         in_keys: Keys of base pose, joint positions, object poses, active flags.
         out_keys: Keys of readings and detections.
 
     Raises:
-        ValueError: If the skin does not fit the chain, there is no object, or one that
-            is no shape.
+        ValueError: If the skin does not fit the chain, there is no object, or an object
+            is not a shape.
     """
 
     _link: Tensor
@@ -172,18 +171,18 @@ class ProximitySensor(RowTransform):
         self._kinematics = LinkKinematics(chain, links)
 
         def constant(name: str, value: object, dtype: torch.dtype) -> None:
-            # A copy: a mask changes the ranges of this sensor, not of the skin.
+            # Copied, because `mask` changes the ranges of this sensor but not the skin.
             self.register_buffer(name, torch.as_tensor(value, dtype=dtype).clone())
 
-        # Constants are float64; a scene has them in the dtype of its inputs.
+        # Constants are float64; `scene` converts them to the dtype of its inputs.
         constant("_link", [links.index(name) for name in skin.links], torch.int64)
         constant("_offset", skin.position.T[:, :, None], torch.float64)
-        # Columns of the sensor frames in the link frames, [3 (axis), 3, S, 1].
+        # Axes of the sensor frames in the link frames, [3 (axis), 3, S, 1].
         constant("_axes", skin.rotation().transpose(2, 1, 0)[..., None], torch.float64)
         constant("_range", skin.range[:, None], torch.float64)
         self._skin_range = self._range.clone()
-        # No object whose centre is farther from the base than this is in range in any
-        # pose of the robot [m], [O].
+        # An object whose centre is farther from the base than this is out of range in
+        # every pose of the robot [m], [O].
         reach = np.array(self._kinematics.reach())[self._link.numpy()]
         reach += np.linalg.norm(skin.position, axis=-1)
         farthest = float((reach + skin.reach()).max()) + _SLACK
@@ -192,11 +191,11 @@ class ProximitySensor(RowTransform):
         self._kernels: Kernels | None = None
 
     def _use_kernels(self, kind: Literal["field", "ray"], **constants: Any) -> None:
-        """Use C++ kernels from now on, where they can compute this.
+        """Use the C++ kernels if all objects are balls and there is no occlusion.
 
         Args:
             kind: Coverage of the sensors.
-            constants: What `Kernels` is to know of it.
+            constants: Constants of the coverage for `Kernels`.
         """
         balls = [shape for shape in self.objects if isinstance(shape, Sphere)]
         if self._occluder is not None or len(balls) < len(self.objects):
@@ -213,20 +212,20 @@ class ProximitySensor(RowTransform):
         self._kernels = Kernels(kind, self._kinematics, balls, {**own, **constants})
 
     def mask(self, sensors: Sequence[int]) -> None:
-        """Let some sensors, and no others, detect nothing from now on.
+        """Mask some sensors: they detect nothing. Replaces the previous mask.
 
         Args:
-            sensors: Their indices.
+            sensors: Indices of the masked sensors.
         """
         self._range.copy_(self._skin_range)
-        # No distance is within it.
+        # No distance is within a negative range.
         self._range[list(sensors)] = -1.0
         if self._kernels is not None:
             self._kernels.set_constants(range=self._range.numpy())
 
     @property
     def num_joints(self) -> int:
-        """Number of joint positions it reads, ``J``."""
+        """Number of joint positions read, ``J``."""
         return self._kinematics.num_joints
 
     @property
@@ -237,7 +236,7 @@ class ProximitySensor(RowTransform):
     def scene(
         self, base_pose: Tensor, joint_pos: Tensor, object_pose: Tensor, active: Tensor
     ) -> Scene:
-        """Return what is computed from, given the four inputs."""
+        """Return the scene of the four inputs."""
         poison = self._poison(base_pose, joint_pos, object_pose)
         objects = (object_pose + poison[..., None]).permute(1, 2, 0).contiguous()
         skin = {
@@ -251,12 +250,12 @@ class ProximitySensor(RowTransform):
         )
 
     def views(self, scene: Scene) -> list[View]:
-        """Return each object as the links see it."""
+        """Return each object's pose relative to the links."""
         rotation, position = (x[..., : self._num_links, :] for x in scene.links)
         base = _matrix(scene.base[3:])
         views = []
         for pose, shape in zip(scene.objects.unbind(0), self.objects, strict=True):
-            # R^T d, written out: torch's cross product fuses sums.
+            # R^T d, written out: torch's cross product uses fused operations.
             centre = _turned_back(base, pose[:3] - scene.base[:3])
             seen = _turned_back(rotation, centre[:, None] - position)
             turn = None
@@ -274,15 +273,15 @@ class ProximitySensor(RowTransform):
 
         Args:
             joint_pos: Joint positions, ``[B, J]``.
-            out: Where to write the two, contiguous. New tensors by default.
+            out: Contiguous tensors to write the result to. New ones by default.
 
         Returns:
             Position [m] ``[B, S, 3]`` and rotation ``[B, S, 3, 3]``, whose columns
             are the axes of the sensor frames.
 
         Raises:
-            ValueError: If J is not the robot's number of joints, or what is to be
-                written does not fit.
+            ValueError: If J is not the robot's number of joints, or ``out`` has a wrong
+                shape, layout, dtype or device.
         """
         self._kinematics.check(joint_pos)
         shape = (len(joint_pos), self.num_sensors, 3)
@@ -295,7 +294,7 @@ class ProximitySensor(RowTransform):
             return out
         rotation, position = self._kinematics.link_frames(joint_pos)
         offset = self._offset.to(joint_pos)
-        # p + R o, and the axes turned likewise
+        # p + R o, and the axes rotated by R
         x, y, z = rotation[:, :, self._link].unbind(1)
         shift = x * offset[0] + y * offset[1] + z * offset[2]
         axes = [x * a[0] + y * a[1] + z * a[2] for a in self._axes.to(joint_pos)]
@@ -314,7 +313,7 @@ class ProximitySensor(RowTransform):
         target: Tensor,
         radius: float,
     ) -> Tensor:
-        """Return readings without those of paths that the robot's body blocks.
+        """Return the readings, infinite where the robot's body blocks the path.
 
         Args:
             reading: Readings of some pairs of sensor and row [m], ``[n, K]``.
@@ -322,10 +321,10 @@ class ProximitySensor(RowTransform):
             sensor: Sensor of each pair, ``[n]``.
             row: Row of each pair, ``[n]``.
             direction: Unit directions in the sensors' links, ``[3, n, K]``.
-            length: Lengths of the paths [m], ``[n, K]``; infinite ones lead to nothing.
-            target: Where the paths of each pair lead, as seen from the sensor, in its
-                link [m], ``[3, n]``.
-            radius: They end no farther from there than this [m].
+            length: Lengths of the paths [m], ``[n, K]``; infinite for no hit.
+            target: Vector from each pair's sensor to the centre of the end points of
+                its paths, in the sensor's link [m], ``[3, n]``.
+            radius: Largest distance of an end point from that centre [m].
 
         Returns:
             ``[n, K]``, infinite where blocked.
@@ -357,17 +356,17 @@ class ProximitySensor(RowTransform):
 
     @abstractmethod
     def measure(self, scene: Scene, rows: Tensor, out: Tensor) -> Tensor:
-        """Write the readings of some rows, and return the least of each object.
+        """Write the readings of some rows; return the minimum of each object.
 
-        All other readings are infinite already.
+        The other entries of ``out`` are already infinite.
 
         Args:
-            scene: The rows, ``n`` of them.
-            rows: Index of each of them, ``[n]``.
-            out: Readings [m], ``[B, S, ...]`` or, told apart, ``[O, B, S, ...]``.
+            scene: The ``n`` rows.
+            rows: Their indices in the batch, ``[n]``.
+            out: Readings [m], ``[B, S, ...]``, or ``[O, B, S, ...]`` if per object.
 
         Returns:
-            Least reading of each object [m], ``[O, n]``, infinite if it is not active.
+            Minimum reading of each object [m], ``[O, n]``, infinite if not active.
         """
 
     def compute(self, *inputs: Tensor, out: Tensor | None = None) -> tuple[Tensor, ...]:
@@ -375,14 +374,14 @@ class ProximitySensor(RowTransform):
 
         Args:
             inputs: Base pose, joint positions, object poses, active flags.
-            out: Where to write the readings, contiguous; with ``per_object`` its
+            out: Contiguous tensor to write the readings to; with ``per_object`` its
                 first dimension is ``O``. A new tensor by default.
 
         Raises:
-            ValueError: If the number of objects is not that of the sensor, a pose has
-                not seven numbers, there is not one position for each joint, the
-                inputs are not of one floating type and bool, or what is to be written
-                does not fit.
+            ValueError: If the number of objects or of joint positions is wrong, a pose
+                does not have seven numbers, the inputs are not all of one floating type
+                (active flags: bool), or ``out`` has a wrong shape, layout, dtype or
+                device.
         """
         self._check(inputs)
         self._kinematics.check(inputs[1])
@@ -398,7 +397,7 @@ class ProximitySensor(RowTransform):
             if len(rows):
                 scene = self.scene(*(x[rows] for x in inputs))
                 least = self.measure(scene, rows, out)
-                # A reading of NaN may be anything: the object counts as seen.
+                # NaN could be any distance: the object counts as detected.
                 detected[rows] = least.t() != torch.inf
         return (out.movedim(0, -1) if self.per_object else out), detected
 
@@ -441,11 +440,11 @@ class ProximitySensor(RowTransform):
     def _poison(
         self, base_pose: Tensor, joint_pos: Tensor, object_pose: Tensor
     ) -> Tensor:
-        """Return 0 or, for bad input in the row or the object, NaN, ``[B, O]``.
+        """Return NaN where a row's or object's input is invalid, else 0, ``[B, O]``.
 
-        That is NaN (0 NaN = NaN) or a quaternion of zero (0 / 0 = NaN), but for that of
-        a sphere. It makes all readings of the object NaN, culled or not; no comparison
-        discards it.
+        Invalid are numbers that are not finite (0 NaN = NaN) and zero quaternions
+        (0 / 0 = NaN), except those of spheres. The NaN makes all readings of the object
+        NaN, culled or not.
         """
         row = 0.0 * (joint_pos.sum(-1) + base_pose.sum(-1))
         row = row + 0.0 / base_pose[:, 3:].square().sum(-1)
@@ -464,7 +463,7 @@ class ProximitySensor(RowTransform):
         object_pose: Tensor,
         active: Tensor,
     ) -> Tensor:
-        """Rows with an active object that may be in range, or with NaN, ``[n]``."""
+        """Rows with an active object that may be in range or is NaN, ``[n]``."""
         limit = self._farthest.to(object_pose.dtype)
         away = (object_pose[..., :3] - base_pose[:, None, :3]).square().sum(-1)
         away = away + self._poison(base_pose, joint_pos, object_pose)
@@ -486,17 +485,18 @@ class ProximitySensor(RowTransform):
 def checked(
     skin: Skin, coverage: Coverage, max_range: float | None, kind: type[Coverage]
 ) -> tuple[Skin, list]:
-    """Return the skin, resolved, and its coverages.
+    """Return the resolved skin and its coverages.
 
     Args:
         skin: The sensors.
-        coverage: For sensors without one of their own.
-        max_range: For sensors without a range of their own [m]; None: all have one.
-        kind: The coverage that all sensors must have.
+        coverage: Coverage of sensors for which the skin sets none.
+        max_range: Range of sensors for which the skin sets none [m]; None if it sets
+            all.
+        kind: Required kind of coverage.
 
     Raises:
-        ValueError: If the range is not positive, a sensor has none, or one is of
-            another kind.
+        ValueError: If the range is not positive, a sensor has no range, or its coverage
+            is of another kind.
     """
     if max_range is not None and not max_range > 0:
         raise ValueError(f"max_range must be positive, got {max_range}")

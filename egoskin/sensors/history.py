@@ -1,4 +1,4 @@
-"""Memory of observations: the last few of them, or the last that detected anything."""
+"""Memory of observations: the last few values, or the value at the last detection."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from egoskin.transform import StatefulTransform
 
 
 class History(StatefulTransform):
-    """The latest values of some entries side by side, oldest first.
+    """The latest values of some entries, concatenated, oldest first.
 
-    Reads any entries ``[*B, ..., F]`` and writes ``[*B, ..., length F]`` for each. An
-    episode starts with its first value throughout.
+    Reads any entries ``[*B, ..., F]`` and writes ``[*B, ..., length F]`` for each. At
+    the start of an episode the history is filled with the first value.
 
     Args:
-        length: How many values, the present one included.
+        length: Number of values, including the current one.
         in_keys: Keys of the entries.
         out_keys: Keys of their histories, in the same order.
 
@@ -54,14 +54,14 @@ class History(StatefulTransform):
     def advance(
         self, rows: Tensor, inputs: Sequence[Tensor], state: Sequence[Tensor]
     ) -> list[Tensor]:
-        """Return the histories without their oldest value and with the present one."""
+        """Return the histories with the oldest value dropped and the new one added."""
         return [
             torch.cat((past[..., x.shape[-1] :], x), -1)
             for past, x in zip(state, inputs, strict=True)
         ]
 
     def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
-        """Return the specs of the histories, bounded where their entries are."""
+        """Return the specs of the histories, bounded if their entries are."""
         specs = []
         for key in self.in_keys:
             one = spec[key]
@@ -81,9 +81,9 @@ class History(StatefulTransform):
 class KeepLast(StatefulTransform):
     """The signal while anything is detected, then its last value.
 
-    Reads ``signal [*B, F]`` (of `Localization`, for example) and any number of
-    ``object_detected [*B, O]`` (something is detected if one of them says so); writes
-    ``last_signal [*B, F]``, zero until something is detected in the episode.
+    Reads ``signal [*B, F]`` (for example from `Localization`) and any number of
+    ``object_detected [*B, O]`` (a detection in any of them counts); writes
+    ``last_signal [*B, F]``, zero until the first detection of the episode.
 
     Args:
         in_keys: Keys of the signal and of the detections (one or more).

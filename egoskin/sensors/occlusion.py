@@ -1,4 +1,4 @@
-"""Occlusion: what the robot's own body hides from its sensors."""
+"""Occlusion of objects by the robot's own body."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ from torch import Tensor
 from egoskin.robots.config import Primitive
 from egoskin.shapes import shape_of
 
-# A path is blocked if more than this of it lies inside one primitive [m]: a sensor on
-# the surface is not blocked by the point it sits on, nor is a path along the surface.
+# A path is blocked if a longer part of it than this lies inside one primitive [m]. The
+# surface that a sensor sits on therefore does not block it, nor paths along a surface.
 _DEPTH = 1e-3
-# Primitives are left out with this margin for rounding [m].
+# Margin for rounding when primitives are culled [m].
 _SLACK = 1e-3
-# Bundles worked on at a time: temporaries then stay in the cache.
+# Bundles processed at a time, so that temporaries stay in the cache.
 _CHUNK = 2**12
 
 
 class Occluder:
     """The body of a robot as an obstacle to straight paths.
 
-    Paths come in bundles: from one sensor to points of one object. Only primitives that
-    reach into the cone of a bundle are tried; the result is that of trying all.
+    Paths come in bundles from one sensor to points of one object. Only primitives that
+    reach into the cone of a bundle are tested; the result is the same as testing all.
 
     Args:
         primitives: The robot's body.
-        links: Links whose frames will be given, those of the body among them.
+        links: Links whose frames are passed to `blocked`, including those of the body.
     """
 
     def __init__(self, primitives: Sequence[Primitive], links: Sequence[str]) -> None:
@@ -47,15 +47,16 @@ class Occluder:
         direction: Sequence[Tensor],
         length: Tensor,
     ) -> Tensor:
-        """Return whether straight paths run through the robot.
+        """Return whether straight paths intersect the robot.
 
         Args:
             frames: Rotations ``[3, 3, L, B]`` and positions [m] ``[3, L, B]`` of the
                 links in the base frame.
             row: Row of each bundle, ``[n]``.
-            origin: Where each bundle starts, in the base frame [m], ``[3, n]``.
-            target: From there to the centre of where it leads [m], ``[3, n]``.
-            radius: No path ends farther from that centre than this [m].
+            origin: Start of each bundle in the base frame [m], ``[3, n]``.
+            target: Vector from there to the centre of the bundle's end points [m],
+                ``[3, n]``.
+            radius: Largest distance of an end point from that centre [m].
             bundle: Bundle of each path, ``[m]``.
             direction: Unit directions in the base frame, three of ``[m]``.
             length: Lengths of the paths [m], ``[m]``.
@@ -99,18 +100,18 @@ class Occluder:
     def _near(
         self, centre: Tensor, origin: Tensor, target: Tensor, radius: float
     ) -> Tensor:
-        """Which primitives may block some path of a bundle, ``[P, n]`` bool."""
+        """Which primitives may block a path of each bundle, ``[P, n]`` bool."""
         reach = (target * target).sum(0).sqrt()
         axis = target / reach
-        # All paths lie in the cone about a ball. From within the ball there is none:
-        # NaN, and all of the body is near.
+        # All paths lie in the cone around the ball of end points. For an origin inside
+        # the ball there is no cone: the NaN makes all primitives near.
         sin = radius / reach
         cos = (1 - sin * sin).sqrt()
         x, y, z = centre - origin[:, None]
         along = x * axis[0] + y * axis[1] + z * axis[2]
         x, y, z = x - along * axis[0], y - along * axis[1], z - along * axis[2]
         across = (x * x + y * y + z * z).sqrt()
-        # How far the primitive's centre is out of the cone: beside, behind, beyond.
+        # Distance of the primitive's centre from the cone: beside, behind, beyond it.
         gap = torch.maximum(across * cos - along * sin, -along)
         gap = torch.maximum(gap, along - (reach + radius))
         bounds = centre.new_tensor([s.bounding_radius for s in self._shapes])
@@ -118,6 +119,6 @@ class Occluder:
 
 
 def _turned(rows: Sequence | Tensor, vector: Sequence | Tensor) -> list[Tensor]:
-    """The product of a matrix, row by row, with a vector."""
+    """The product of a matrix, given by its rows, with a vector."""
     x, y, z = vector
     return [a * x + b * y + c * z for a, b, c in rows]

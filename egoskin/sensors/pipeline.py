@@ -1,7 +1,7 @@
-"""From a skin and a configuration to the signal: the one place where both are resolved.
+"""Build the transforms from a skin and a configuration to the signal.
 
-Contract: a `SensorPipeline` resolves the skin once. Whatever else wants to know of a
-sensor's coverage, range or group asks it.
+Contract: a `SensorPipeline` resolves the skin once. All other code takes the coverage,
+range and group of a sensor from it.
 """
 
 from __future__ import annotations
@@ -28,42 +28,41 @@ from egoskin.sensors.skin.skin import Skin
 from egoskin.shapes import Shape
 
 MASK_ALL = ("all",)
-"""Mask of all sensors, and of what an oracle observes."""
+"""Mask of all sensors, or of the whole observation of an oracle."""
 
-# The golden ratio's bits: seeds far apart for sensors of different kinds.
+# Bits of the golden ratio: the seeds of different groups are far apart.
 _GROUP_SEED = 0x9E3779B9
 
 
 def masks_all(mask: Sequence[str]) -> bool:
-    """Whether a mask is that of all sensors."""
+    """Whether a mask is the mask of all sensors."""
     return tuple(mask) == MASK_ALL
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SensorGroup:
-    """Sensors of one kind, which one transform computes."""
+    """Sensors of one kind, computed by one transform."""
 
     suffix: str
-    """Ending of the group's keys: ``distance{suffix}`` and so on; "" if it is alone."""
+    """Suffix of the group's keys, as in ``distance{suffix}``; "" for a single group."""
     index: list[int]
-    """Which sensors of the skin these are."""
+    """Indices of the group's sensors in the skin."""
     skin: Skin
-    """They alone, resolved."""
+    """Resolved skin with the group's sensors only."""
 
     @property
     def is_ray(self) -> bool:
-        """Whether they are grids of beams."""
+        """Whether the sensors are ray sensors."""
         return isinstance(self.skin.coverage[0], Ray)
 
 
 class SensorPipeline:
-    """What the sensors of a skin on a robot are, measure and signal.
+    """The sensors of a robot's skin, their measurements and their signal.
 
     Args:
-        config: What they measure, and what is signalled of it.
+        config: Measurements and signal.
         robot: The robot.
-        skin: The sensors; those that leave their coverage or range to the
-            configuration get them here.
+        skin: The sensors; a missing coverage or range is taken from the configuration.
 
     Raises:
         ValueError: If the configuration does not fit the skin.
@@ -82,7 +81,7 @@ class SensorPipeline:
             )
             for i, index in enumerate(groups)
         ]
-        """The sensors by kind; none without a skin."""
+        """The sensors grouped by kind; empty if no skin is used."""
         if config.reduce != "none" and not any(g.is_ray for g in self.groups):
             raise ValueError(
                 f"reduce={config.reduce} is for ray sensors, and the skin has none: "
@@ -90,7 +89,7 @@ class SensorPipeline:
             )
 
     def num_readings(self, group: SensorGroup) -> int:
-        """Return how many readings each sensor of a group signals, ``K`` or 1."""
+        """Return the number of readings per sensor of a group, ``K`` or 1."""
         coverage = group.skin.coverage[0]
         if isinstance(coverage, Ray) and self.config.reduce == "none":
             return coverage.num_beams
@@ -98,7 +97,7 @@ class SensorPipeline:
 
     @property
     def signal_size(self) -> int:
-        """Numbers that the signal of a row has; 0 without a skin."""
+        """Size of the signal of one row; 0 without a skin."""
         if self.config.signal == "localization":
             return 3
         return sum(len(g.index) * self.num_readings(g) for g in self.groups)
@@ -106,7 +105,7 @@ class SensorPipeline:
     # --- masks ------------------------------------------------------------------
 
     def check_mask(self, mask: Sequence[str]) -> None:
-        """Raise ValueError for a mask that masks nothing; the text lists what does.
+        """Raise ValueError if part of a mask has no effect; the text lists valid links.
 
         Args:
             mask: Links whose sensors detect nothing, or `MASK_ALL`.
@@ -128,7 +127,7 @@ class SensorPipeline:
                 )
 
     def masked(self, mask: Sequence[str]) -> list[int]:
-        """Return the indices of the sensors that a mask masks.
+        """Return the indices of the masked sensors.
 
         Args:
             mask: Links, or `MASK_ALL`.
@@ -141,10 +140,10 @@ class SensorPipeline:
     def sensors(
         self, objects: Sequence[Shape], masked: Collection[int] = ()
     ) -> list[FieldSensor | RaySensor]:
-        """Return the transforms that measure, one for each group.
+        """Return the transforms that compute the measurements, one per group.
 
         Args:
-            objects: Shapes of what is sensed.
+            objects: Shapes of the objects.
             masked: Indices of sensors that detect nothing.
         """
         sensors: list[FieldSensor | RaySensor] = []
@@ -176,13 +175,13 @@ class SensorPipeline:
     ) -> list[Transform]:
         """Return the transforms that write the signal (none without a skin).
 
-        It holds the readings of the skin's first sensor, of its second and so on, of
-        whatever kinds they are.
+        The readings in the signal are in the order of the sensors in the skin, also if
+        the skin has several kinds of sensors.
 
         Args:
-            objects: Shapes of what is sensed.
+            objects: Shapes of the objects.
             dt: Duration of a control step [s].
-            seed: Seed of what real sensors draw.
+            seed: Seed of the sensor models (`SensorConfig.corruption`).
             row_offset: Global index of the first row.
             out_key: Key of the signal.
             masked: Indices of sensors that detect nothing.
@@ -210,7 +209,7 @@ class SensorPipeline:
                 Corruption(
                     models,
                     dt=dt,
-                    # Two groups of sensors must not fail alike.
+                    # The errors of two groups must be independent.
                     seed=offset_seed(seed, number * _GROUP_SEED),
                     row_offset=row_offset,
                     in_keys=[distance, *joints],
@@ -234,12 +233,13 @@ class SensorPipeline:
         return transforms
 
     def sparse_rays(self, objects: Sequence[Shape]) -> SparseRays | None:
-        """Return what gives the signal as sparse rows, or None if it is not sparse.
+        """Return the function that computes the signal as sparse rows, or None.
 
-        Sparse are the beams of ideal rays of one grid and one range.
+        It is available for the full grids of ideal ray sensors that all have the same
+        grid and the same range.
 
         Args:
-            objects: Shapes of what is sensed.
+            objects: Shapes of the objects.
         """
         config = self.config
         measured = config.signal != "localization" and config.corruption == "none"
@@ -256,7 +256,7 @@ class SensorPipeline:
         """Return which sensors detect something in one row, ``[S]`` bool.
 
         Args:
-            state: One row of the environment's output, raw keys kept.
+            state: One row of the environment's output, including ``distance``.
         """
         result = np.zeros(len(self.skin), dtype=bool)
         for group in self.groups:
@@ -265,9 +265,9 @@ class SensorPipeline:
         return result
 
     def _signal(self, skin: Skin, in_key: str, out_key: str) -> Proximity | Binary:
-        """Return the signal of some sensors' readings."""
+        """Return the transform from readings of some sensors to their signal."""
         keys: dict[str, Any] = {"in_keys": [in_key], "out_keys": [out_key]}
-        # A corrupted reading may be one of something beyond the range.
+        # A corrupted reading can lie beyond the range.
         ranges = skin.range.tolist()
         if self.config.signal == "binary":
             return Binary(ranges, **keys)

@@ -1,4 +1,4 @@
-"""Ray sensors: grids of thin beams, the distance to the first hit of each."""
+"""Ray sensors: grids of thin beams that measure the distance to their first hit."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from egoskin.sensors.skin.skin import Skin
 from egoskin.shapes import Shape, first_hit
 from egoskin.sparse import SparseRows, offsets_of
 
-# Pairs of sensor and agent are culled with this margin for rounding [m].
+# Margin for rounding when pairs of sensor and object are culled [m].
 _SLACK = 1e-4
-# Pairs worked on at a time: temporaries then stay in the cache.
+# Readings processed at a time, so that temporaries stay in the cache.
 _CHUNK = 2**17
 
 
@@ -40,32 +40,34 @@ class RaySensor(ProximitySensor):
     ``object_active [*B, O]``. Writes ``distance [*B, S, K]`` [m] (with ``reduce``
     ``[*B, S]``), infinite where nothing is hit in range and NaN where the input is
     not finite, and ``object_detected [*B, O]``, whether any beam hits the object. A
-    sensor inside an object reads 0 on every beam. Distances are those of the state
-    given.
+    sensor inside an object reads 0 on every beam. Sensor poses are computed from the
+    joint positions by forward kinematics.
 
-    Only pairs of sensor and object whose bounding sphere reaches into the field of
-    view are computed: a few per cent. The result is that of computing all.
+    Only pairs of sensor and object for which the object's bounding sphere reaches into
+    the field of view are computed (a few per cent); the result is the same.
 
     Args:
-        skin: The sensors. Their own coverage and range come first; all must have the
-            same number of beams.
+        skin: The sensors. A coverage or range set in the skin takes precedence; all
+            sensors must have the same number of beams.
         chain: Kinematic chain of the robot, rooted at the base.
-        objects: Shape of each object, ``O`` of them, or of the only one.
+        objects: Shape of each of the ``O`` objects, or a single shape.
         max_range: A distance is detected if it is at most this [m]; may be infinite.
-            None if all sensors have a range of their own.
-        coverage: What a sensor sees.
-        reduce: "min" writes the minimum over each sensor's beams, without the grid.
-        body: The robot's shapes, to hide what lies behind them; empty: transparent.
-        per_object: Objects told apart in a last dimension ``O``.
+            None if the skin sets a range for every sensor.
+        coverage: Coverage of sensors for which the skin sets none.
+        reduce: "min" writes only the minimum over each sensor's beams.
+        body: The robot's shapes, for occlusion; empty: no occlusion.
+        per_object: Write one distance per object, in a last dimension ``O``.
         cull: Skip pairs that cannot hit; results are the same.
-        compile: Use C++ kernels, where they can be compiled, for balls and a
-            transparent robot; results are the same (float64: to the last bit or two).
+        compile: Use C++ kernels if they can be compiled, all objects are balls and
+            there is no occlusion; results are the same (float64: to the last bit or
+            two).
         in_keys: Keys of the four inputs, in the order above.
         out_keys: Keys of the two outputs, in the order above.
 
     Raises:
         ValueError: If the range is not positive, the skin does not fit the chain,
-            holds a sensor that is no ray sensor, or sensors of different beams.
+            contains a sensor that is not a ray sensor, or sensors with different
+            numbers of beams.
     """
 
     _beams: Tensor
@@ -102,11 +104,11 @@ class RaySensor(ProximitySensor):
             )
         self._num_beams = len(directions[0])
         self.reduce, self._cull = reduce, cull
-        # [3, U, K] for U different coverages, and which of them each sensor has.
+        # [3, U, K] for U different coverages, and the index of each sensor's coverage.
         beams = torch.stack(directions).movedim(-1, 0)
         beam_of = torch.tensor([kinds.index(r) for r in rays])
-        # Cosine and sine of the half angles of the pyramid about each sensor's beams,
-        # along x and along y.
+        # Cosine and sine of the half angles along x and y of the pyramid around each
+        # sensor's beams.
         slopes = (beams[:2].abs() / beams[2]).amax(-1)[:, beam_of]
         angles = slopes.atan()
         depth = torch.tensor([r.measure == "depth" for r in rays])
@@ -139,18 +141,18 @@ class RaySensor(ProximitySensor):
                 bound=np.array(bounds),
                 reach=self._reach.numpy(),
                 pyramid=pyramid.permute(2, 0, 1, 3).numpy(),
-                # Whole vectors; what is added repeats the last direction.
+                # Padded to whole vectors with copies of the last direction.
                 directions=_padded(beams.transpose(0, 1).numpy()),
                 grid=beam_of.numpy(),
                 depth=depth.numpy() if depth.any() else None,
             )
 
     def margins(self, scene: Scene) -> tuple[Tensor, list[View]]:
-        """Return by how much each sensor may see each object.
+        """Return the culling margin of each sensor and object, and the views.
 
         Returns:
             Margin [m] ``[O, B, S]``, 0 only where no beam can hit in range, and the
-            objects as the links see them.
+            `View` of each object.
         """
         views = self.views(scene)
         margins = [
@@ -164,7 +166,7 @@ class RaySensor(ProximitySensor):
         away = view.centre[:, self._link] - skin["offset"]
         x, y, z = self._in_sensor(away, skin["axes"])
         if not self._cull:
-            # 1, or NaN.
+            # No pair is culled: 1, or NaN.
             return 1.0 + 0.0 * x
         # Outside the range, behind the sensor, or beyond a side of the pyramid:
         # R + r - |c|, r + z, r - (|x| cos h - z sin h).
@@ -178,7 +180,7 @@ class RaySensor(ProximitySensor):
 
     @staticmethod
     def _in_sensor(v: Tensor, axes: Tensor) -> list[Tensor]:
-        """Coordinates along the axes of the sensor frames."""
+        """Coordinates of a vector in the sensor frames."""
         return [a[0] * v[0] + a[1] * v[1] + a[2] * v[2] for a in axes]
 
     def read(
@@ -189,17 +191,17 @@ class RaySensor(ProximitySensor):
         row: Tensor,
         shape: Shape,
     ) -> tuple[Tensor, Tensor]:
-        """Return what some pairs of sensor and row measure of one object.
+        """Return the readings of one object for some pairs of sensor and row.
 
         Args:
             scene: The rows.
-            view: The object as the links see it.
+            view: The object in the link frames.
             sensor: Sensor of each pair, ``[n]``.
             row: Row of each pair, ``[n]``.
             shape: The object's shape.
 
         Returns:
-            Readings [m], ``[n, K]`` or reduced ``[n]``, and the least of each pair,
+            Readings [m], ``[n, K]`` or reduced ``[n]``, and the minimum of each pair,
             ``[n]``.
         """
         skin, link = scene.skin, self._link[sensor]
@@ -211,7 +213,7 @@ class RaySensor(ProximitySensor):
             beams = beams[:, self._beam_of[sensor]]
         origin, way = [-c[:, None] for c in centre], list(beams)
         if view.turn is not None:
-            # Sensor to object: M R, the columns of R being the sensor's axes.
+            # Sensor to object: M R; the columns of R are the sensor's axes.
             turn = product(view.turn[:, :, link, row], axes.transpose(0, 1))[..., None]
             x, y, z = origin
             origin = [r[0] * x + r[1] * y + r[2] * z for r in turn]
@@ -235,11 +237,11 @@ class RaySensor(ProximitySensor):
         return (least if self.reduce == "min" else distance), least
 
     def measure(self, scene: Scene, rows: Tensor, out: Tensor) -> Tensor:
-        """Write the readings of some rows, and return the least of each object."""
+        """Write the readings of some rows; return the minimum of each object."""
         least = scene.active.new_full(scene.active.shape, torch.inf, dtype=out.dtype)
         for i, row, place, reading, nearest in self._pairs(scene, rows):
             target = out[i] if self.per_object else out
-            # A view, or an error: a copy would lose what is written.
+            # view() and not reshape(): writes to a copy would be lost.
             flat = target.view(-1, *target.shape[2:])
             if i and not self.per_object:
                 reading = torch.minimum(_take(flat, place), reading)
@@ -250,26 +252,26 @@ class RaySensor(ProximitySensor):
     def _pairs(
         self, scene: Scene, rows: Tensor
     ) -> Iterator[tuple[int, Tensor, Tensor, Tensor, Tensor]]:
-        """Yield object, rows, places, readings and their least, of what may be hit.
+        """Yield object, rows, places, readings and their minima of all possible hits.
 
-        Rows count within the scene; a place is that of a sensor in ``[B S]``.
+        Row indices are relative to the scene; a place is a sensor's index in ``[B S]``.
         """
         margins, views = self.margins(scene)
         for i, (view, shape) in enumerate(zip(views, self.objects, strict=True)):
-            # Whatever is not 0 may be hit, NaN too.
+            # Pairs with a margin that is not 0 may hit, including NaN.
             for part in _nonzero(margins[i]).split(self._chunk):
                 row, sensor = part // self.num_sensors, part % self.num_sensors
                 place = rows[row] * self.num_sensors + sensor
                 yield i, row, place, *self.read(scene, view, sensor, row, shape)
 
     def hits(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what is hit, without the grid: a thousandth of its numbers.
+        """Return only the beams that hit: about a thousandth of the full grid.
 
         Args:
             inputs: Base pose, joint positions, object poses, active flags.
 
         Returns:
-            Place in the flattened readings ``[B, S, K]`` of each beam that hits
+            Index in the flattened readings ``[B, S, K]`` of each beam that hits
             anything, ascending ``[n]`` int64, and its reading [m], ``[n]``.
         """
         if self._kernels is not None and self._kernels.can(*inputs[:3]):
@@ -280,7 +282,7 @@ class RaySensor(ProximitySensor):
             return places[0], readings[0]
         scene = self.scene(*(x[rows] for x in inputs))
         for _, _, place, reading, _ in self._pairs(scene, rows):
-            # NaN is no miss.
+            # NaN counts as a hit.
             hit = _nonzero(reading != torch.inf)
             beam = hit % self._num_beams
             places.append(place[hit // self._num_beams] * self._num_beams + beam)
@@ -292,12 +294,12 @@ class RaySensor(ProximitySensor):
 class SparseRays:
     """The signal of full ray grids as `egoskin.sparse.SparseRows`, ``[B, S K]``.
 
-    The same numbers as those of the transforms, of the beams that hit anything; for
-    agents that learn from thousands of beams.
+    Stores the values only of beams that hit something, equal to those of the
+    transforms. For agents that learn from thousands of beams.
 
     Args:
-        sensor: Sensors with all their beams, objects not told apart.
-        reading: What makes the signal of a distance, the same for every sensor.
+        sensor: Sensors without ``reduce`` and without ``per_object``.
+        reading: Transform from distance to signal, the same for every sensor.
     """
 
     def __init__(self, sensor: RaySensor, reading: Proximity | Binary) -> None:
@@ -324,7 +326,7 @@ class SparseRays:
 
 
 def _nearest(place: Tensor, reading: Tensor) -> tuple[Tensor, Tensor]:
-    """Return each place once, ascending, with the least of its readings; NaN stays NaN.
+    """Return unique places, ascending, with their minimum readings; NaN stays NaN.
 
     Args:
         place: Places, ``[n]``.
@@ -336,7 +338,7 @@ def _nearest(place: Tensor, reading: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _nearest_numpy(place: Tensor, reading: Tensor) -> tuple[Tensor, Tensor]:
-    """Return what `_nearest` does; NumPy's sort uses that most are in order already."""
+    """Return the same as `_nearest`; NumPy's sort is fast on nearly sorted places."""
     places, readings = place.numpy(), reading.numpy()
     order = np.argsort(places, kind="stable")
     places = places[order]
@@ -346,30 +348,30 @@ def _nearest_numpy(place: Tensor, reading: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _padded(directions: np.ndarray) -> np.ndarray:
-    """Return ``[..., n]`` with n made a multiple of the kernels' vectors."""
+    """Return ``[..., n]`` with n padded to a multiple of the kernels' vector size."""
     extra = -directions.shape[-1] % VECTOR
     return np.pad(directions, [(0, 0)] * (directions.ndim - 1) + [(0, extra)], "edge")
 
 
 def _numpy_serves(x: Tensor) -> bool:
-    """Whether NumPy may work on a tensor's memory."""
+    """Whether NumPy may operate on a tensor's memory."""
     return x.is_cpu and not x.requires_grad and not torch.compiler.is_compiling()
 
 
 def _nonzero(x: Tensor) -> Tensor:
     """Return the indices of the entries that are not 0, ``[n]``."""
     if _numpy_serves(x):
-        # PyTorch's takes several times as long.
+        # PyTorch's nonzero takes several times as long.
         return torch.from_numpy(np.flatnonzero(x.numpy() != 0))
     return x.flatten().nonzero()[:, 0]
 
 
-# Rows of a grid are short: NumPy moves each as one item, PyTorch number by number,
-# which takes four times as long.
+# Rows of a grid are short. NumPy copies each row as one item; PyTorch copies number by
+# number, which takes four times as long.
 
 
 def _items(x: Tensor) -> np.ndarray:
-    """Return the rows of a tensor as one item each, ``[n]``: a view."""
+    """Return a view of a tensor with each row as one item, ``[n]``."""
     array = x.numpy()
     return array.view(np.dtype((np.void, array[:1].nbytes))).reshape(-1)
 

@@ -1,9 +1,8 @@
-"""Signals: what a policy is given of what sensors measure.
+"""Signals: conversion of sensor measurements to policy observations.
 
-All of them read the measurements of a coverage, so that every signal goes with every
-coverage and whatever corrupts a measurement comes in between. A measurement of
-infinity means that nothing is in range, as does one beyond the range; one of NaN (bad
-input) gives a signal of NaN.
+Signals read the measurements of any coverage, with or without corruption in between. A
+measurement that is infinite or beyond the range means that nothing is in range; NaN
+(invalid input) gives a signal of NaN.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from egoskin.robots.kinematics import rotate_inverse
 from egoskin.sensors.geometry import ProximitySensor
 from egoskin.transform import RowTransform
 
-# An infinite range has no scale of its own: distance d reads d / (d + 1 m).
+# An infinite range has no scale: a distance d gives the signal d / (d + 1 m).
 _HALF_DISTANCE = 1.0
 
 
@@ -29,9 +28,9 @@ class _Reading(RowTransform):
     """A signal of one number for each measurement, in [0, 1].
 
     Args:
-        max_range: The sensor whose measurements these are, for its own ranges. Or
-            ranges [m], one or one for each sensor, that may be infinite: a measurement
-            beyond finds nothing, however far the sensor sees.
+        max_range: Sensor transform whose ranges are used, or ranges [m], one for all or
+            one for each sensor; may be infinite. A measurement beyond counts as no
+            detection, even if the sensor's own range is larger.
         in_keys: Key of the measurements.
         out_keys: Key of the signal.
 
@@ -89,18 +88,18 @@ class _Reading(RowTransform):
 
 
 class Proximity(_Reading):
-    """Distance over range: 0 at the sensor, 1 at the range, beyond and for nothing.
+    """Distance over range: 0 is contact, 1 is at the range or no detection.
 
     Reads ``distance [*B, S]`` or ``[*B, S, K]`` [m]; writes ``signal [*B, S K]``,
     sensor by sensor.
 
     Args:
-        max_range: The sensor whose measurements these are, for its own ranges. Or
-            ranges [m], one or one for each sensor: a measurement beyond reads as
-            nothing, however far the sensor sees. For an infinite one the signal is
+        max_range: Sensor transform whose ranges are used, or ranges [m], one for all or
+            one for each sensor. A measurement beyond counts as no detection, even if
+            the sensor's own range is larger. For an infinite range the signal is
             d / (d + 1 m).
-        closeness: Write 1 - signal instead: 1 at the sensor, 0 at the range and for
-            nothing.
+        closeness: Write 1 - signal instead: 1 is contact, 0 is at the range or no
+            detection.
         in_keys: Key of the measurements.
         out_keys: Key of the signal.
 
@@ -123,24 +122,24 @@ class Proximity(_Reading):
     def signal(self, distance: Tensor) -> Tensor:
         """Return the signal of measurements [m], ``[B, n]`` each."""
         scale = self._limits(distance)
-        # An infinite distance is nothing (1) whatever the range.
+        # An infinite distance gives 1 for every range.
         limited = (distance / scale).clamp_(0.0, 1.0)
         if self._unlimited:
-            # 1 - 1 / (1 + d) is 1 for an infinite distance, where d / (1 + d) is NaN.
+            # For an infinite distance 1 - 1 / (1 + d) is 1, but d / (1 + d) is NaN.
             unlimited = 1.0 - _HALF_DISTANCE / (_HALF_DISTANCE + distance)
             limited = torch.where(scale.isinf(), unlimited, limited)
         return 1.0 - limited if self.closeness else limited
 
 
 class Binary(_Reading):
-    """Whether each measurement finds anything in range: 1 or 0.
+    """Whether each measurement is in range: 1 or 0.
 
     Reads ``distance [*B, S]`` or ``[*B, S, K]`` [m]; writes ``signal [*B, S K]``.
 
     Args:
-        max_range: The sensor whose measurements these are, for its own ranges, or
-            ranges [m], one or one for each sensor. (Measurements that are infinite
-            beyond it, those of perfect sensors, need none.)
+        max_range: Sensor transform whose ranges are used, or ranges [m], one for all or
+            one for each sensor. (Not needed for ideal sensors, whose measurements are
+            infinite beyond their range.)
         in_keys: Key of the measurements.
         out_keys: Key of the signal.
 
@@ -158,25 +157,24 @@ class Binary(_Reading):
         super().__init__(max_range, in_keys, out_keys)
 
     def signal(self, distance: Tensor) -> Tensor:
-        """Return 1 for what is measured in range, 0 for nothing, NaN for NaN."""
-        # Nothing is infinitely far, whatever the range.
+        """Return 1 for measurements in range, 0 for no detection, NaN for NaN."""
+        # An infinite distance is out of range even if the range is infinite.
         limit = self._limits(distance).clamp(max=torch.finfo(distance.dtype).max)
         inside = (distance <= limit).to(distance)
         return torch.where(distance.isnan(), distance, inside)
 
 
 class SkinOrder(RowTransform):
-    """Signals of several groups of sensors as one, in the order of the skin.
+    """Concatenates the signals of several groups of sensors in the order of the skin.
 
-    Reads a signal for each group, ``[*B, n]`` of its sensors one after the other, and
-    writes ``signal [*B, N]``: the readings of the skin's first sensor, of its second
-    and so on.
+    Reads a signal ``[*B, n]`` for each group, its sensors one after the other, and
+    writes ``signal [*B, N]`` with the readings in the order of the skin's sensors.
 
     Args:
-        groups: The sensors of each group, which together are all.
-        num_readings: Readings of each sensor of a group.
+        groups: Indices of the sensors of each group; together all of the skin.
+        num_readings: Readings per sensor of each group.
         in_keys: Key of the signal of each group.
-        out_keys: Key of the signal of all.
+        out_keys: Key of the signal of all groups.
     """
 
     _order: Tensor
@@ -190,7 +188,7 @@ class SkinOrder(RowTransform):
         out_keys: Sequence[NestedKey] = ("signal",),
     ) -> None:
         super().__init__(in_keys, out_keys)
-        # The sensor that each number comes from.
+        # Index of the sensor that each number comes from.
         owner = [
             torch.tensor(group).repeat_interleave(each)
             for group, each in zip(groups, num_readings, strict=True)
@@ -198,20 +196,21 @@ class SkinOrder(RowTransform):
         self.register_buffer("_order", torch.cat(owner).argsort(stable=True))
 
     def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
-        """Return the signal of all, ``[B, N]``."""
+        """Return the signal of all groups, ``[B, N]``."""
         return (torch.cat(inputs, -1)[:, self._order],)
 
     def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
-        """Return the spec of the signal of all."""
+        """Return the spec of the signal of all groups."""
         shape = torch.Size((*spec.shape, len(self._order)))
         return (Bounded(0.0, 1.0, shape=shape, dtype=spec[self.in_keys[0]].dtype),)
 
 
 class BeamMinimum(RowTransform):
-    """The smallest of each sensor's beams, for readings that exist already.
+    """Minimum over each sensor's beams, for existing readings.
 
-    Reads ``distance [*B, S, K]`` [m]; writes ``sensor_distance [*B, S]``. (Where beams
-    need not be kept or corrupted one by one, ``RaySensor(reduce="min")`` is faster.)
+    Reads ``distance [*B, S, K]`` [m]; writes ``sensor_distance [*B, S]``.
+    (``RaySensor(reduce="min")`` is faster if beams need not be kept or corrupted
+    individually.)
 
     Args:
         in_keys: Key of the measurements.
@@ -236,12 +235,12 @@ class BeamMinimum(RowTransform):
 
 
 class Localization(RowTransform):
-    """Position of the detected object nearest to the robot's base, in its frame.
+    """Position of the detected object nearest to the robot's base, in the base frame.
 
     Reads ``base_pose [*B, 7]``, ``object_pose [*B, O, 7]``, ``joint_pos [*B, J]`` and
-    any number of ``object_detected [*B, O]`` (an object counts if one of them says
-    so). Writes ``signal [*B, 3]`` [m], zero if no sensor detects any object and NaN if
-    one does in a row that holds NaN: where the sensors are is then unknown.
+    any number of ``object_detected [*B, O]`` (a detection in any of them counts).
+    Writes ``signal [*B, 3]`` [m], zero if no sensor detects any object, and NaN if one
+    is detected in a row with NaN inputs, as the sensor poses are then unknown.
 
     Args:
         in_keys: Keys of base pose, object pose, joint positions and detections (one
@@ -267,14 +266,14 @@ class Localization(RowTransform):
         quat = base_pose[:, 3:] / base_pose[:, 3:].norm(dim=-1, keepdim=True)
         each = quat[:, None].expand(-1, offset_w.shape[1], -1)
         position = rotate_inverse(each, offset_w)
-        # Bad joints leave open where the sensors are, a bad orientation of an object
-        # where its surface is: 0 NaN = NaN.
+        # With invalid joints the sensor poses are unknown, with an invalid orientation
+        # the object's surface is: 0 NaN = NaN.
         bad = joint_pos.sum(-1, keepdim=True) + object_pose[..., 3:].sum(-1)
         position = position + 0.0 * bad[..., None]
         away = offset_w.square().sum(-1)
         nearest = away.masked_fill(~detected, torch.inf).argmin(-1, keepdim=True)
         position = position.gather(1, nearest[..., None].expand(-1, -1, 3))[:, 0]
-        # A detected object of NaN stays NaN; what is not in play may be anywhere.
+        # NaN remains if an object is detected; poses of inactive objects do not matter.
         return (position.masked_fill(~detected.any(-1, keepdim=True), 0.0),)
 
     def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:

@@ -1,13 +1,13 @@
-"""Touch: which links are in contact, and what other tasks make of it.
+"""Touch: contacts of links, and contact penalty, termination and labels for tasks.
 
-Everything counts contact per link, ``[*B, L]``; which of the ``L`` links matter is
-named by shell patterns. For a walking task the feet are left out::
+Contacts are per link, ``[*B, L]``; shell patterns select which of the ``L`` links
+count. For a walking task, exclude the feet::
 
     body = [name for name in robot.links if name not in robot.feet]
     ContactTermination(robot.links, body)
 
-Rewards and ends are TorchRL's own, so `ContactPenalty` and `ContactTermination` write
-the keys they read, as `torchrl.envs.RewardScaling` does.
+`ContactPenalty` and `ContactTermination` read and overwrite TorchRL's reward and done
+keys, as `torchrl.envs.RewardScaling` does.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def _matching(links: Sequence[str], patterns: Sequence[str]) -> Tensor:
 
 
 def _check_links(tactile: Tensor, links: Tensor, key: NestedKey) -> None:
-    """Raise ValueError unless contacts have one entry for each link."""
+    """Raise ValueError unless there is one contact for each link."""
     if tactile.shape[-1] != len(links):
         raise ValueError(
             f"{key!r} holds {tactile.shape[-1]} contacts a row, the transform was "
@@ -55,19 +55,19 @@ def _check_links(tactile: Tensor, links: Tensor, key: NestedKey) -> None:
 
 
 class Tactile(RowTransform):
-    """Whether each link is touched: its contact force is above a threshold.
+    """Whether the contact force on each link is above a threshold.
 
     Reads ``contact_force [*B, L, n]`` [N]; writes ``tactile [*B, L]`` bool. The last
-    three components are the force, so that MuJoCo's ``cfrc_ext`` (torque, then force)
-    is read as it is. A force that is not a number counts as contact.
+    three components are the force, so MuJoCo's ``cfrc_ext`` (torque, then force) can be
+    used directly. A force of NaN counts as contact.
 
     Args:
-        threshold: A link is touched if its force is larger than this [N].
+        threshold: A link is in contact if its force is larger than this [N].
         in_keys: Key of the forces.
         out_keys: Key of the contacts.
 
     Raises:
-        ValueError: If the threshold is negative or no number.
+        ValueError: If the threshold is negative or NaN.
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class Tactile(RowTransform):
     def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Return the contacts, ``[B, L]`` bool."""
         (force,) = inputs
-        # Not `>`, which is false for NaN: a broken simulation must not read as free.
+        # Not `>`, which is false for NaN: a diverged simulation must count as contact.
         return (~(force[..., -3:].norm(dim=-1) <= self.threshold),)
 
     def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
@@ -94,20 +94,20 @@ class Tactile(RowTransform):
 
 
 class ContactPenalty(Transform):
-    """Lowers the reward by a price for each link that touches something.
+    """Reduces the reward by a price for each link in contact.
 
     Reads ``tactile [*B, L]`` and ``reward [*B, 1]``; writes ``reward``.
 
     Args:
         links: Names of the links, in the order of ``tactile``.
-        prices: What a step of contact costs, by link name pattern; each pattern
-            counts for every link that it matches, and a link that none does is free.
+        prices: Cost of one step of contact by link name pattern. The prices of all
+            patterns that match a link add up; a link without a match costs nothing.
         in_keys: Keys of the two inputs, in the order above.
         out_keys: Key of the reward.
 
     Raises:
-        ValueError: If a pattern matches no link, a price is not finite or there is
-            none.
+        ValueError: If a pattern matches no link, a price is not finite or ``prices`` is
+            empty.
     """
 
     _prices: Tensor
@@ -132,11 +132,11 @@ class ContactPenalty(Transform):
         return next_tensordict.set(self.out_keys[0], reward - cost[..., None])
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the reward of any tensordict that holds the in keys."""
+        """Write the reward into any tensordict that holds the in keys."""
         return self._call(tensordict)
 
     def transform_reward_spec(self, reward_spec: TensorSpec) -> TensorSpec:
-        """Return the spec with a reward that is not bounded."""
+        """Return the spec with an unbounded reward."""
         assert isinstance(reward_spec, Composite)
         old = reward_spec[self.in_keys[1]]
         reward_spec[self.out_keys[0]] = Unbounded(
@@ -146,10 +146,10 @@ class ContactPenalty(Transform):
 
 
 class ContactTermination(Transform):
-    """Ends the episode when a link touches something.
+    """Terminates the episode when a link is in contact.
 
     Reads ``tactile [*B, L]``, ``terminated [*B, 1]`` and ``done [*B, 1]``; writes
-    ``terminated`` and ``done``. ``truncated`` stays as it is. A contact in the state
+    ``terminated`` and ``done``; ``truncated`` is unchanged. A contact in the state
     after a reset does not end the episode.
 
     Args:
@@ -183,7 +183,7 @@ class ContactTermination(Transform):
         return next_tensordict
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the ends of any tensordict that holds the in keys."""
+        """Write the done flags into any tensordict that holds the in keys."""
         return self._call(tensordict)
 
 
@@ -191,9 +191,9 @@ class ContactFree(StatefulTransform):
     """Whether the trajectory has been free of contact so far.
 
     Reads ``tactile [*B, L]``; writes ``contact_free [*B, 1]`` bool, which is its
-    state. At the last step of a trajectory it is the label that `contact_free` gives
-    to the whole of it, unless the state it was reset to already touches: that counts
-    here, and is no step there.
+    state. At the last step of a trajectory it equals the label that `contact_free`
+    gives to the whole trajectory, except that contact in the state after the reset
+    counts only here: `contact_free` sees only steps.
 
     Args:
         links: Names of the links, in the order of ``tactile``.
@@ -231,7 +231,7 @@ class ContactFree(StatefulTransform):
     def advance(
         self, rows: Tensor, inputs: Sequence[Tensor], state: Sequence[Tensor]
     ) -> Sequence[Tensor]:
-        """Return whether it still is, ``[B, 1]``."""
+        """Return whether the trajectory is still free of contact, ``[B, 1]``."""
         (now,) = self.start(rows, inputs, None)
         return (state[0] & now,)
 
@@ -241,18 +241,18 @@ class ContactFree(StatefulTransform):
 
 
 def _trajectory(done: Tensor) -> Tensor:
-    """Return the number of each step's trajectory: the ends before it."""
+    """Return the index of each step's trajectory: the number of ends before it."""
     return done.long().cumsum(-2) - done.long()
 
 
 def contact_free(tactile: Tensor, done: Tensor) -> Tensor:
-    """Return whether the whole trajectory that a step belongs to is free of contact.
+    """Return whether the whole trajectory that each step belongs to is contact-free.
 
     Args:
-        tactile: Contacts after each step, ``[*B, T, L]`` bool; give only the links
+        tactile: Contacts after each step, ``[*B, T, L]`` bool; pass only the links
             that count (without feet: ``tactile[..., body]``).
-        done: Whether the step was the last of its trajectory, ``[*B, T, 1]`` bool. A
-            last trajectory without an end counts by the steps that it has.
+        done: Whether the step was the last of its trajectory, ``[*B, T, 1]`` bool. An
+            unfinished last trajectory is labelled by the steps it has.
 
     Returns:
         One label for each step, ``[*B, T, 1]`` bool.
@@ -266,7 +266,7 @@ def contact_free(tactile: Tensor, done: Tensor) -> Tensor:
 def split_by_contact(
     data: TensorDictBase, tactile: Tensor, done: Tensor
 ) -> tuple[list[TensorDictBase], list[TensorDictBase]]:
-    """Return the contact-free trajectories of stored steps, and the others.
+    """Split stored steps into contact-free trajectories and others.
 
     Args:
         data: Steps ``[*B, T]``.
@@ -274,16 +274,16 @@ def split_by_contact(
         done: As for `contact_free`.
 
     Returns:
-        Two lists of trajectories, a tensordict ``[T_i]`` each, in the order of the
-        data; views of it where that is contiguous.
+        Contact-free trajectories and others: two lists of tensordicts ``[T_i]`` in the
+        order of the data, which are views if the data is contiguous.
     """
     flat = data.reshape(-1)
     number = _trajectory(done).reshape(-1, data.shape[-1])
-    # A row of T steps holds at most T trajectories: no number comes twice.
+    # A row of T steps has at most T trajectories, so the numbers are unique.
     row = torch.arange(len(number), device=number.device)
     number = number + data.shape[-1] * row[:, None]
     _, lengths = number.reshape(-1).unique_consecutive(return_counts=True)
-    # A trajectory has one label: that of its last step.
+    # The label of a trajectory is that of its last step.
     free = contact_free(tactile, done).reshape(-1)[lengths.cumsum(0) - 1]
     pieces = list(zip(flat.split(lengths.tolist()), free.tolist(), strict=True))
     return [p for p, ok in pieces if ok], [p for p, ok in pieces if not ok]

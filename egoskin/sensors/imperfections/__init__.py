@@ -1,1 +1,1 @@
-"""What makes real readings of true distances: noise, rate, latency, drop-out."""
+"""Models of sensor imperfections: noise, sampling rate, latency, dropout."""

@@ -1,12 +1,12 @@
-"""Imperfect sensors: the transform that makes readings of true distances.
+"""Imperfect sensors: the transform from true distances to sensor readings.
 
 Imperfections (`egoskin.sensors.imperfections.models`) are frozen dataclasses that hold
 their own parameters; `Corruption` applies a sequence of them to every reading of a
-skin. Distances are metres; infinite means that nothing is in range, and NaN marks a
-bad input and stays NaN.
+skin. Distances are in metres; infinite means that nothing is in range, and NaN marks an
+invalid input and stays NaN.
 
-Every draw is a function of (seed, global row, episode, step, model, reading): results
-depend neither on the number of workers nor on which rows reset together.
+Every random number is a function of (seed, global row, episode, step, model, reading):
+results depend neither on the number of workers nor on which rows reset together.
 """
 
 from __future__ import annotations
@@ -25,41 +25,41 @@ from egoskin.rng import Stream, halfwords, random_words, stream_key
 from egoskin.transform import StatefulTransform
 
 State = dict[str, Tensor]
-"""What a model remembers from step to step, by name, ``[B, ...]`` each."""
+"""State of a model between steps: tensors ``[B, ...]`` by name."""
 
-# Fourth word of a draw's counter: 24 bits of block, 2 of purpose, 6 of model.
+# Fourth word of the generator's counter: 24 bits of block, 2 of purpose, 6 of model.
 _PURPOSE_BIT, _MODEL_BIT = 24, 26
 _MAX_MODELS = 1 << (32 - _MODEL_BIT)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Moment:
-    """When readings are made and whose they are."""
+    """Time of a batch of readings and their rows, for random draws."""
 
     seed: int
     """Seed of all draws."""
     dt: float
     """Duration of a control step [s]."""
     row: Tensor
-    """Global agent rows, ``[B]`` int64."""
+    """Global row indices, ``[B]`` int64."""
     episode: Tensor
     """Episode of each row, ``[B]`` int64."""
     step: Tensor
     """Control steps since the start of the episode, ``[B]`` int64."""
     speed: Tensor
-    """Speed of the fastest joint [rad/s], ``[B]``; 0 where no model asks for it."""
+    """Speed of the fastest joint [rad/s], ``[B]``; 0 if no model depends on it."""
     redraw_traits: bool
-    """Whether each row and episode has sensors of its own."""
+    """Whether sensor properties are redrawn for each row and episode."""
     model: int = 0
-    """Place of the model in the sequence: models share no draw."""
+    """Index of the model in the sequence; models draw independent numbers."""
 
     def words(self, row: Tensor, block: Tensor, purpose: int = 0) -> Tensor:
         """Return four random words for each of some rows at this step.
 
         Args:
             row: Rows of this batch, ``[n]`` int64.
-            block: Which words of the row, ``[n]`` int64 in [0, 2**24).
-            purpose: What the model draws them for, in [0, 4).
+            block: Index of the words within the row, ``[n]`` int64 in [0, 2**24).
+            purpose: Number that separates different draws of a model, in [0, 4).
 
         Returns:
             Words in [0, 2**32), ``[4, n]`` int64.
@@ -75,8 +75,8 @@ class Moment:
 
     @cached_property
     def of_traits(self) -> Moment:
-        """The moment of draws that are constant: for what a sensor is."""
-        # A step that no episode has, so that traits share no draw with a step.
+        """The moment for draws of constant sensor properties (traits)."""
+        # Step -1 exists in no episode: traits are independent of all steps' draws.
         fixed = replace(self, step=torch.full_like(self.step, -1))
         if self.redraw_traits:
             return fixed
@@ -85,13 +85,13 @@ class Moment:
 
 
 class Places:
-    """Some places in readings ``[B, S, K]``, and the random numbers drawn there.
+    """Places (indices) in readings ``[B, S, K]``, and the random numbers drawn there.
 
     Args:
         row: Rows of this batch, ``[n]`` int64, ascending.
         place: Places in the flat ``[S, K]`` of the row, ``[n]`` int64, ascending
             within a row.
-        beams: Beams of a sensor ``K``.
+        beams: Number of beams per sensor ``K``.
     """
 
     def __init__(self, row: Tensor, place: Tensor, beams: int) -> None:
@@ -114,7 +114,7 @@ class Places:
 
         Args:
             moment: The moment of the readings.
-            purpose: What the model draws them for, in [0, 4).
+            purpose: Number that separates different draws of a model, in [0, 4).
 
         Returns:
             Numbers in [0, 2**16), ``[n]`` int64.
@@ -122,11 +122,11 @@ class Places:
         return _numbers(self._readings, moment, purpose)
 
     def draw_trait(self, moment: Moment, purpose: int = 0) -> Tensor:
-        """Return a random number for the sensor of each place, for all its time.
+        """Return a random number for the sensor of each place, constant over time.
 
         Args:
             moment: The moment of the readings.
-            purpose: What the model draws them for, in [0, 4).
+            purpose: Number that separates different draws of a model, in [0, 4).
 
         Returns:
             Numbers in [0, 2**16), ``[n]`` int64.
@@ -135,7 +135,7 @@ class Places:
         return _numbers(calls, moment.of_traits, purpose)
 
     def draw_common(self, moment: Moment) -> Tensor:
-        """Return a random number for each place at this step, one for a whole row.
+        """Return a random number for each place at this step, shared within each row.
 
         Args:
             moment: The moment of the readings.
@@ -151,18 +151,18 @@ class Places:
 
 
 def _calls(row: Tensor, place: Tensor) -> tuple[Tensor, ...]:
-    """Return the calls of the generator that serve some places, and who is served.
+    """Return the generator calls needed for some places.
 
-    One call gives eight numbers, for eight neighbours, and is made where any of them
-    needs one: most readings are infinite and need none.
+    One call gives eight numbers, for eight adjacent places, and is made only if one of
+    them is needed: most readings are infinite and need none.
 
     Args:
         row: Rows, ``[n]`` int64, ascending.
         place: Places in the row, ``[n]`` int64, ascending within a row.
 
     Returns:
-        Row and block of each call ``[c]``; for each place which of the numbers of all
-        calls it is given ``[n]``.
+        Row and block of each call ``[c]``; index of each place's number among the
+        numbers of all calls ``[n]``.
     """
     key = (row << _PURPOSE_BIT) + (place >> 3)
     calls, inverse = torch.unique_consecutive(key, return_inverse=True)
@@ -171,7 +171,7 @@ def _calls(row: Tensor, place: Tensor) -> tuple[Tensor, ...]:
 
 
 def _numbers(calls: tuple[Tensor, ...], moment: Moment, purpose: int) -> Tensor:
-    """Return the 16-bit numbers of the places that the calls serve, ``[n]``."""
+    """Return the 16-bit numbers of the places of the calls, ``[n]``."""
     row, block, number = calls
     return halfwords(moment.words(row, block, purpose)).take(number)
 
@@ -184,28 +184,28 @@ class Model:
 
 
 class PointModel(Model, ABC):
-    """A model that changes finite readings, each for itself, and remembers nothing."""
+    """A stateless model that changes finite readings independently of each other."""
 
     @abstractmethod
     def change(self, distance: Tensor, places: Places, moment: Moment) -> Tensor:
-        """Return the changed distances [m], infinite for a reading of nothing, ``[n]``.
+        """Return the changed distances [m], infinite for no detection, ``[n]``.
 
         Args:
             distance: Finite readings [m], ``[n]``.
-            places: Where they are among the readings.
+            places: Their places among all readings.
             moment: The moment of the readings.
         """
 
 
 class FrameModel(Model, ABC):
-    """A model of all readings of a moment together, which may remember."""
+    """A model of all readings of a step together, which may have a state."""
 
     def start(self, reading: Tensor, moment: Moment) -> State:
         """Return the state before the first reading of an episode.
 
         Args:
-            reading: The first reading as it comes to this model [m], ``[B, S, K]``.
-            moment: Its moment.
+            reading: First input of this model [m], ``[B, S, K]``.
+            moment: The moment of the reading.
         """
         return {}
 
@@ -213,18 +213,18 @@ class FrameModel(Model, ABC):
     def apply(
         self, reading: Tensor, state: State, moment: Moment
     ) -> tuple[Tensor, State]:
-        """Return what the model makes of readings, and its state after that.
+        """Return the changed readings and the new state.
 
         Args:
-            reading: Distances [m], ``[B, S, K]``; not to be written to.
-            state: The state after the reading before; not to be written to.
+            reading: Distances [m], ``[B, S, K]``; must not be modified.
+            state: State after the previous reading; must not be modified.
             moment: The moment of the readings.
         """
 
 
 def find(reading: Tensor) -> tuple[Tensor, Places]:
-    """Return the finite ones among readings ``[B, S, K]``, and where they are."""
-    # Finite and not NaN, in one comparison.
+    """Return the finite readings of ``[B, S, K]``, and their places."""
+    # One comparison excludes infinity and NaN.
     row, place = (reading.flatten(1) < torch.inf).nonzero(as_tuple=True)
     places = Places(row, place, reading.shape[2])
     return reading.take(places.index(reading.shape)), places
@@ -237,7 +237,7 @@ def put(reading: Tensor, places: Places, distance: Tensor) -> Tensor:
 
 
 class _Found:
-    """The finite readings while point models change them, one after the other."""
+    """The finite readings, while consecutive point models change them."""
 
     def __init__(self, reading: Tensor) -> None:
         self._reading = reading
@@ -245,15 +245,15 @@ class _Found:
         self._hidden = torch.zeros_like(self._distance, dtype=torch.bool)
 
     def change(self, model: PointModel, moment: Moment) -> None:
-        """Let one more model change them."""
+        """Apply one more model."""
         changed = model.change(self._distance, self._places, moment)
-        # Later models are given finite distances alone; what is gone stays gone.
+        # Later models get only finite distances; a lost detection stays lost.
         gone = changed == torch.inf
         self._hidden |= gone
         self._distance = torch.where(gone, self._distance, changed)
 
     def readings(self) -> Tensor:
-        """Return all readings with the changed ones among them, ``[B, S, K]``."""
+        """Return all readings, including the changed ones, ``[B, S, K]``."""
         distance = self._distance.masked_fill(self._hidden, torch.inf)
         return put(self._reading, self._places, distance)
 
@@ -264,12 +264,12 @@ def corrupt(
     states: Sequence[State] | None,
     moment: Moment,
 ) -> tuple[Tensor, list[State]]:
-    """Return what models in sequence make of distances, and their states after that.
+    """Apply a sequence of models to distances; return readings and new states.
 
     Args:
         models: The models, in the order in which they apply.
         distance: True distances [m], ``[B, S, K]``; infinite where nothing is in
-            range, NaN where the input was bad.
+            range, NaN where the input was invalid.
         states: The state of each model; None starts an episode.
         moment: The moment of the reading.
 
@@ -277,7 +277,7 @@ def corrupt(
         Readings [m], not negative, ``[B, S, K]``; and one state for each model.
     """
     reading, after = distance, []
-    # Found once for all point models in a row.
+    # Computed once for consecutive point models.
     found: _Found | None = None
     for i, model in enumerate(models):
         now, state = replace(moment, model=i), {}
@@ -300,27 +300,27 @@ class Corruption(StatefulTransform):
 
     Reads ``distance [*B, S]`` or ``[*B, S, K]`` [m] (infinite: nothing in range; NaN
     stays NaN) and, if a model depends on the speed of the joints, ``joint_vel
-    [*B, J]`` [rad/s]. Writes ``reading``, like the distance and never negative;
-    ``reading_clock [*B, 2]``, episode and step of each row; and for the i-th model
-    ``reading_i_...``, what it remembers.
+    [*B, J]`` [rad/s]. Writes ``reading``, of the same shape and never negative;
+    ``reading_clock [*B, 2]``, episode and step of each row; and ``reading_i_...``, the
+    state of the i-th model.
 
-    Rows count from ``row_offset``: give each worker its own, and results do not
-    depend on the number of workers. Episodes of a row count from 0 and go on from
-    reset to reset. Two of these in one environment need two seeds.
+    Rows are numbered from ``row_offset``: with the right offset for each worker,
+    results do not depend on the number of workers. The episodes of a row are numbered
+    from 0, across resets. Two of these transforms in one environment need two seeds.
 
     Args:
-        models: What happens to a reading, in this order.
+        models: Imperfections, in the order in which they apply.
         dt: Duration of a control step [s].
         seed: Seed of all draws, in [0, 2**32).
         row_offset: Global index of the first row.
-        redraw_traits: Whether each row and each episode has sensors of its own
-            (offsets, gains, phases, which are dead), to train for any robot; or all
-            have the same, those of the one robot that the seed stands for.
+        redraw_traits: Whether sensor properties (offsets, gains, phases, dead sensors)
+            are redrawn for each row and episode, to train for any robot. If False, all
+            rows and episodes have the same, which depend on the seed only.
         in_keys: Keys of the distance and, if needed, of the joint velocities.
-        out_keys: Key of the reading; the other keys take their names from it.
+        out_keys: Key of the reading; the other keys are derived from it.
 
     Raises:
-        ValueError: If the control step is not positive, the seed is none, there are
+        ValueError: If the control step is not positive, the seed is invalid, there are
             too many models or the number of keys is wrong.
     """
 
@@ -349,7 +349,7 @@ class Corruption(StatefulTransform):
         *where, name = out if isinstance(out, tuple) else (out,)
         self._settings = {"seed": seed, "dt": dt, "redraw_traits": redraw_traits}
         self._row_offset, self._models = row_offset, tuple(models)
-        # What the models remember is known from any reading.
+        # A dummy reading gives the names of the models' states.
         one = torch.zeros(1, 2, dtype=torch.int64)
         moment = self._moment(one[0, :1], one, [])
         _, states = corrupt(self._models, torch.zeros(1, 1, 1), None, moment)
@@ -365,7 +365,7 @@ class Corruption(StatefulTransform):
     def _moment(self, rows: Tensor, clock: Tensor, joint_vel: list[Tensor]) -> Moment:
         """Return the moment of some rows, from their clocks ``[B, 2]``."""
         if joint_vel:
-            # The fastest joint and not the mean square: a maximum has no rounding.
+            # The maximum, unlike the mean square, has no rounding.
             speed = joint_vel[0].abs().amax(-1)
         else:
             speed = torch.zeros(len(rows), device=rows.device)
@@ -384,7 +384,7 @@ class Corruption(StatefulTransform):
         clock: Tensor,
         remembered: Sequence[Tensor] | None,
     ) -> list[Tensor]:
-        """Return reading, clock and what the models remember; None starts anew."""
+        """Return reading, clock and states; ``remembered=None`` starts an episode."""
         distance, *joint_vel = inputs
         before = None
         if remembered is not None:
@@ -393,7 +393,7 @@ class Corruption(StatefulTransform):
                 before[i][name] = value
         reading, after = corrupt(
             self._models,
-            # Without beams, a sensor has one.
+            # Distances [B, S] count as one beam per sensor.
             distance.reshape(*distance.shape[:2], -1),
             before,
             self._moment(rows, clock, joint_vel),
@@ -422,7 +422,7 @@ class Corruption(StatefulTransform):
     def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
         """Return the specs of the reading, the clock and the models' states."""
         batch = spec.shape
-        # Shapes are those of any reading.
+        # Take the shapes from a dummy reading.
         inputs = [
             torch.zeros(1, *spec[k].shape[len(batch) :], dtype=spec[k].dtype)
             for k in self.in_keys

@@ -1,7 +1,6 @@
-"""Imperfections of sensors, one dataclass each, for `Corruption` to put in sequence.
+"""Models of sensor imperfections, one dataclass each, applied by `Corruption`.
 
-Each holds its own parameters: metres, seconds, Hz, radians, and standard deviations
-where it says ``std``.
+Parameters are in metres, seconds, Hz and radians; ``std`` is a standard deviation.
 """
 
 from __future__ import annotations
@@ -24,12 +23,12 @@ from egoskin.sensors.imperfections.corruption import (
     put,
 )
 
-# Phases and rates of a sampling clock count in this part of a control step.
+# Ticks per period of a sampling clock; phases and rates are whole ticks.
 _TICKS = 1 << 16
 
 
 def _hide(distance: Tensor, half: Tensor, probability: Tensor | float) -> Tensor:
-    """Return the distances, infinite with a probability, from a 16-bit number each."""
+    """Return the distances, each infinite with a probability, from 16-bit numbers."""
     return distance.masked_fill((half + 0.5) * 2.0**-16 < probability, torch.inf)
 
 
@@ -53,7 +52,7 @@ def _check_probability(model: object, name: str) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Bias(PointModel):
-    """Calibration error: d becomes d + offset + gain d, with errors of each sensor."""
+    """Calibration error per sensor: d becomes d + offset + gain d."""
 
     offset: float = 0.0
     """Mean offset over all sensors [m]."""
@@ -65,7 +64,7 @@ class Bias(PointModel):
     """Standard deviation of the gain error from sensor to sensor [1]."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for a negative spread, or what is not finite."""
+        """Raise ValueError for negative deviations or values that are not finite."""
         _check_not_negative(self, "offset_std", "gain_std")
         if not (math.isfinite(self.offset) and math.isfinite(self.gain)):
             raise ValueError(
@@ -91,8 +90,8 @@ class Bias(PointModel):
 class _Spread:
     """A standard deviation that depends on the distance d.
 
-    The largest of constant, linear x d and quadratic x d squared. A capacitive
-    sensor has d = alpha / C, so that constant noise of C is quadratic in d.
+    It is the maximum of constant, linear x d and quadratic x d squared. A capacitive
+    sensor has d = alpha / C, so constant noise of C gives noise quadratic in d.
     """
 
     constant: float = 0.0
@@ -114,12 +113,12 @@ class _Spread:
 
 @dataclass(frozen=True, kw_only=True)
 class Noise(_Spread, PointModel):
-    """Gaussian noise, anew in every reading; see `_Spread` for how it depends on d."""
+    """Gaussian noise, drawn anew for every reading; may depend on d (`_Spread`)."""
 
     per_speed: float = 0.0
-    """Ego noise: relative rise with the speed of the fastest joint [s/rad]."""
+    """Ego noise: relative increase with the speed of the fastest joint [s/rad]."""
     common: bool = False
-    """Whether all sensors of a robot share one draw (hum, supply)."""
+    """Whether all sensors of a robot share one draw (hum, power supply)."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for a negative parameter."""
@@ -139,14 +138,14 @@ class Noise(_Spread, PointModel):
 
 @dataclass(frozen=True, kw_only=True)
 class Drift(_Spread, FrameModel):
-    """A baseline that walks at random from 0, by one step before the first reading.
+    """A baseline error that is a random walk from 0, with a step before each reading.
 
-    The spread after t seconds is sqrt(t) times the one given, which may depend on
-    the distance (`_Spread`). All beams of a sensor share its walk.
+    The standard deviation after t seconds is sqrt(t) times the given one, which may
+    depend on the distance (`_Spread`). All beams of a sensor share one walk.
     """
 
     def start(self, reading: Tensor, moment: Moment) -> State:
-        """Return the walk at its start, ``[B, S]``."""
+        """Return the initial walk, zeros ``[B, S]``."""
         return {"walk": torch.zeros_like(reading[:, :, 0])}
 
     def apply(
@@ -154,8 +153,8 @@ class Drift(_Spread, FrameModel):
     ) -> tuple[Tensor, State]:
         """Return the readings with the walk after one more step."""
         rows, sensors = reading.shape[:2]
-        # A step to either side by the toss of a coin; their sum is Gaussian soon. A
-        # call of the generator gives 128 coins.
+        # Steps of equal size with random sign; their sum soon is nearly Gaussian. One
+        # call of the generator gives 128 random bits.
         calls = -(-sensors // 128)
         half = halfwords(
             moment.words(
@@ -176,17 +175,17 @@ class Drift(_Spread, FrameModel):
 
 @dataclass(frozen=True, kw_only=True)
 class Dropout(PointModel):
-    """Readings that see nothing, each with a probability of its own moment."""
+    """Readings that randomly detect nothing, drawn independently for each reading."""
 
     probability: float = 0.0
-    """At distance 0 and at rest."""
+    """Probability at distance 0 and at rest."""
     per_metre: float = 0.0
-    """Rise with the distance [1/m]."""
+    """Increase with the distance [1/m]."""
     per_speed: float = 0.0
-    """Rise with the speed of the fastest joint [s/rad]."""
+    """Increase with the speed of the fastest joint [s/rad]."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for what is no probability or falls."""
+        """Raise ValueError for an invalid probability or a negative increase."""
         _check_probability(self, "probability")
         _check_not_negative(self, "per_metre", "per_speed")
 
@@ -196,20 +195,20 @@ class Dropout(PointModel):
         if self.per_speed:
             speed = moment.speed.to(distance.dtype).take(places.row)
             chance += self.per_speed * speed
-            # At a speed of NaN nobody knows: 0 NaN = NaN.
+            # A speed of NaN gives a reading of NaN: 0 NaN = NaN.
             distance = distance + 0.0 * speed
         return _hide(distance, places.draw(moment), chance)
 
 
 @dataclass(frozen=True, kw_only=True)
 class DeadSensors(PointModel):
-    """Sensors that never see anything."""
+    """Sensors that never detect anything."""
 
     probability: float
     """Probability that a sensor is dead."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for what is no probability."""
+        """Raise ValueError for an invalid probability."""
         _check_probability(self, "probability")
 
     def change(self, distance: Tensor, places: Places, moment: Moment) -> Tensor:
@@ -219,15 +218,15 @@ class DeadSensors(PointModel):
 
 @dataclass(frozen=True, kw_only=True)
 class FalsePositives(FrameModel):
-    """Readings of something where nothing is, at any distance alike."""
+    """False detections, uniformly distributed over distance."""
 
     probability: float
-    """Probability that a reading of nothing reads something."""
+    """Probability of a false detection in a reading that detects nothing."""
     max_range: float
     """False distances are uniform from 0 to this [m]."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for what is no probability or no range."""
+        """Raise ValueError for an invalid probability or range."""
         _check_probability(self, "probability")
         if not 0 < self.max_range < math.inf:
             raise ValueError(
@@ -248,10 +247,11 @@ class FalsePositives(FrameModel):
         return put(reading, places, false), state
 
     def _strikes(self, rows: int, size: int, moment: Moment) -> tuple[Tensor, ...]:
-        """Return which elements of ``[rows, size]`` a rare event strikes.
+        """Return the row and place of random events among ``[rows, size]`` elements.
 
-        Each is struck with the probability, independently. Drawn are the gaps from
-        one to the next, so that the cost goes with the events, not the readings.
+        Each element has an event with the model's probability, independently. The gaps
+        between events are drawn, so the cost depends on the number of events and not of
+        readings.
         """
         struck = torch.zeros(rows, size, dtype=torch.bool, device=moment.row.device)
         # P(gap <= g) = 1 - (1 - p)^(g + 1)
@@ -272,17 +272,17 @@ class FalsePositives(FrameModel):
 
 @dataclass(frozen=True, kw_only=True)
 class RangeLimits(PointModel):
-    """The nearest and the farthest distance that a sensor can read."""
+    """The smallest and largest distance that a sensor can measure."""
 
     minimum: float = 0.0
     """Minimum range [m]."""
     maximum: float = math.inf
-    """A reading beyond this is nothing [m]."""
+    """Maximum range [m]; beyond it nothing is detected."""
     below: Literal["nothing", "minimum"] = "minimum"
-    """What is read of something nearer than the minimum."""
+    """Reading of an object nearer than the minimum."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for limits that leave no range, or an unknown word."""
+        """Raise ValueError for invalid values."""
         if self.below not in ("nothing", "minimum"):
             raise ValueError(
                 f"RangeLimits.below must be nothing or minimum, got {self.below!r}"
@@ -302,10 +302,10 @@ class RangeLimits(PointModel):
 
 @dataclass(frozen=True, kw_only=True)
 class Quantisation(PointModel):
-    """Readings are whole multiples of a step."""
+    """Readings are rounded to multiples of a step."""
 
     step: float
-    """Distance between two neighbouring readings [m]."""
+    """Resolution of the readings [m]."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for a step that is not positive and finite."""
@@ -321,14 +321,14 @@ class Quantisation(PointModel):
 
 @dataclass(frozen=True, kw_only=True)
 class SampleAndHold(FrameModel):
-    """Each sensor measures at a rate, at its own phase, and holds what it measured.
+    """Each sensor measures at a fixed rate with its own phase; readings are held.
 
-    The first reading of an episode is measured, whatever the phase. Measurements fall
-    on control steps: a rate at or above theirs measures at each.
+    The first reading of an episode is always a new measurement. Measurements are made
+    at control steps: if the rate is at least the control rate, at every step.
     """
 
     rate_hz: float
-    """Measurements of a sensor in a second [Hz]."""
+    """Measurement rate of a sensor [Hz]."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for a rate that is not positive and finite."""
@@ -348,8 +348,8 @@ class SampleAndHold(FrameModel):
     def apply(
         self, reading: Tensor, state: State, moment: Moment
     ) -> tuple[Tensor, State]:
-        """Return the new readings where one is due, the held ones elsewhere."""
-        # Whole numbers, so that no measurement is lost to rounding.
+        """Return new readings of sensors that are due, held ones of the others."""
+        # Integers, so that no measurement is lost to rounding.
         rate = round(self.rate_hz * moment.dt * _TICKS)
         ticks = (moment.step * rate % _TICKS).to(torch.int32)
         due = ((ticks[:, None] + state["phase"]) & (_TICKS - 1)) < rate
@@ -359,20 +359,20 @@ class SampleAndHold(FrameModel):
 
 @dataclass(frozen=True, kw_only=True)
 class Latency(FrameModel):
-    """Readings come late, by a whole number of control steps.
+    """Readings are delayed by a whole number of control steps.
 
-    Until the first one arrives, an episode reads its first.
+    At the start of an episode, its first reading is repeated until later ones arrive.
     """
 
     seconds: float
-    """Delay [s], rounded to control steps: less than half of one is none."""
+    """Delay [s], rounded to control steps: less than half a step is no delay."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for a negative delay."""
         _check_not_negative(self, "seconds")
 
     def start(self, reading: Tensor, moment: Moment) -> State:
-        """Return the readings on their way, oldest first, ``[B, steps, S, K]``."""
+        """Return the queue of delayed readings, oldest first, ``[B, steps, S, K]``."""
         steps = round(self.seconds / moment.dt)
         if not steps:
             return {}
@@ -381,7 +381,7 @@ class Latency(FrameModel):
     def apply(
         self, reading: Tensor, state: State, moment: Moment
     ) -> tuple[Tensor, State]:
-        """Return the oldest reading on its way, and those behind it."""
+        """Return the oldest reading in the queue, and the new queue."""
         if not state:
             return reading, state
         queue = state["queue"]

@@ -1,1 +1,1 @@
-"""The sensors' C++ kernels: their source, how it is compiled and called."""
+"""The sensors' C++ kernels: source, compilation and Python binding."""

@@ -1,4 +1,4 @@
-"""The C++ kernels of the sensors, called from Python; `kernels.cpp` holds them."""
+"""Python binding of the sensors' C++ kernels (`kernels.cpp`)."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from egoskin.sensors.kernels.compilation import load_library
 from egoskin.shapes import Sphere
 
 VECTOR = 16
-"""Numbers that the kernels work on together."""
+"""Vector size of the kernels."""
 
 SOURCE = Path(__file__).with_name("kernels.cpp")
-"""What `load_library` compiles."""
+"""C++ source of the kernels."""
 
 _NAMES = {torch.float32: "float32", torch.float64: "float64"}
 _COUNTS = (
@@ -54,16 +54,16 @@ class _Inputs(ctypes.Structure):
 
 
 class Kernels:
-    """What C++ computes of balls and a skin on a robot that is transparent to it.
+    """C++ implementation of the sensors for balls and without occlusion.
 
-    Where it cannot be compiled, `can` says no.
+    If the kernels cannot be compiled, `can` returns False.
 
     Args:
         kind: Coverage of all sensors.
-        kinematics: Of the links that they are on.
-        balls: What is sensed.
-        constants: What else `Tables` of kernels.cpp holds: counts, flags and arrays;
-            what is missing is 0 or null.
+        kinematics: Kinematics of the links that carry sensors.
+        balls: The objects.
+        constants: The other entries of `Tables` in kernels.cpp: counts, flags and
+            arrays; missing ones are 0 or null.
     """
 
     def __init__(
@@ -88,29 +88,32 @@ class Kernels:
             "squared": radius * radius,
             **constants,
         }
-        # The arrays are kept: a table holds their addresses alone.
+        # The arrays must be kept alive: a table holds only their addresses.
         self._tables: dict[torch.dtype, tuple[_Tables, list[np.ndarray]]] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what can be copied into another process."""
+        """Return the state without the library, which cannot be pickled."""
         return {**vars(self), "_library": None, "_tables": {}}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Find the library again."""
+        """Restore the state and load the library again."""
         vars(self).update(state)
         self._library = load_library(SOURCE)
 
     def set_constants(self, **constants: Any) -> None:
-        """Give some of the constants other values.
+        """Change some of the constants.
 
         Args:
-            constants: As of the class.
+            constants: As in the class.
         """
         self._constants.update(constants)
         self._tables.clear()
 
     def can(self, *inputs: Tensor) -> bool:
-        """Whether the kernels take these inputs: on the CPU, and without gradients."""
+        """Whether the kernels support these inputs: on the CPU and without gradients.
+
+        Always False if the kernels could not be compiled or under ``torch.compile``.
+        """
         if self._library is None or torch.compiler.is_compiling():
             return False
         grad = torch.is_grad_enabled()
@@ -137,17 +140,18 @@ class Kernels:
         Args:
             inputs: Base pose, joint positions, object poses, active flags.
             out: Readings [m], contiguous.
-            detected: ``[B, O]``, contiguous; false before.
+            detected: ``[B, O]``, contiguous; must be all False.
         """
         self._call(self._kind, inputs, _address(out), _address(detected))
 
     def hits(self, inputs: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-        """Return what `RaySensor.hits` says.
+        """Return the result of `RaySensor.hits`.
 
         Args:
-            inputs: As of `measure`.
+            inputs: As in `measure`.
         """
-        # A dozen beams of a row hit; where more do, a second call has the room.
+        # About a dozen beams per row hit. If more hit than there is room for, a second
+        # call follows.
         room = 32 * len(inputs[0])
         while True:
             place = torch.empty(room, dtype=torch.int64)
@@ -159,9 +163,9 @@ class Kernels:
             room = found
 
     def _call(self, name: str, inputs: Sequence[Tensor], *arguments: object) -> int:
-        """Call a kernel; all of its inputs are of the type of the joint positions."""
+        """Call the kernel for the dtype of the joint positions."""
         dtype = inputs[1].dtype
-        # The numbers of a row must be next to each other.
+        # Rows must be contiguous.
         rows = [x.flatten(1) for x in inputs]
         rows = [x if x.stride(-1) == 1 else x.contiguous() for x in rows]
         given = _Inputs(
@@ -175,7 +179,7 @@ class Kernels:
         return function(tables, ctypes.byref(given), *arguments)
 
     def _of_type(self, dtype: torch.dtype) -> _Tables:
-        """Return the constants in a floating type."""
+        """Return the constants in a floating-point type."""
         if dtype not in self._tables:
             arrays = []
             tables = _Tables()
@@ -192,5 +196,5 @@ class Kernels:
 
 
 def _address(x: Tensor) -> ctypes.c_void_p:
-    """Return where a tensor's numbers are."""
+    """Return the address of a tensor's data."""
     return ctypes.c_void_p(x.data_ptr())

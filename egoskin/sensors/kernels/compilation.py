@@ -1,7 +1,7 @@
-"""C++ where it can be compiled; what it computes, PyTorch does as well.
+"""Compilation and caching of C++ libraries; without a compiler PyTorch is used instead.
 
-Libraries are kept in a folder that belongs to the user alone, under the name of what
-they were compiled from and of their own content: one that was cut or changed is none.
+Libraries are cached in a folder that only the user can access. Their file names contain
+hashes of the source and of the library, so truncated or modified files are ignored.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from pathlib import Path
 import torch
 
 SETTING = "EGOSKIN_COMPILE"
-"""Environment variable: 0 compiles nothing, for tests and measurements."""
+"""Environment variable: 0 disables the C++ kernels, for tests and measurements."""
 
 _log = logging.getLogger(__name__)
 
-# No -ffast-math: results are the same whoever computes them.
+# No -ffast-math: results must equal those of PyTorch.
 _FLAGS = (
     "-std=c++17 -O3 -shared -fPIC -ffp-contract=off -fno-math-errno "
     "-fno-trapping-math -Wno-psabi"
 )
-# Instruction sets by what PyTorch finds on this machine.
+# Instruction sets by the CPU capability that PyTorch reports.
 _VECTORS = {
     "AVX2": "-mavx2",
     "AVX512": "-mavx512f -mavx512dq -mavx512vl -mavx512bw -mprefer-vector-width=512",
@@ -40,7 +40,7 @@ _VECTORS = {
 
 
 def _compiler() -> str | None:
-    """Return the C++ compiler: that of CXX, or the first that is found."""
+    """Return the C++ compiler: CXX, or the first one found."""
     names = (os.environ.get("CXX"), "c++", "g++", "clang++")
     return next(filter(None, (shutil.which(name) for name in names if name)), None)
 
@@ -51,20 +51,21 @@ def can_compile() -> bool:
 
 
 def load_library(source: Path) -> ctypes.CDLL | None:
-    """Return a C++ source as a library, compiled once on a machine, or None.
+    """Return a C++ source as a library, compiled once per machine, or None.
 
-    It is None where that fails, which is logged as one warning. A process of
-    `multiprocessing` takes what its parent has compiled, and neither compiles nor logs.
+    It is None if compilation fails, which is logged as one warning, or is disabled.
+    Child processes of `multiprocessing` use the library that the parent compiled; they
+    neither compile nor log.
 
     Args:
-        source: The file; it includes nothing of its own.
+        source: The file; it may include only system headers.
     """
     return None if os.environ.get(SETTING) == "0" else _loaded(source)
 
 
 @functools.cache
 def _loaded(source: Path) -> ctypes.CDLL | None:
-    """Return the library, or None, having said why."""
+    """Return the library, or None after logging the reason."""
     is_parent = parent_process() is None
     try:
         command, name = _recipe(source)
@@ -85,7 +86,7 @@ def _loaded(source: Path) -> ctypes.CDLL | None:
 
 
 def _recipe(source: Path) -> tuple[list[str], str]:
-    """Return the command that compiles a source, and a name for the two."""
+    """Return the compile command of a source, and a name with a hash of the two."""
     compiler = _compiler()
     if compiler is None:
         raise RuntimeError("no C++ compiler was found: install g++")
@@ -100,7 +101,7 @@ def _digest(content: bytes) -> str:
 
 
 def _cache() -> Path:
-    """Return the folder that libraries are kept in, which nobody else can write to."""
+    """Return the cache folder of the libraries, which only the user can access."""
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     folder = Path(base) / "egoskin"
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -115,12 +116,12 @@ def _cache() -> Path:
 
 
 def _find(folder: Path, name: str) -> ctypes.CDLL | None:
-    """Return the library that is kept by a name, if there is one and it is whole."""
+    """Return the cached library of a name, if there is one and it is intact."""
     for path in sorted(folder.glob(f"{name}-*.so")):
         about = path.lstat()
         own = stat.S_ISREG(about.st_mode) and about.st_uid == os.geteuid()
         if own and path.name == _file_name(name, path.read_bytes()):
-            # One that was compiled for another system cannot be loaded.
+            # A library compiled on another system may fail to load.
             with suppress(OSError):
                 return ctypes.CDLL(str(path))
     return None
@@ -146,7 +147,7 @@ def _compile(command: list[str], source: Path) -> bytes:
 
 
 def _keep(folder: Path, name: str, content: bytes) -> ctypes.CDLL:
-    """Keep a library, whole or not at all, and return it."""
+    """Write a library to the cache atomically, and return it."""
     path = folder / _file_name(name, content)
     descriptor, partial = tempfile.mkstemp(dir=folder)
     try:
@@ -156,7 +157,7 @@ def _keep(folder: Path, name: str, content: bytes) -> ctypes.CDLL:
     except BaseException as error:
         os.unlink(partial)
         if isinstance(error, OSError):
-            # The system's own text of a full disk names no file.
+            # The system's error for a full disk does not name the file.
             raise OSError(error.errno, error.strerror, str(path)) from error
         raise
     try:

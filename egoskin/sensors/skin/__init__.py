@@ -1,1 +1,1 @@
-"""Where sensors sit: skins, placing them, importing and exporting them."""
+"""Skins: sensor poses and coverage, placement, import and export."""

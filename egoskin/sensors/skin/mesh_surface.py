@@ -1,9 +1,9 @@
-"""The outer surface of a robot's meshes, for skins that sit where the real covers are.
+"""The outer surface of a robot's meshes, to place skins on the real covers.
 
 Meshes are `trimesh.Trimesh` objects in the frames of their links [m], by link: load,
 scale and pose them with trimesh, or use `meshes_in_folder` and `meshes_of_mjcf`.
-Meshes of real parts are full of inner faces, so a point counts as outer only if it sees
-enough of the world around the robot, in the default pose.
+Meshes of real parts have many inner faces, so a point counts as outer only if enough
+of the robot's surroundings is visible from it in the default pose.
 
 trimesh and embreex are optional dependencies: ``pip install 'egoskin[design]'``.
 """
@@ -36,13 +36,13 @@ if TYPE_CHECKING:
 Meshes = Mapping[str, Sequence["Trimesh"]]
 """Meshes by link, in the frames of the links [m]."""
 
-# Largest file of a mesh [bytes].
+# Largest mesh file [bytes].
 _LARGEST = 2**30
-# Rays over the hemisphere of each point, and the share of them that must escape: 0.15
-# rejects the floor of a round pit deeper than 1.2 diameters.
+# Rays over the hemisphere of each point, and the share of them that must hit nothing:
+# 0.15 rejects the bottom of a round hole deeper than 1.2 diameters.
 _NUM_RAYS = 48
 _MIN_OPENNESS = 0.15
-# Rays start this far off the face that they leave [m].
+# Distance of the start of a ray from its face [m].
 _CLEARANCE = 1e-4
 # Points whose rays are cast at once.
 _CHUNK = 4096
@@ -52,10 +52,10 @@ def _trimesh() -> ModuleType:
     """Return the module trimesh, which casts rays with embreex.
 
     Raises:
-        ImportError: If one of the two is not installed; the text says how to.
+        ImportError: If either is not installed; the text says how to install them.
     """
     try:
-        # Without it trimesh casts rays in Python, for hours and in all the memory.
+        # Without embreex, trimesh casts rays in Python: hours, and all of the memory.
         import embreex  # noqa: F401
         import trimesh
     except ImportError as error:
@@ -70,14 +70,14 @@ def meshes_in_folder(folder: Path, links: Sequence[str]) -> dict[str, list[Trime
 
     Args:
         folder: Folder of files such as ``torso_link.STL``, each in the frame of its
-            link, in metres; files named otherwise are left alone.
+            link, in metres; files with other names are ignored.
         links: Names of the links, usually ``RobotConfig.links``.
 
     Returns:
         Meshes by link; links without a file are missing.
 
     Raises:
-        FileNotFoundError: If there is no such folder, or no file is named after a link.
+        FileNotFoundError: If the folder is missing or no file is named after a link.
         ValueError: If two files are named after one link, or one cannot be read.
     """
     trimesh = _trimesh()
@@ -109,15 +109,15 @@ def meshes_in_folder(folder: Path, links: Sequence[str]) -> dict[str, list[Trime
 
 
 def meshes_of_mjcf(path: Path, group: int | None = None) -> dict[str, list[Trimesh]]:
-    """Return the meshes that a MuJoCo model shows, by body.
+    """Return the mesh geoms of a MuJoCo model, by body.
 
     Args:
         path: MJCF file.
-        group: Take only geoms of this group (visual ones have their own by custom);
-            None takes all. What is there twice is taken once.
+        group: Take only geoms of this group (visual geoms usually have their own); None
+            takes all. Duplicates are dropped.
 
     Returns:
-        Meshes in the frames of the bodies [m], scaled and posed as the model says.
+        Meshes in the frames of the bodies [m], scaled and posed as in the model.
 
     Raises:
         ValueError: If MuJoCo cannot load the file, or no geom is a mesh.
@@ -155,7 +155,7 @@ def meshes_of_mjcf(path: Path, group: int | None = None) -> dict[str, list[Trime
 
 
 def _asset_name(model: mujoco.MjModel, mesh: int) -> str:
-    """File name of a mesh asset; its own name if it comes from no file."""
+    """File name of a mesh asset, or its asset name if it has no file."""
     start = model.mesh_pathadr[mesh]
     if start < 0:
         return model.mesh(mesh).name
@@ -185,7 +185,7 @@ def triangle_patch(link: str, triangles: np.ndarray) -> Patch:
 
     def sample(n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         face = rng.choice(len(triangles), n, p=double_area / double_area.sum())
-        # A point of the parallelogram beyond the diagonal is mirrored at its centre.
+        # Points of the parallelogram beyond the diagonal are mirrored at its centre.
         u, v = rng.random((2, n, 1))
         u, v = np.where(u + v > 1, (1 - u, 1 - v), (u, v))
         points = origin[face] + u * along[face] + v * across[face]
@@ -195,19 +195,19 @@ def triangle_patch(link: str, triangles: np.ndarray) -> Patch:
 
 
 def openness(mesh: Trimesh, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Return how much of the world around a mesh is seen from points on it.
+    """Return the share of a mesh's surroundings that is visible from points on it.
 
     Args:
-        mesh: What blocks the view.
+        mesh: The mesh that blocks the view.
         points: Points in the frame of the mesh [m], ``[n, 3]``.
         normals: Unit normals there, ``[n, 3]``.
 
     Returns:
-        Share of the cosine-weighted rays over the hemisphere of the normal that meet
-        no face, 0 to 1, ``[n]``.
+        Share of the cosine-weighted rays over the hemisphere of the normal that hit no
+        face, 0 to 1, ``[n]``.
     """
     _trimesh()
-    # Even spread over the unit sphere along a golden-angle spiral.
+    # Points evenly spread over the unit sphere along a golden-angle spiral.
     k = np.arange(_NUM_RAYS) + 0.5
     z, angle = 1.0 - 2.0 * k / _NUM_RAYS, k * math.pi * (3.0 - math.sqrt(5.0))
     ring = np.sqrt(1.0 - z**2)
@@ -227,19 +227,20 @@ def openness(mesh: Trimesh, points: np.ndarray, normals: np.ndarray) -> np.ndarr
 def mesh_surface(robot: RobotConfig, links: Sequence[str], meshes: Meshes) -> Surface:
     """Return the outer surface of the meshes of some links, in the default pose.
 
-    A link without meshes keeps its primitives. A point of any shape is outer if it is
-    inside none of those, and at least 15 % of the cosine-weighted rays over the
-    hemisphere of its normal meet no mesh of the robot. The normal is that of the side
-    that sees more, however the face is wound.
+    A link without meshes keeps its primitives. A point of a mesh or primitive is outer
+    if it is inside no such primitive and at least 15 % of the cosine-weighted rays over
+    the hemisphere of its normal hit no mesh of the robot. The normal is that of the
+    side with more visibility, whatever the winding of the face.
 
     Args:
         robot: The robot.
         links: Names of the links to sample.
-        meshes: Meshes of the robot; those of other links hide what they cover.
+        meshes: Meshes of the robot; those of links not sampled still block the view.
 
     Raises:
-        ValueError: If a mesh's link or a link is not the robot's, the links carry no
-            shape, or a link without meshes has a collision shape that is no primitive.
+        ValueError: If the robot lacks a mesh's link or a sampled link, the links carry
+            no shape, or a link without meshes has a collision shape that is not a
+            primitive.
     """
     for link, on_link in meshes.items():
         if not on_link:

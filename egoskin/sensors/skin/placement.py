@@ -1,7 +1,7 @@
-"""Placing sensors on a robot: a skin from a method, a seed and a few wishes.
+"""Placement of sensors on a robot.
 
-Contract: a sensor sits on the outer surface of the robot in its default pose, its
-normal pointing out, and the same arguments give the same skin.
+Contract: sensors lie on the outer surface of the robot in its default pose, their
+normals point outward, and the same arguments give the same skin.
 """
 
 from __future__ import annotations
@@ -20,38 +20,38 @@ from egoskin.robots.surface import primitive_surface
 from egoskin.sensors.skin.mesh_surface import Meshes, mesh_surface
 from egoskin.sensors.skin.skin import FARTHEST, Skin
 
-# Candidates for each sensor that sample elimination chooses (Yuksel 2015, section 4).
+# Candidates per sensor for sample elimination (Yuksel 2015, section 4).
 _CANDIDATES = 5
-# Darts thrown at each square of the spacing. A full cover has 0.70 sensors in each, and
+# Darts thrown per square of the spacing. A full cover has 0.70 sensors per square, and
 # then less than 1 % of the surface is farther than the spacing from a sensor.
 _DARTS_PER_SQUARE = 40
-# As many as fit are found among this many darts at most: some minutes on meshes. More
-# are thrown only for a number of sensors, so many at once.
+# Largest number of darts to find as many sensors as fit: some minutes on meshes. For a
+# given number of sensors more are thrown, in batches of this size.
 _MAX_DARTS = 2_000_000
-# Of more the candidates alone would fill the memory.
+# The candidates of more sensors would not fit in memory.
 MAX_SENSORS = _MAX_DARTS // _CANDIDATES
-# Points that measure the outer area and the rejected shares.
+# Points to estimate the outer area and the rejected shares.
 _AREA_POINTS = 4000
 
 
-# Points whose neighbours are looked up at once, and cells along an axis at most.
+# Points whose neighbours are looked up at once, and largest number of cells per axis.
 _CHUNK = 4096
 _MOST_CELLS = 1_000_000
 
 
 class _Cells:
-    """Points sorted into cubes, to find those near a point.
+    """A grid of cubic cells for neighbour search.
 
     Args:
         points: Points [m], ``[n, 3]``.
-        edge: Edge of a cube [m]; all that is nearer than this is found.
+        edge: Edge of a cell [m]; all points nearer than this are found.
     """
 
     def __init__(self, points: np.ndarray, edge: float) -> None:
         edge = max(edge, float(np.ptp(points, axis=0).max()) / _MOST_CELLS)
         cell = ((points - points.min(axis=0)) // edge).astype(np.int64) + 1
         across = cell.max(axis=0) + 2
-        # Cubes that follow each other along z have numbers that do.
+        # Cells that are consecutive along z have consecutive keys.
         key = (cell[:, 0] * across[1] + cell[:, 1]) * across[2] + cell[:, 2]
         self._order = np.argsort(key, kind="stable")
         self._key, self._sorted = key, key[self._order]
@@ -59,19 +59,19 @@ class _Cells:
         self._rows = ((x * across[1] + y) * across[2]).ravel()
 
     def near(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return (which of some points, point in or beside its cube) for all pairs.
+        """Return all pairs of a query point and a point in its or an adjacent cell.
 
         Args:
-            index: Indices of points, ``[m]``.
+            index: Indices of the query points, ``[m]``.
 
         Returns:
             Positions in ``index``, ascending, and indices of points, ``[pairs]`` each.
         """
-        # Three cubes in a row along z, in each of nine rows.
+        # Three consecutive cells along z in each of nine columns.
         middle = self._key[index][:, None] + self._rows
         low = np.searchsorted(self._sorted, middle.ravel() - 1, "left")
         number = np.searchsorted(self._sorted, middle.ravel() + 1, "right") - low
-        # Ranges low, low + 1, ... of so many numbers, one after the other.
+        # Concatenated ranges low, low + 1, ..., low + number - 1.
         before = np.cumsum(number) - number
         place = np.arange(number.sum()) + np.repeat(low - before, number)
         which = np.repeat(np.repeat(np.arange(len(index)), 9), number)
@@ -79,14 +79,14 @@ class _Cells:
 
 
 def throw_darts(points: np.ndarray, radius: np.ndarray, most: int) -> np.ndarray:
-    """Return a subset of points whose discs are disjoint, as large as the order allows.
+    """Return a subset of points whose discs are disjoint (dart throwing).
 
-    Each point in turn is taken unless its disc meets that of one taken before.
+    Each point in turn is taken unless its disc overlaps that of one taken before.
 
     Args:
         points: Points in random order [m], ``[n, 3]``.
-        radius: Radius of the disc around each, half of its spacing [m], ``[n]``.
-        most: Stop at this many.
+        radius: Radius of the disc around each point, half of its spacing [m], ``[n]``.
+        most: Largest number of points to take.
 
     Returns:
         Indices of the points taken, in order.
@@ -109,16 +109,18 @@ def throw_darts(points: np.ndarray, radius: np.ndarray, most: int) -> np.ndarray
 def eliminate(
     points: np.ndarray, scale: np.ndarray, count: int, area: float
 ) -> np.ndarray:
-    """Return a well-spread subset of points: the most crowded ones go, one by one.
+    """Return an evenly spread subset of points (sample elimination).
+
+    The most crowded points are removed one by one.
 
     Args:
         points: Points in random order [m], ``[n, 3]``.
-        scale: Spacing wanted around each point, relative to the others, ``[n]``.
-        count: How many to leave, at most n.
-        area: Area that the points cover, each part over its squared scale [m^2].
+        scale: Relative spacing around each point, ``[n]``.
+        count: Number of points to keep, at most n.
+        area: Area that the points cover, each part divided by its squared scale [m^2].
 
     Returns:
-        Indices of the points left, ascending, ``[count]``.
+        Indices of the points kept, ascending, ``[count]``.
 
     Source: Yuksel, "Sample Elimination for Generating Poisson Disk Sample Sets",
         Computer Graphics Forum 34(2), 2015.
@@ -142,17 +144,18 @@ def eliminate(
         which, near, distance = which[close], near[close], distance[close]
         # w_ij = (1 - d_ij / (2 r_max))^alpha with alpha = 8.
         weight = (1 - distance.clip(closest, widest) / widest) ** 8
-        # One after the other: sums in another order round otherwise.
+        # In sequence: another order of summation would change the rounding.
         np.add.at(total, near, weight)
         ends = np.searchsorted(which, np.arange(1, len(index)))
         neighbours += np.split(near.astype(np.int32), ends)
         crowding += np.split(weight, ends)
 
-    # Mutual neighbours tie: rounding, which differs by machine, must not decide.
+    # Mutual neighbours tie. Rounded, so that machine-dependent rounding errors do not
+    # decide.
     heap = [(-value, i) for i, value in enumerate(total.round(12).tolist())]
     heapq.heapify(heap)
     for _ in range(len(points) - count):
-        # Totals only fall, so that one that is out of date stands too far in front.
+        # Totals only decrease, so an outdated heap entry is too close to the front.
         while -heap[0][0] > (value := float(total[heap[0][1]].round(12))):
             heapq.heapreplace(heap, (-value, heap[0][1]))
         _, worst = heapq.heappop(heap)
@@ -164,7 +167,7 @@ def eliminate(
 def _link_weights(
     links: Sequence[str], density: Mapping[str, float]
 ) -> dict[str, float]:
-    """Return the weight of each link from weights by shell pattern, 1 if none matches.
+    """Return the weight of each link from weights by shell pattern; 1 without a match.
 
     Raises:
         ValueError: If a weight is negative or not finite, a pattern matches no link, or
@@ -186,14 +189,15 @@ def _link_weights(
 
 
 def _num_darts(area: float, spacing: float, num_sensors: int | None) -> int:
-    """Return how many darts fill an area [m^2], or find the sensors asked for.
+    """Return the number of darts to fill an area [m^2] or to find ``num_sensors``.
 
     Raises:
-        ValueError: If they are too many.
+        ValueError: If there are too many.
     """
     darts = math.ceil(_DARTS_PER_SQUARE * area / spacing**2)
     if num_sensors is not None:
-        # Where this is fewer, the sensors take little more than half of what fits.
+        # If 100 per sensor are fewer, the sensors are little more than half of those
+        # that fit.
         return min(darts, 100 * num_sensors)
     if darts > _MAX_DARTS:
         finest = math.sqrt(_DARTS_PER_SQUARE * area / _MAX_DARTS)
@@ -211,7 +215,7 @@ def _check(
     spacing: float | None,
     stand_off: float,
 ) -> None:
-    """Raise ValueError for arguments that are out of range or contradict each other."""
+    """Raise ValueError for arguments that are invalid or contradict each other."""
     if method not in ("area_uniform", "poisson_disk"):
         raise ValueError(
             f"method must be 'area_uniform' or 'poisson_disk', got {method!r}"
@@ -238,7 +242,7 @@ def _check(
 def _check_metres(
     robot: RobotConfig, link: np.ndarray, position: np.ndarray, meshes: Meshes
 ) -> None:
-    """Raise ValueError if a sensor would lie where none is on a robot."""
+    """Raise ValueError if a sensor is implausibly far from its link's origin."""
     away = np.linalg.norm(position, axis=-1)
     if away.max() > FARTHEST:
         name = robot.links[link[away.argmax()]]
@@ -263,32 +267,32 @@ def place_sensors(
 ) -> Skin:
     """Return a skin of sensors placed on the outer surface of a robot.
 
-    ``area_uniform`` places every sensor at random, whatever the others. With
-    ``poisson_disk`` they keep apart: by ``spacing``, or without one as far as so many
-    go (sample elimination). Distances are straight lines in the default pose.
+    ``area_uniform`` places every sensor independently at random. ``poisson_disk`` keeps
+    them apart: by ``spacing`` if given, else as far as possible (sample elimination).
+    Distances are straight-line distances in the default pose.
 
     Args:
         robot: The robot.
-        num_sensors: Number of sensors ``S``; None takes as many as the spacing lets in.
+        num_sensors: Number of sensors ``S``; None takes as many as fit at the spacing.
         seed: Seed of the placement.
-        method: How sensors are spread.
+        method: Placement method.
         links: Links to cover; the robot's ``skin_links`` (upper body) by default.
-        density: Sensors per area, relative to the other links, by link or shell pattern
-            (``*_wrist_*``); 1 for links not named, 0 leaves a link bare.
-        spacing: Least distance between sensors [m] (``poisson_disk``). A link of
-            density w has spacing / sqrt(w); between two links, their mean holds.
+        density: Relative number of sensors per area by link or shell pattern
+            (``*_wrist_*``); 1 for links not named, 0 for no sensors.
+        spacing: Minimum distance between sensors [m] (``poisson_disk``). A link of
+            density w has spacing / sqrt(w); between two links the mean applies.
         stand_off: Distance of the sensors from the surface along the normal [m].
-        meshes: Meshes to place on instead of the robot's primitives, by link
-            (`mesh_surface`); links without any keep their primitives.
+        meshes: Meshes to use instead of the robot's primitives, by link
+            (`mesh_surface`); links without meshes use their primitives.
 
     Returns:
-        Sensors with z along the outward normal. Their provenance holds the arguments
-        and the share of each link's samples rejected for lying inside the robot.
+        Sensors with z along the outward normal. The provenance holds the arguments and
+        the share of each link's samples rejected for lying inside the robot.
 
     Raises:
-        ValueError: If an argument is out of its range, a link or pattern is not the
-            robot's, the links show no surface, a link without meshes has a collision
-            shape that is no primitive, or the sensors do not fit.
+        ValueError: If an argument is out of range, the robot lacks a link or pattern,
+            the links have no outer surface, a link without meshes has a collision shape
+            that is not a primitive, or the sensors do not fit.
     """
     _check(num_sensors, seed, method, spacing, stand_off)
     covered = tuple(robot.skin_links if links is None else links)
@@ -301,7 +305,7 @@ def place_sensors(
         surface = mesh_surface(robot, covered, meshes)
 
     measured = surface.sample(_AREA_POINTS, seed, weights, stand_off)
-    # Where spacing goes as 1 / sqrt(w), an area counts w-fold.
+    # As the spacing is proportional to 1 / sqrt(w), areas are weighted by w.
     area = sum(weights[link] * size for link, size in measured.area.items())
     if spacing is not None:
         number = _num_darts(area, spacing, num_sensors)
@@ -317,12 +321,12 @@ def place_sensors(
             break
         points = surface.sample(
             min(_MAX_DARTS, number - first),
-            # Another stream for each lot, whatever the seed.
+            # A different random stream for each batch, whatever the seed.
             seed + (first << 64),
             weights,
             stand_off,
         )
-        # Six decimals are what the file holds: a saved skin is the same skin.
+        # Skin files have six decimals: a saved and loaded skin is identical.
         at = (points.position + stand_off * points.normal).round(6)
         _check_metres(robot, points.link, at, meshes or {})
         link = np.concatenate((link, points.link))
@@ -334,7 +338,7 @@ def place_sensors(
             if spacing is None:
                 chosen = eliminate(places, scale, wanted, area)
             else:
-                # What was taken before comes first, and is taken again.
+                # Points taken before come first and are therefore taken again.
                 chosen = throw_darts(places, scale * spacing / 2, wanted)
             link, position, normal = link[chosen], position[chosen], normal[chosen]
     if num_sensors is not None and len(link) < num_sensors:

@@ -1,7 +1,7 @@
-"""A skin: the poses of the sensors on the links of a robot, and its file.
+"""A skin: the poses of the sensors on the links of a robot, and its file format.
 
-The file is JSON made to be read and edited by people: units and conventions stand at
-the top, one sensor on each line.
+The file is human-readable JSON that can be edited by hand: units and conventions at the
+top, one sensor per line.
 """
 
 from __future__ import annotations
@@ -32,19 +32,19 @@ _CONVENTIONS = {
 }
 _FIELDS = ("format", "robot", "conventions", "provenance", "types", "sensors")
 _OPTIONAL = ("range", "roll_deg", "radius", "type")
-# What types of older files say as well, and the only values that are still measured.
+# Former fields of types in older files, and the only value still supported for each.
 _DROPPED: dict[str, dict[str, Any]] = {
     "field": {"measure": "surface"},
     "ray": {"fov": "diagonal", "beams": "centres", "sub_beams": 1},
 }
-# Unit normals must be unit to this.
+# Tolerance of the length of unit normals.
 _UNIT_TOLERANCE = 1e-3
 FARTHEST = 2.0
-"""Farther from its link's origin no sensor of a file sits [m]: the unit is wrong."""
+"""Largest distance of a sensor from its link's origin [m]; beyond, units are wrong."""
 
 
 def _is_number(value: object) -> bool:
-    """Whether a JSON value is a finite number; Python also reads NaN and 10^400."""
+    """Whether a JSON value is a finite number; Python's JSON allows NaN and 10^400."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return False
     return abs(value) <= sys.float_info.max
@@ -58,7 +58,7 @@ def _is_vector(value: object) -> bool:
 
 
 def _coverage(name: str, entry: object) -> Coverage:
-    """Return the coverage that one of a file's types describes."""
+    """Return the coverage described by a type of a skin file."""
     if not isinstance(entry, Mapping):
         raise ValueError(f"type {name!r} must be an object, got {entry!r}")
     values = dict(entry)
@@ -93,14 +93,14 @@ def _coverage(name: str, entry: object) -> Coverage:
 
 
 def _check_known(where: str, name: str, known: Sequence[str]) -> None:
-    """Raise ValueError for a field that a skin file does not have."""
+    """Raise ValueError for an unknown field of a skin file."""
     if name not in known:
         hint = did_you_mean(name, known)
         raise ValueError(f"{where}: unknown field {name!r}{hint}")
 
 
 def _check_sensor(index: int, sensor: object, types: Mapping[str, Coverage]) -> None:
-    """Raise ValueError for an entry that describes no sensor."""
+    """Raise ValueError for an entry that is not a valid sensor."""
     where = f"sensor {index}"
     if not isinstance(sensor, Mapping):
         raise ValueError(f"{where} must be an object, got {sensor!r}")
@@ -139,26 +139,26 @@ def _check_sensor(index: int, sensor: object, types: Mapping[str, Coverage]) -> 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Skin:
-    """Sensors on a robot, ``S`` of them.
+    """The ``S`` sensors on a robot.
 
     Args:
         robot: Name of the robot.
         links: Link of each sensor, ``S`` names.
         position: Positions in the link frames [m], ``[S, 3]``.
-        normal: Outward unit normals in the link frames, ``[S, 3]``; as rounded as they
-            come.
-        coverage: What each sensor sees, ``S`` of them; None leaves it to the
+        normal: Outward unit normals in the link frames, ``[S, 3]``; not renormalised.
+        coverage: Coverage of each sensor, ``S`` entries; None is filled in from the
             configuration.
-        range: Range of each sensor [m], ``[S]``; NaN leaves it to the configuration.
-        roll_deg: Turn of each sensor's frame about its normal [deg], ``[S]``; 0 by
+        range: Range of each sensor [m], ``[S]``; NaN is filled in from the
+            configuration.
+        roll_deg: Rotation of each sensor frame about its normal [deg], ``[S]``; 0 by
             default.
-        radius: Radius of each sensor itself [m], ``[S]``; NaN if unknown.
-        types: Names of coverages, for the reader of the file; others are numbered.
-        provenance: How the skin was made, for the reader of the file.
+        radius: Physical radius of each sensor [m], ``[S]``; NaN if unknown.
+        types: Names of coverages for the skin file; unnamed ones get a number.
+        provenance: How the skin was made, for readers of the skin file.
 
     Raises:
-        ValueError: If the arrays disagree in length, hold values that are not finite
-            or normals that are not unit vectors.
+        ValueError: If the arrays differ in length, positions, normals or rolls are not
+            finite, ranges or radii are not positive, or normals are not unit vectors.
     """
 
     robot: str
@@ -173,7 +173,7 @@ class Skin:
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Fill in defaults, check shapes and values."""
+        """Fill in defaults; check shapes and values."""
         if isinstance(self.links, str):
             raise ValueError(f"links must be a name for each, got {self.links!r}")
         shape, number = (len(self.links), 3), len(self.links)
@@ -228,16 +228,17 @@ class Skin:
                 )
 
     def rotation(self) -> np.ndarray:
-        """Sensor frames in the link frames: columns x, y, z, ``[S, 3, 3]``.
+        """Rotations of the sensor frames in the link frames, ``[S, 3, 3]``.
 
-        Orthonormal to rounding, whatever digits the normals were written with.
+        The columns are the x, y and z axes. Orthonormal up to rounding, even if the
+        normals have few digits.
         """
         z = self.normal / np.linalg.norm(self.normal, axis=-1, keepdims=True)
         # x = normalise(z_link x n); parallel to z_link: x_link.
         x = np.cross([0.0, 0.0, 1.0], z)
         length = np.linalg.norm(x, axis=-1, keepdims=True)
         x = np.where(length > 1e-6, x / np.maximum(length, 1e-6), [1.0, 0.0, 0.0])
-        # A normal a hair off z_link leaves x_link not quite perpendicular.
+        # If the normal is nearly z_link, x_link is not exactly perpendicular to it.
         x = x - (x * z).sum(-1, keepdims=True) * z
         x /= np.linalg.norm(x, axis=-1, keepdims=True)
         y = np.cross(z, x)
@@ -246,11 +247,11 @@ class Skin:
         return np.stack((c * x + s * y, c * y - s * x, z), axis=-1)
 
     def misplaced(self, position_std: float, angle_std_deg: float, seed: int) -> Skin:
-        """Return the skin as it is mounted: every sensor a little off its place.
+        """Return the skin with random mounting errors of every sensor.
 
         Args:
             position_std: Standard deviation of each coordinate [m].
-            angle_std_deg: Standard deviation of the turn about each axis [deg].
+            angle_std_deg: Standard deviation of the rotation about each axis [deg].
             seed: Seed of the errors.
 
         Raises:
@@ -285,7 +286,7 @@ class Skin:
         return replace(moved, roll_deg=np.degrees(roll))
 
     def select(self, index: Sequence[int]) -> Skin:
-        """Return the skin of some of the sensors, in the order given."""
+        """Return a skin with some of the sensors, in the order given."""
         arrays = ("position", "normal", "range", "roll_deg", "radius")
         return replace(
             self,
@@ -303,8 +304,8 @@ class Skin:
         """Return the skin with a coverage and a range for every sensor.
 
         Args:
-            coverage: For sensors that have none of their own.
-            max_range: For sensors without a range of their own [m].
+            coverage: Coverage of sensors without one.
+            max_range: Range of sensors without one [m].
         """
         return replace(
             self,
@@ -313,9 +314,10 @@ class Skin:
         )
 
     def groups(self) -> list[list[int]]:
-        """Return the sensors of a `resolved` skin that one transform computes together.
+        """Return the sensor indices of a `resolved` skin, grouped by kind.
 
-        Those are of one kind: fields, or grids of beams of one size.
+        One transform computes a group: all field sensors, or all ray sensors with the
+        same grid.
         """
         groups: dict[object, list[int]] = {}
         for index, own in enumerate(self.coverage):
@@ -324,7 +326,12 @@ class Skin:
         return list(groups.values())
 
     def reach(self) -> np.ndarray:
-        """Return how far each sensor of a `resolved` skin sees at most [m], ``[S]``."""
+        """Return the largest distance at which each sensor detects [m], ``[S]``.
+
+        The skin must be `resolved`.
+
+        It exceeds the range for slanted beams that measure depth.
+        """
         slant = [1.0 if c is None else c.slant for c in self.coverage]
         return self.range * np.array(slant)
 
@@ -346,7 +353,7 @@ class Skin:
             for name in ("range", "radius"):
                 value = float(getattr(self, name)[i])
                 if not np.isnan(value):
-                    # JSON has no number for it.
+                    # JSON has no infinity.
                     entry[name] = "inf" if value == math.inf else value
             if coverage is not None:
                 if coverage not in types:
@@ -371,10 +378,10 @@ class Skin:
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> Skin:
-        """Return the skin that `to_dict` described.
+        """Return the skin described by the result of `to_dict`.
 
         Raises:
-            ValueError: If the content is not such a description; the text names the
+            ValueError: If the content is not a valid description; the text names the
                 sensor and the field.
         """
         if not isinstance(content, Mapping) or content.get("format") != _FORMAT:
@@ -416,10 +423,10 @@ class Skin:
         )
 
     def save(self, path: Path) -> None:
-        """Write the skin to a JSON file, one sensor on each line."""
+        """Write the skin to a JSON file, one sensor per line."""
         content = self.to_dict()
         sensors = content.pop("sensors")
-        # Provenance may hold a path.
+        # default=str because the provenance may hold a path.
         head = json.dumps(content, indent=2, default=str)[:-2]
         lines = ",\n".join(f"    {json.dumps(sensor)}" for sensor in sensors)
         Path(path).write_text(f'{head},\n  "sensors": [\n{lines}\n  ]\n}}\n')
@@ -429,7 +436,8 @@ class Skin:
         """Return the skin of a file.
 
         Raises:
-            ValueError: If the file is missing, no JSON, or no skin; the text names it.
+            ValueError: If the file is missing, not JSON or not a skin; the text names
+                the file.
         """
         try:
             return cls.from_dict(json.loads(read_regular(path)))

@@ -1,10 +1,10 @@
-"""Skins designed in GenTact: import of its exports, and export to its CSV.
+"""Import of GenTact's skin exports, and export to its CSV.
 
-GenTact (https://github.com/HIRO-group/GenTact) designs skins in Blender. Every dialect
-of its tables is read, and its xacro macro, raw or expanded to URDF; which one a file is
-shows in its content, whatever its name. Contract: nothing is guessed in silence. What
-cannot be read for certain is an error that names file and line; what was filled in or
-left out stands in the provenance of the skin.
+GenTact (https://github.com/HIRO-group/GenTact) is a Blender tool to design skins. All
+dialects of its tables and its xacro macro, raw or expanded to URDF, are supported; the
+format is detected from the content, not from the file name. Contract: nothing is
+guessed silently. Ambiguous input is an error that names file and line; values filled in
+and entries left out are listed in the provenance of the skin.
 """
 
 from egoskin.sensors.skin.gentact.importing import load_gentact

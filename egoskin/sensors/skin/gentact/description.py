@@ -1,4 +1,4 @@
-"""GenTact's robot descriptions: its xacro macro, and URDF with the macro expanded."""
+"""Reading of GenTact's robot descriptions: the xacro macro, raw or expanded to URDF."""
 
 from __future__ import annotations
 
@@ -22,14 +22,13 @@ from egoskin.sensors.skin.gentact.source import (
     read_radius,
 )
 
-# A normal and the frame beside it may differ by this [deg]: files rounded by hand.
+# Tolerance between a normal and the z axis of its frame [deg]: files rounded by hand.
 _SAME_DIRECTION = 2.0
 _SENSOR_TAGS = ("xacro:self_cap_sensor", "xacro:tof_sensor")
-# Some versions of the exporter leave out the > between a sensor's attributes and its
-# <origin>.
+# Some versions of the exporter omit the > between a sensor's attributes and <origin>.
 _UNCLOSED_SENSOR = re.compile(r'(<xacro:\w+_sensor\s[^<>]*")(?=\s*<origin\s)')
 _SENSOR_JOINT = re.compile(r"(^|[_/])sensor_\d+_joint$")
-# GenTact's magnetic sensors sense no proximity.
+# GenTact's magnetic sensors are not proximity sensors.
 _MAGNETIC = "mag_sensor"
 
 Frame = tuple[np.ndarray, np.ndarray]
@@ -37,13 +36,13 @@ Frame = tuple[np.ndarray, np.ndarray]
 
 
 class Xml:
-    """A parsed file in which each element knows its line. No entities, no DOCTYPE."""
+    """A parsed file with the line number of each element; DOCTYPE is an error."""
 
     def __init__(self, text: str, path: Path) -> None:
         self.path = path
         self._lines: dict[ElementTree.Element, int] = {}
         body = _UNCLOSED_SENSOR.sub(r"\1>", text.lstrip())
-        # GenTact writes a newline before the declaration, which XML forbids.
+        # GenTact writes a newline before the XML declaration, which is not valid XML.
         above = text[: len(text) - len(text.lstrip())].count("\n")
         builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()
 
@@ -76,12 +75,12 @@ class Xml:
         return f"{self.path}:{self._lines[element]}"
 
     def value(self, element: ElementTree.Element, name: str, default: str = "") -> str:
-        """An attribute, with the file's own xacro properties put in."""
+        """An attribute, with the xacro properties of the file substituted."""
         text = element.get(name, default).strip()
         return re.sub(r"\$\{(\w+)\}", lambda m: self.properties.get(m[1], m[0]), text)
 
     def vector(self, element: ElementTree.Element, name: str) -> np.ndarray:
-        """Three numbers of an attribute; zero if there is none."""
+        """An attribute of three numbers; zero if it is missing."""
         parts = self.value(element, name, "0 0 0").split()
         if len(parts) != 3:
             raise SensorError(
@@ -105,7 +104,7 @@ class Xml:
 
 
 def read_description(xml: Xml, names: Links, problems: Problems) -> Export:
-    """Sensors of a xacro macro or of a URDF."""
+    """Return the sensors of a xacro macro or of a URDF."""
     tags = Counter(element.tag for element in xml.root.iter())
     if any(tags[tag] for tag in _SENSOR_TAGS):
         sensors, dialect = _read_xacro(xml, names, problems), "xacro"
@@ -126,13 +125,13 @@ def read_description(xml: Xml, names: Links, problems: Problems) -> Export:
 
 
 def _is_sensor(joint: ElementTree.Element) -> bool:
-    """Whether a joint of a URDF carries a sensor of GenTact's."""
+    """Whether a joint of a URDF carries a GenTact sensor."""
     name = joint.get("name", "")
     return joint.get("type") == "fixed" and bool(_SENSOR_JOINT.search(name))
 
 
 def _read_xacro(xml: Xml, names: Links, problems: Problems) -> list[Sensor]:
-    """Sensors of the one macro of a xacro file, or of a file without macros."""
+    """Return the sensors of a xacro file with one sensor macro, or without macros."""
     macros = [
         macro
         for macro in xml.root.iter("xacro:macro")
@@ -161,7 +160,7 @@ def _read_xacro(xml: Xml, names: Links, problems: Problems) -> list[Sensor]:
 
 
 def _read_tag(xml: Xml, element: ElementTree.Element, link: str, base: Frame) -> Sensor:
-    """Sensor of an element of a xacro macro, given its link and the skin's frame."""
+    """Return the sensor of a xacro element, given its link and the skin's frame."""
     where = xml.where(element)
     if element.get("sensor_number") is None or element.find("origin") is None:
         raise SensorError(f"{where}: a sensor needs a sensor_number and an <origin>")
@@ -183,7 +182,7 @@ def _read_tag(xml: Xml, element: ElementTree.Element, link: str, base: Frame) ->
 def _read_urdf(
     xml: Xml, names: Links, joints: Sequence[ElementTree.Element], problems: Problems
 ) -> list[Sensor]:
-    """Sensors of a URDF: fixed joints that lead to them from links of the robot."""
+    """Return the sensors of a URDF, given the fixed joints that carry them."""
     tree = _Tree(xml, names)
     spheres = {
         link.get("name"): link.find("visual/geometry/sphere")
@@ -199,7 +198,7 @@ def _read_urdf(
             sensor = _framed(
                 xml,
                 joint,
-                # A fixed joint has no axis; GenTact's holds the normal.
+                # Fixed joints need no axis; GenTact stores the normal in it.
                 None if axis is None else xml.vector(axis, "xyz"),
                 base,
                 link=link,
@@ -211,7 +210,7 @@ def _read_urdf(
 
 
 class _Tree:
-    """Which link of the robot a URDF's links are fixed to, and where."""
+    """Lookup of the robot's link that a URDF's links are fixed to, and their frames."""
 
     def __init__(self, xml: Xml, names: Links) -> None:
         self._xml, self._names = xml, names
@@ -224,21 +223,21 @@ class _Tree:
                     f"already ({xml.where(self._above[child])}); take one out"
                 )
             self._above[child] = joint
-        # Frames found so far in their links of the robot; or the name of the link,
-        # fixed to none, at which the search ended.
+        # Results so far: link of the robot and frame in it; or, if there is none, the
+        # name of the link at which the search ended.
         self._frames: dict[str, tuple[str, Frame] | str] = {}
 
     def climb(self, joint: ElementTree.Element) -> tuple[str, Frame]:
-        """Link of the robot above a joint, and the frame of the joint's parent in it.
+        """Return the robot's link above a joint, and the joint parent's frame in it.
 
         Raises:
-            SensorError: If the parent is no link of the robot nor fixed to one.
+            SensorError: If the parent is not a link of the robot and not fixed to one.
         """
         name = _end(self._xml, joint, "parent")
         way: dict[str, ElementTree.Element] = {}
         while (found := self._frame(name)) is None:
             up = self._above.get(name)
-            # Passing a link twice is a ring.
+            # A link passed twice is a cycle.
             if up is None or up.get("type") != "fixed" or name in way:
                 found = name
                 break
@@ -260,7 +259,7 @@ class _Tree:
         return found
 
     def _frame(self, name: str) -> tuple[str, Frame] | str | None:
-        """What is known of a link without a look at what it hangs on."""
+        """Known result for a link, without looking at its parents; None if unknown."""
         if name not in self._frames and (link := self._names.match(name)) is not None:
             self._names.found[name] = link
             self._frames[name] = (link, (np.eye(3), np.zeros(3)))
@@ -285,11 +284,15 @@ def _framed(
     name: str,
     radius: float,
 ) -> Sensor:
-    """The sensor of an element with an origin and maybe a normal beside it.
+    """Return the sensor of an element with an origin and an optional normal.
 
     Both are relative to a base frame, which is given in the frame of the link. The
-    normal is z of the origin's frame; where it is not, an origin without rpy has just
-    no frame to tell. A normal of (0, 0, 0) tells nothing: exporters write it for none.
+    normal must be the z axis of the origin's frame. If it is not, an origin without rpy
+    gives no frame, only a position; one with rpy is an error. Exporters write (0, 0, 0)
+    for a missing normal.
+
+    Raises:
+        SensorError: If the normal and the z axis of rpy differ.
     """
     own, position = xml.frame(element)
     where = xml.where(element)

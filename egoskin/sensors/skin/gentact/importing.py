@@ -1,4 +1,4 @@
-"""Import of GenTact's exports as skins."""
+"""Import of GenTact exports as skins."""
 
 from __future__ import annotations
 
@@ -27,16 +27,17 @@ from egoskin.storage.files import read_regular
 
 # Largest file [bytes]: 100,000 sensors.
 _LARGEST = 16 * 2**20
-# Lengths of normals: read as they are; normalised; else refused.
+# Deviation of a normal's length from 1: accepted up to the first, normalised up to the
+# second, else an error.
 _UNIT, _ALMOST_UNIT = 1e-5, 0.05
-# Nearer to their links' origins [m] not all sensors of a skin sit: the unit is another.
+# If all sensors are nearer to their links' origins than this [m], the unit is wrong.
 _NEAREST = 0.002
-# Sensors of other radii [m] there are not: the unit is another.
+# Plausible radii [m]; outside, the unit is wrong.
 _SMALLEST, _LARGEST_RADIUS = 1e-4, 0.5
-# Step of the numerical gradient [m]; where it is shorter than this there is no one
-# outward direction (it is 1, or 1/sqrt(2) on an edge).
+# Step of the numerical gradient [m], and its smallest valid length: below, the outward
+# direction is not unique. (The length is 1, or 1/sqrt(2) on an edge.)
 _STEP, _SHORTEST = 1e-6, 0.5
-# Less roll than this [deg] is the rounding of the file.
+# A smaller roll than this [deg] is rounding of the file.
 _NO_ROLL = 0.1
 
 
@@ -51,33 +52,33 @@ def load_gentact(
     parent: str | None = None,
     skip_invalid: bool = False,
 ) -> Skin:
-    """Return the skin that one or several files exported from GenTact describe.
+    """Return the skin described by one or several files exported from GenTact.
 
-    A radius of 0.1 m, 0 or none is unknown: NaN. Normals of a file without any are
-    those of the robot's nearest primitive on the same link. A xacro or URDF frame
-    that is turned about its normal gives the sensor a roll.
+    A radius of 0.1 m, 0 or none is unknown: NaN. If a file has no normals, those of the
+    nearest primitive on the same link are used. A xacro or URDF frame that is rotated
+    about its normal gives the sensor a roll.
 
     Args:
-        path: CSV of any dialect, xacro, or URDF into which the xacro was expanded; the
-            sensors of several files come one after the other.
+        path: CSV of any dialect, xacro, or URDF with the xacro expanded; the sensors of
+            several files are concatenated.
         robot_name: Name of the robot, for the skin.
         links: Links of the robot.
         primitives: The robot's shapes, for files without normals and for the distance
-            of the sensors from the surface, which the provenance tells.
-        scale: Metres of one unit of the files' positions (and radii, but for the 3-D
-            print export since it has headings: its radii are in metres); None: that of
-            the dialect, or what the header says in brackets.
+            of the sensors from the surface in the provenance.
+        scale: Unit of the positions [m], and of the radii except in newer 3-D print
+            exports, whose radii are in metres. None: the unit given in brackets in the
+            header, or that of the dialect.
         link_map: Link of the robot by a component of the Parent path, the whole path,
-            a link of the URDF, or the name of the xacro's macro; goes before the names
-            themselves. What no file needs stands in the provenance.
-        parent: Link of the sensors in a file that names none.
-        skip_invalid: Leave out sensors that cannot be read for certain; the provenance
-            lists them. Otherwise they are an error that names them all.
+            a link of the URDF, or the name of the xacro macro; takes precedence over
+            the names themselves. Unused entries are listed in the provenance.
+        parent: Link of the sensors in files that do not name any.
+        skip_invalid: Leave out invalid or ambiguous sensors and list them in the
+            provenance. Otherwise they raise an error that lists all of them.
 
     Raises:
-        ValueError: If a file cannot be read for certain; the text says where in it,
-            what was expected, what came and what to do.
-        OSError: If there is no such file.
+        ValueError: If a file is invalid or ambiguous; the text gives the place in the
+            file, the expected and actual value and the remedy.
+        OSError: If a file does not exist.
     """
     paths = [Path(p) for p in ([path] if isinstance(path, (str, Path)) else path)]
     if not paths:
@@ -122,7 +123,7 @@ def _load(
     scale: float | None,
     problems: Problems,
 ) -> Skin | None:
-    """The skin of one file; None if all its sensors are invalid."""
+    """Return the skin of one file; None if all its sensors are invalid."""
     try:
         text = read_regular(path, _LARGEST).decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -185,7 +186,7 @@ def _load(
 
 
 def _check_new(sensor: Sensor, first: dict[str, str]) -> None:
-    """Raise SensorError if a sensor of that name came before; note it if not."""
+    """Raise SensorError if the sensor's name is a duplicate, else record it."""
     if sensor.name in first:
         raise SensorError(
             f"{sensor.where}: {sensor.name!r} is there already "
@@ -195,7 +196,7 @@ def _check_new(sensor: Sensor, first: dict[str, str]) -> None:
 
 
 def _metres_per_unit(path: Path, export: Export, scale: float | None) -> float:
-    """Metres of one unit of the file; ValueError if that is doubtful."""
+    """Return the unit of the file [m]; raise ValueError if it is unknown or wrong."""
     if export.unit_is_given and scale not in (None, export.unit):
         raise ValueError(
             f"{path}: the header says {export.unit:g} m to the unit, scale says "
@@ -216,7 +217,7 @@ def _metres_per_unit(path: Path, export: Export, scale: float | None) -> float:
 
 
 def _wrong_unit(sensor: Sensor, length: float, unit: float) -> SensorError:
-    """The error for a sensor in a place where no sensor is."""
+    """Return the error for a sensor at an implausible distance from its link."""
     return SensorError(
         f"{sensor.where}: the sensor lies {length:.3g} m from the origin of its link "
         f"with {unit:g} m to the unit of the file",
@@ -226,14 +227,14 @@ def _wrong_unit(sensor: Sensor, length: float, unit: float) -> SensorError:
 
 
 def _check_near(sensor: Sensor, unit: float) -> None:
-    """Raise SensorError if a sensor lies where none is on a robot."""
+    """Raise SensorError if a sensor is implausibly far from its link's origin."""
     length = unit * math.hypot(*sensor.position)
     if length > FARTHEST:
         raise _wrong_unit(sensor, length, unit)
 
 
 def _radius(sensor: Sensor, unit: float) -> float:
-    """Radius [m], NaN if unknown."""
+    """Return the radius [m], NaN if unknown."""
     radius = unit * sensor.radius
     if math.isclose(radius, NO_RADIUS):
         return math.nan
@@ -249,10 +250,10 @@ def _radius(sensor: Sensor, unit: float) -> float:
 def _outward(
     sensors: Sequence[Sensor], position: np.ndarray, primitives: Sequence[Primitive]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Gradient of the distance to the link's primitives, and that distance [m].
+    """Return the gradient of the distance to the link's primitives, and the distance.
 
     Returns:
-        ``[S, 3]`` and ``[S]``; NaN on a link without primitives.
+        ``[S, 3]`` and ``[S]`` [m]; NaN on a link without primitives.
     """
     gradient, distance = np.full_like(position, np.nan), np.full(len(sensors), np.nan)
     for link in {s.link for s in sensors}:
@@ -272,7 +273,7 @@ def _outward(
 
 
 def _normal(sensor: Sensor, outward: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Unit normal ``[3]``, and whether it is the file's made a unit vector."""
+    """Return the unit normal ``[3]``, and whether the file's had to be normalised."""
     if sensor.normal is None:
         length = float(np.linalg.norm(outward))
         if not length >= _SHORTEST:
@@ -291,14 +292,14 @@ def _normal(sensor: Sensor, outward: np.ndarray) -> tuple[np.ndarray, bool]:
         raise SensorError(
             f"{sensor.where}: the normal must have length 1, got {length:.4g}"
         )
-    # Up to its own digits a unit vector stays as written.
+    # A unit vector up to rounding of the file is kept as written.
     if abs(length - 1) <= _UNIT:
         return sensor.normal, False
     return sensor.normal / length, True
 
 
 def _roll_deg(skin: Skin, sensors: Sequence[Sensor]) -> np.ndarray:
-    """Turn about the normal from the skin's frames to the file's [deg], ``[S]``."""
+    """Return the roll from the skin's frames to the file's [deg], ``[S]``."""
     roll = np.zeros(len(skin))
     for i, (frame, sensor) in enumerate(zip(skin.rotation(), sensors, strict=True)):
         if sensor.x_axis is not None:

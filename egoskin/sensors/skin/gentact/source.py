@@ -1,4 +1,4 @@
-"""What a file of GenTact's says of its sensors, in whatever dialect it says it."""
+"""Common representation of the sensors in GenTact's files, for all dialects."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ import numpy as np
 from egoskin.hints import did_you_mean
 
 NO_RADIUS = 0.1
-"""What GenTact writes for a sensor that has no radius [m]."""
-# Names below a link in GenTact's paths, as Isaac Sim's URDF importer gives them.
+"""Radius that GenTact writes for a sensor without one [m]."""
+# Names below a link in GenTact's paths, from Isaac Sim's URDF importer.
 _BELOW_LINK = re.compile(r"(visuals|collisions|geometry)([._]?\d+)?")
 
 
-# Of a file with more invalid sensors than this the rest is not read; so many are named.
+# Number of invalid sensors after which reading stops, and number listed in the error.
 _MOST_INVALID, _SHOWN = 1000, 100
 
 
 class SensorError(ValueError):
-    """One sensor cannot be read for certain.
+    """A sensor is invalid or ambiguous.
 
     Args:
-        what: Where in the file, what was expected and what came.
-        remedy: What to do about it, the same for all sensors of whom it is true.
+        what: Place in the file, expected and actual value.
+        remedy: How to fix it; the same text for all sensors with the same problem.
     """
 
     def __init__(self, what: str, remedy: str = "") -> None:
@@ -37,14 +37,18 @@ class SensorError(ValueError):
 
 
 class Problems:
-    """The sensors that cannot be read, to name all of them at once."""
+    """Collects the errors of invalid sensors, to report all of them at once."""
 
     def __init__(self) -> None:
         self.found: list[SensorError] = []
 
     @contextmanager
     def collect(self) -> Iterator[None]:
-        """Note that a sensor is invalid, and go on behind the block."""
+        """Record a SensorError raised in the block, and continue after it.
+
+        Raises:
+            ValueError: If there are too many.
+        """
         try:
             yield
         except SensorError as error:
@@ -56,7 +60,7 @@ class Problems:
                 ) from None
 
     def raise_all(self) -> None:
-        """Raise ValueError if a sensor was invalid."""
+        """Raise ValueError if any sensor was invalid."""
         if len(self.found) == 1:
             raise ValueError(
                 f"{self.found[0]}; or leave it out with skip_invalid (--skip-invalid)"
@@ -76,7 +80,7 @@ class Problems:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Sensor:
-    """One sensor as the file has it."""
+    """One sensor as given in the file."""
 
     where: str
     name: str
@@ -84,35 +88,36 @@ class Sensor:
     # In the frame of the link, in the unit of the file.
     position: np.ndarray
     normal: np.ndarray | None
-    # x axis of the sensor's frame; None if the file gives none.
+    # x axis of the sensor's frame; None if not in the file.
     x_axis: np.ndarray | None = None
     radius: float = math.nan
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Export:
-    """A file's sensors, and what to know of its dialect."""
+    """The sensors of a file, and properties of its dialect."""
 
     dialect: str
     sensors: list[Sensor]
-    # Metres of one unit of the positions; None if the file does not say.
+    # Unit of the positions [m]; None if unknown.
     unit: float | None = 1.0
-    # The header itself says that unit.
+    # Whether the header states that unit.
     unit_is_given: bool = False
-    # Metres of one unit of the radii; None if it is that of the positions.
+    # Unit of the radii [m]; None if it is that of the positions.
     radius_unit: float | None = None
-    # Numbers of entries that are no proximity sensors.
+    # Number of skipped entries, which are not proximity sensors, by kind.
     skipped: dict[str, int] = field(default_factory=dict)
 
 
 class Links:
-    """Which link of the robot the file means.
+    """Mapping from names and paths in the file to links of the robot.
 
     Args:
         robot_name: Name of the robot, for error texts.
-        links: Its links.
-        link_map: The user's: link by a part of a path or by all of it.
-        parent: The user's link for sensors whose link the file does not name.
+        links: Links of the robot.
+        link_map: User's map from a name, a component of a path or a whole path to a
+            link.
+        parent: User's link for sensors whose link is not in the file.
 
     Raises:
         ValueError: If the user names a link that the robot does not have.
@@ -129,7 +134,7 @@ class Links:
         self.found: dict[str, str] = {}
         self._link_map, self._parent = dict(link_map), parent
         self.unused = dict.fromkeys(link_map)
-        """Names in the user's map that decided nothing so far, in their order."""
+        """Names in the user's map that have not been used yet, in order."""
         self._needs_parent = False
         for target in (*link_map.values(), *(() if parent is None else (parent,))):
             if target not in self.links:
@@ -137,18 +142,22 @@ class Links:
                 raise ValueError(f"no link {target!r}{hint}; {self.known()}")
 
     def known(self) -> str:
-        """The robot's links, to end an error text with."""
+        """List of the robot's links, for the end of an error text."""
         return f"the links of {self.robot_name} are {', '.join(self.links)}"
 
     def match(self, name: str) -> str | None:
-        """Link that a name stands for, by the user's map or by its own; else None."""
+        """Return the link for a name from the user's map or of that name, else None."""
         if name in self._link_map:
             self.unused.pop(name, None)
             return self._link_map[name]
         return name if name in self.links else None
 
     def of_path(self, path: str, where: str) -> str:
-        """Link of a Parent path."""
+        """Return the link of a Parent path.
+
+        Raises:
+            SensorError: If no component of the path is a link, or it is ambiguous.
+        """
         if path in self._link_map:
             return self.found.setdefault(path, str(self.match(path)))
         parts = path.strip("/").split("/")
@@ -158,8 +167,8 @@ class Links:
             link = self.match(parts[last]) or self.match(plain)
             if link is None:
                 continue
-            # GenTact puts the names of siblings with sensors into one path by mistake,
-            # and a path may go on to a link that this robot lacks.
+            # GenTact sometimes puts the names of several siblings with sensors into one
+            # path by mistake, and a path may continue to a link this robot lacks.
             rest = [p for p in parts[last + 1 :] if not _BELOW_LINK.fullmatch(p)]
             if rest:
                 raise SensorError(
@@ -179,11 +188,14 @@ class Links:
         )
 
     def default(self, where: str, name: str = "") -> str:
-        """The user's link for sensors whose link the file does not name.
+        """Return the user's link for sensors whose link is not in the file.
 
         Args:
             where: File and line.
-            name: What the file calls the skin, which the user's map may hold.
+            name: Name of the skin in the file, which the user's map may contain.
+
+        Raises:
+            SensorError: If the user gave none.
         """
         if name in self._link_map:
             return self.found.setdefault(name, str(self.match(name)))
@@ -197,7 +209,7 @@ class Links:
         )
 
     def check_parent(self) -> None:
-        """Raise ValueError if the user gave a parent and no sensor has use for it."""
+        """Raise ValueError if the user gave a parent that no sensor needs."""
         if self._parent is not None and not self._needs_parent:
             found = ", ".join(sorted(set(self.found.values())))
             raise ValueError(
@@ -207,7 +219,7 @@ class Links:
 
 
 def number(text: str, where: str, what: str) -> float:
-    """A finite number, or an error that says where it should have been."""
+    """Return a finite number, or raise a SensorError with its place in the file."""
     try:
         value = float(text)
     except ValueError:
@@ -218,7 +230,7 @@ def number(text: str, where: str, what: str) -> float:
 
 
 def read_radius(text: str, where: str) -> float:
-    """Radius in the file's unit; NaN for what the exporter writes without one."""
+    """Return the radius in the file's unit; NaN for the exporter's placeholders."""
     if text in ("", "REPLACE_ME"):
         return math.nan
     value = number(text, where, "the radius")

@@ -1,4 +1,4 @@
-"""GenTact's tables: the CSV of every version and the 3-D print export."""
+"""GenTact's tables: the CSV of all versions and the 3-D print export."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ _HEADERS = (
 _PLACE = ("x", "y", "z")
 _NORMAL = tuple(f"norm{axis}" for axis in _PLACE)
 _STEM = tuple(f"stem{axis}" for axis in _PLACE)
-# What the columns are called, without case, spaces and the like. A sensor's own name
-# is a number ("index") or any text ("name").
+# Accepted column headers, without spaces and punctuation, compared ignoring case. The
+# identifier of a sensor is a number ("index") or any text ("name").
 _COLUMNS = {
     "index": "index sensor num number id sensornum sensornumber sensorindex sensorid",
     "name": "name sensorname",
@@ -58,18 +58,19 @@ _DECIMAL_COMMA = re.compile(r"^([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)$")
 
 
 def save_gentact(skin: Skin, path: Path | str) -> tuple[str, ...]:
-    """Write the skin as GenTact's current CSV; return what that cannot hold.
+    """Write the skin as GenTact's current CSV; return the fields that are lost.
 
     Args:
         skin: The skin. An unknown radius is written as GenTact's 0.1 m.
         path: File to write.
 
     Returns:
-        Names of the fields of the skin that are lost, of ``coverage``, ``range`` and
-        ``roll_deg``.
+        Which of the fields ``coverage``, ``range`` and ``roll_deg`` the skin uses but
+        the format cannot store.
 
     Raises:
-        ValueError: If a link's name holds a slash, which divides GenTact's paths.
+        ValueError: If the name of a link or of the robot contains a slash, the
+            separator of GenTact's paths.
     """
     slashed = [name for name in (*skin.links, skin.robot) if "/" in name]
     if slashed:
@@ -80,7 +81,7 @@ def save_gentact(skin: Skin, path: Path | str) -> tuple[str, ...]:
         radius = np.where(np.isnan(skin.radius), NO_RADIUS, skin.radius)
         for i, link in enumerate(skin.links):
             numbers = (*skin.position[i], *skin.normal[i], radius[i])
-            # repr, the shortest text that reads as the same number
+            # repr is the shortest text that parses to the same number.
             row = [repr(float(v)) for v in numbers]
             writer.writerow([i, *row, f"/{skin.robot}/{link}/visuals", "visuals"])
     lost = {
@@ -92,10 +93,10 @@ def save_gentact(skin: Skin, path: Path | str) -> tuple[str, ...]:
 
 
 def _rows(text: str, path: Path) -> Iterator[tuple[str, list[str]]]:
-    """Rows that are neither blank nor comments (#), as (where, stripped cells).
+    """Yield the rows that are not blank or comments (#), as (where, stripped cells).
 
-    A spreadsheet may have put semicolons or tabs between the cells, and then decimal
-    commas into them.
+    Spreadsheets may write semicolons or tabs as delimiters; decimal commas are then
+    accepted.
     """
     lines = (line for line in text.splitlines() if line.strip())
     header = next((line for line in lines if not line.lstrip().startswith("#")), "")
@@ -111,7 +112,7 @@ def _rows(text: str, path: Path) -> Iterator[tuple[str, list[str]]]:
             raise ValueError(f"{where}: {error}") from None
         if row is None:
             return
-        # A quote that is never closed would swallow the rows that follow.
+        # An unclosed quote would swallow the following rows.
         if any("\n" in cell or "\r" in cell for cell in row):
             raise ValueError(f"{where}: a quoted value must end on its line")
         cells = [cell.strip() for cell in row]
@@ -122,7 +123,7 @@ def _rows(text: str, path: Path) -> Iterator[tuple[str, list[str]]]:
 
 
 def read_table(text: str, path: Path, names: Links, problems: Problems) -> Export:
-    """Sensors of a table of any dialect."""
+    """Return the sensors of a table of any dialect."""
     rows = list(_rows(text, path))
     if not rows:
         raise ValueError(f"{path}: the file is empty")
@@ -130,7 +131,7 @@ def read_table(text: str, path: Path, names: Links, problems: Problems) -> Expor
     while header and not header[-1]:
         header.pop()
     columns, units = _read_header(header, where)
-    # The 3-D print export has, besides sensors, clips and the names of objects.
+    # Besides sensors, the 3-D print export contains clips and object names (headings).
     kinds = Counter(_kind(cells) for _, cells in rows)
     plain = ["index", *_PLACE, "radius", "parent"]
     is_print = columns[0] == "index" and (
@@ -140,18 +141,18 @@ def read_table(text: str, path: Path, names: Links, problems: Problems) -> Expor
         rows = [(w, cells) for w, cells in rows if _kind(cells) == "sensors"]
     if not rows:
         raise ValueError(f"{path}: there is no sensor in it")
-    # Without the column, one link holds for all.
+    # Without the parent column, all sensors are on one link.
     link = None if "parent" in columns else names.default(where)
     sensors = []
     for where, cells in rows:
         with problems.collect():
             record = _record(cells, columns, where, is_print)
             sensors.append(_read_sensor(record, names, link, where))
-    # Before it had stems the print export came in one unit or another.
+    # The unit of print exports without stem columns (old versions) is unknown.
     unit = 1.0 if not is_print else 1e-3 if _STEM[0] in columns else None
     given = units.get("x")
     radius_unit = units.get("radius")
-    # Since it writes headings, its positions have a unit of their own.
+    # Print exports with stems or headings have radii in metres.
     if radius_unit is None and is_print and (unit is not None or kinds["headings"]):
         radius_unit = 1.0
     return Export(
@@ -167,10 +168,10 @@ def read_table(text: str, path: Path, names: Links, problems: Problems) -> Expor
 def _read_header(
     header: Sequence[str], where: str
 ) -> tuple[list[str], dict[str, float]]:
-    """Names of the columns, and metres of the units that stand in brackets.
+    """Return the names of the columns, and their units given in brackets [m].
 
     Raises:
-        ValueError: If a column is unknown, there twice or missing.
+        ValueError: If a column is unknown, duplicate or missing, or a unit is invalid.
     """
     columns, units = [], {}
     for cell in header:
@@ -213,7 +214,7 @@ def _read_header(
 def _read_sensor(
     record: Mapping[str, str], names: Links, link: str | None, where: str
 ) -> Sensor:
-    """The sensor of a row; ``link`` is the one of all rows, None if each names it."""
+    """Return the sensor of a row; ``link`` is None if each row names its own."""
     if "index" in record:
         number(record["index"], where, "index")
     if link is None and record["parent"]:
@@ -229,17 +230,17 @@ def _read_sensor(
 
 
 def _kind(cells: Sequence[str]) -> str:
-    """What a row describes: a sensor, or in the print export a clip or an object."""
+    """Return the kind of a row: sensor or, in the print export, clip or heading."""
     if cells[0] == "CLIP":
         return "clips"
-    # An object's name stands alone.
+    # A heading is an object's name alone in its row.
     return "sensors" if any(cells[1:]) or cells[0].isdigit() else "headings"
 
 
 def _record(
     cells: list[str], columns: Sequence[str], where: str, is_print: bool
 ) -> dict[str, str]:
-    """A row by its columns; the print export leaves cells at the end out."""
+    """Return a row by column name; the print export may omit trailing cells."""
     while len(cells) > len(columns) and not cells[-1]:
         cells = cells[:-1]
     if is_print:
@@ -255,5 +256,5 @@ def _record(
 def _vector(
     record: Mapping[str, str], columns: Sequence[str], where: str
 ) -> np.ndarray:
-    """Three numbers of a row."""
+    """Return three numbers of a row."""
     return np.array([number(record[c], where, c) for c in columns])
