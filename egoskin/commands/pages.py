@@ -8,7 +8,7 @@ from __future__ import annotations
 
 PAGES = {
     "train": """\
-Train a robot to dodge balls by what its skin observes.
+Train a robot to dodge balls with a skin of proximity sensors.
 
   --sensor.coverage {field,ray,none,oracle}
                           a sphere around each sensor; an 8x8 grid of beams; no
