@@ -49,7 +49,7 @@ class EvaluateConfig:
     episodes: Annotated[int, COUNT] = 1024
     """Throw sequences in the throw set."""
     standard: Literal["2", "1", "paper", "run"] = "2"
-    """Version of the standard throw to play, whatever the policy was trained on;
+    """Version of the standard throw to play, independent of the policy's training;
     run: the throws and terminations of its training."""
     mask: tuple[str, ...] | None = None
     """Links whose sensors are masked; alone: all sensors. The success that remains does

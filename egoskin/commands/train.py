@@ -40,7 +40,7 @@ class Stop:
 
 
 def open_run(config: TrainConfig) -> Run:
-    """Return the run of a configuration, new or to be resumed; print what it is.
+    """Return the new or resumed run of a configuration, and print a summary of it.
 
     Raises:
         ValueError: If the run cannot be trained on this machine.

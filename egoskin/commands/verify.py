@@ -1,4 +1,4 @@
-"""Verify that training gives the same bits whatever the machine settings.
+"""Verify that training gives the same bits with different machine settings.
 
 These are the numbers of workers, physics threads and learner threads, compiled or plain
 sensor kernels, the interval of checkpoints, and a resume that changes them.

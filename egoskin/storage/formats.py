@@ -59,8 +59,8 @@ _MIGRATIONS = {
         removed={
             # Environment steps over which these grew: the touching part of a ball; the
             # penalty on distance from the start, beginning at "drift_start"; the speed
-            # of the balls, beginning at "slow_start". Then, an oracle that observes the
-            # next passing ball first.
+            # of the balls, beginning at "slow_start". Further, whether an oracle
+            # observes the ball that passes next first.
             "core_frames": [0, 0],
             "drift_frames": [0, 0],
             "slow_start_frames": 0,

@@ -5,7 +5,7 @@ manifest *fixes* them: it stores the complete configuration at its creation, in 
 format of that time, and each cell's differences from it. Later changes of defaults or
 option names therefore do not affect a study that has begun.
 
-Contract: cells and seeds can be added to a manifest; those in it never change.
+Contract: cells and seeds can be added to a manifest; nothing in it is changed.
 """
 
 from __future__ import annotations

@@ -220,7 +220,7 @@ class StudyFolder:
         return _last_row(path / "metrics.csv").get("frames") == planned.end
 
     def is_trained_elsewhere(self, name: str) -> bool:
-        """Return whether another process trains a run, such as ppo.py if adopted."""
+        """Return whether another process trains a run, for example ppo.py."""
         return is_locked(self.run_path(name) / "lock")
 
     def is_running(self, name: str) -> bool:
