@@ -1,8 +1,7 @@
-"""The command line: what `egoskin NAME`, `python -m egoskin NAME` and the scripts do.
+"""The command line: `egoskin NAME`, `python -m egoskin NAME` and the scripts.
 
-Contract: a command is the module of its name, with a function ``main(args)``, and
-nothing heavy is imported before its arguments are known to ask for no help: that comes
-at once.
+Contract: a command is the module of its name, with a function ``main(args)``. Help is
+shown at once: nothing heavy is imported before the arguments are checked for it.
 """
 
 from __future__ import annotations
@@ -34,8 +33,8 @@ COMMANDS = {
     "verify": "check that training is reproducible on this machine",
     "bench": "measure speed and accuracy",
 }
-"""What each command does, by name."""
-# What else may be meant: names of scripts that are older.
+"""Descriptions of the commands, by name."""
+# Other names for suggestions: older scripts, and options.
 _OTHER_NAMES = {
     "ppo": "train",
     "render": "film",
@@ -45,21 +44,21 @@ _OTHER_NAMES = {
     "--version": "--version",
 }
 
-# Bytes that PyTorch and MuJoCo take when they are imported, with a reserve.
+# Address space that importing PyTorch and MuJoCo takes, with a reserve [bytes].
 _ADDRESS_SPACE = 1_000_000_000
 # Commands that draw the robot.
 _PICTURES = ("film", "skin", "robot")
 
 
 def main() -> None:
-    """Run the command that the first argument of this process names."""
+    """Run the command named by the first argument of this process."""
     name, *args = sys.argv[1:] or ["--help"]
     if name in ("--help", "-h"):
         _show(_page())
     elif name == "--version":
         print(f"egoskin {__version__}")
     elif name in COMMANDS:
-        # Help and the record of a run show how it was called.
+        # Help and the record of a run show the command as it was called.
         sys.argv = [f"egoskin {name}", *args]
         run(name)
     else:
@@ -68,10 +67,10 @@ def main() -> None:
 
 
 def begin(name: str) -> None:
-    """Give the help that is asked for, and end; else prepare to run a command.
+    """Show the help and exit if it is requested; else prepare to run a command.
 
-    Call this before mujoco and torch are imported. ``--help-all`` is left to the
-    command's own parser, as ``--help``.
+    Call this before mujoco and torch are imported. ``--help-all`` is passed on to the
+    command's own parser as ``--help``.
     """
     end_quietly()
     args = sys.argv[1:]
@@ -89,7 +88,7 @@ def run(name: str) -> None:
     """Run a command on the arguments of this process, with clear errors."""
     begin(name)
     command = import_module(f"egoskin.commands.{name.replace('-', '_')}")
-    # Only now: it imports torch.
+    # Imported late, because it imports torch.
     from egoskin.commands.errors import clear_errors
 
     with clear_errors():
@@ -97,13 +96,13 @@ def run(name: str) -> None:
 
 
 def _show(text: str) -> None:
-    """Print, and end without a word if nobody reads it, as in `| head -1`."""
+    """Print a text; exit silently if the output pipe is closed, as in `| head -1`."""
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)
     print(text, flush=True)
 
 
 def _check_address_space() -> None:
-    """End if `ulimit -v` leaves no room for libraries; some would try for ever."""
+    """Exit if `ulimit -v` leaves no room for libraries; some would retry for ever."""
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)
     if limit != resource.RLIM_INFINITY and limit < _ADDRESS_SPACE:
         print(
@@ -115,7 +114,7 @@ def _check_address_space() -> None:
 
 
 def _page() -> str:
-    """Return the help of the whole."""
+    """Return the help page that lists all commands."""
     width = max(map(len, COMMANDS))
     lines = [f"  {name:<{width}}  {text}" for name, text in COMMANDS.items()]
     return "\n".join(
@@ -136,12 +135,12 @@ def _page() -> str:
 
 
 def unknown(name: str, known: Iterable[str], other: Mapping[str, str] = {}) -> str:
-    """Return what to say of a name that is none, with the nearest that is one.
+    """Return the error text for an unknown name, with the nearest known one.
 
     Args:
-        name: What was given.
-        known: The names that there are.
-        other: Other names that may have been meant, and what each stands for.
+        name: The unknown name.
+        known: The known names.
+        other: Other names that may have been meant, and the known name of each.
     """
     near = difflib.get_close_matches(name, [*known, *other], n=1)
     hint = f", did you mean {other.get(near[0], near[0])!r}?" if near else ""

@@ -1,4 +1,4 @@
-"""Clear errors: what ends a command becomes one line and an exit status."""
+"""Clear errors: failures and signals become one line and an exit status."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from egoskin.interrupts import ENDING, end_next_time, end_now, say, take
 from egoskin.memory import is_out_of_memory
 from egoskin.parallel import WorkerError
 
-# Options that have another name now, by the old one.
+# New names of renamed options, by the old name.
 _RENAMED = {
     "--sensor.localization.hold": "--sensor.keep-last",
     "--sensor.ray.fov": "--sensor.ray.fov-deg, from corner to corner",
@@ -34,7 +34,7 @@ _RENAMED = {
     "--bank-seed": "--throw-set",
 }
 NUMBERS = ConstructorRegistry()
-"""How options are read, while it is entered: a whole number also as 1e6."""
+"""Rules for reading options while it is entered: integers also as 1e6."""
 
 
 @NUMBERS.primitive_rule
@@ -56,26 +56,26 @@ def _read_whole(text: str) -> int:
         return int(text)
     with suppress(ValueError):
         number = float(text)
-        # Beyond, not every whole number is a float.
+        # Beyond this, not every whole number has an exact float.
         if number.is_integer() and abs(number) < 2**53:
             return int(number)
     raise ValueError(f"expected a whole number, got {text}")
 
 
 class _Ended(KeyboardInterrupt):
-    """Raised where the signal of a number arrives."""
+    """Raised when a signal arrives; its argument is the signal number."""
 
 
 @contextmanager
 def clear_errors() -> Iterator[None]:
-    """Turn what ends a command into one line on stderr and an exit status.
+    """Turn failures and signals into one line on stderr and an exit status.
 
-    Within, `NUMBERS` says how options are read.
+    Inside the context, options are read by `NUMBERS`.
 
-    An error that the user can mend is status 2: ValueError (bad input), OSError
-    (files), too little memory, what is too large or too deep. A worker's end is status
-    1, and a signal 128 with its number added. If nobody reads the output any more, that
-    is no error. Anything else is a fault of ours and keeps its traceback.
+    Errors that the user can fix have status 2: ValueError (bad input), OSError (files),
+    too little memory, input that is too large or too deeply nested. The end of a worker
+    has status 1, and a signal 128 plus its number. A closed output pipe is not reported
+    as an error. Any other exception is a bug in egoskin and keeps its traceback.
     """
     before = {number: signal.getsignal(number) for number in ENDING}
     hook, sys.unraisablehook = sys.unraisablehook, _end_if_lost
@@ -97,7 +97,7 @@ def clear_errors() -> Iterator[None]:
         if not isinstance(error, (ValueError, OSError, OverflowError, RecursionError)):
             raise
         if isinstance(error, BrokenPipeError) and _nobody_reads():
-            # What is left to be written is not tried again.
+            # Do not try to write the remaining output again.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             raise SystemExit(128 + signal.SIGPIPE) from None
         print(f"error: {error}", file=sys.stderr)
@@ -114,7 +114,7 @@ def clear_errors() -> Iterator[None]:
 
 
 def _check_names(args: list[str]) -> None:
-    """Raise ValueError for an option that has another name now."""
+    """Raise ValueError for an option that has been renamed."""
     for arg in args:
         name = arg.split("=")[0].replace("_", "-")
         if name in _RENAMED:
@@ -122,12 +122,12 @@ def _check_names(args: list[str]) -> None:
 
 
 def check_packages(what: str, extra: str, *packages: str) -> None:
-    """Raise ValueError if a package is missing that something needs.
+    """Raise ValueError if a required package is missing.
 
     Args:
-        what: What needs it.
-        extra: The extra of egoskin that brings it.
-        packages: Their names.
+        what: Name of the feature that needs the packages, for the error text.
+        extra: The extra of egoskin that installs them.
+        packages: Names of the packages.
     """
     for package in packages:
         if importlib.util.find_spec(package) is None:
@@ -137,7 +137,7 @@ def check_packages(what: str, extra: str, *packages: str) -> None:
 
 
 def _nobody_reads() -> bool:
-    """Whether the other end of the output's pipe is closed."""
+    """Return whether the reading end of the output pipe is closed."""
     poll = select.poll()
     poll.register(sys.stdout.fileno(), 0)
     return bool(poll.poll(0))
@@ -154,7 +154,7 @@ def _number(error: BaseException) -> int:
 
 
 def _end_if_lost(lost: sys.UnraisableHookArgs) -> None:
-    """End if a signal arrived where no exception leads out, as in a destructor."""
+    """Exit if a signal arrived where exceptions are ignored, as in a destructor."""
     if isinstance(lost.exc_value, KeyboardInterrupt):
         end_now(_number(lost.exc_value))
     sys.__unraisablehook__(lost)
@@ -163,15 +163,15 @@ def _end_if_lost(lost: sys.UnraisableHookArgs) -> None:
 def parse_subcommand(
     kinds: Mapping[str, type], args: Sequence[str], description: str | None = None
 ) -> Any:
-    """Return the configuration that arguments name and fill, by subcommand.
+    """Return the configuration of the subcommand that the arguments name.
 
     Args:
         kinds: Dataclass of each subcommand.
         args: Arguments, the subcommand first.
-        description: Text of the help; None: that of the subcommands.
+        description: Help text; None: that of the subcommands.
 
     Raises:
-        ValueError: If there is no such subcommand; the text has the nearest name.
+        ValueError: If there is no such subcommand; the text names the nearest.
     """
     if args and not args[0].startswith("-") and args[0] not in kinds:
         raise ValueError(unknown(args[0], kinds))

@@ -49,33 +49,33 @@ class EvaluateConfig:
     episodes: Annotated[int, COUNT] = 1024
     """Throw sequences in the throw set."""
     standard: Literal["2", "1", "paper", "run"] = "2"
-    """Version of the standard throw to judge by, whatever the policy was trained on;
-    run: the throws and ends of its training."""
+    """Version of the standard throw to play, independent of the policy's training;
+    run: the throws and terminations of its training."""
     mask: tuple[str, ...] | None = None
-    """Links whose sensors detect nothing; alone: all sensors. What is left of the
-    success is not owed to them."""
+    """Links whose sensors are masked; alone: all sensors. The success that remains does
+    not depend on them."""
     num_workers: int | None = None
-    """Processes that simulate; None: the largest divisor of episodes <= cores."""
+    """Simulation processes; None: the largest divisor of episodes <= cores."""
     behaviour: bool = False
-    """Also say what the policy does: hits by kind of throw, displacement, effort."""
+    """Also report the behaviour: hits by kind of throw, displacement, effort."""
     check_substeps: Annotated[int | None, COUNT] = None
-    """Play it once more with this many physics steps in each control step, and say what
-    is lost (8: 480 Hz)."""
+    """Evaluate again with this many physics steps per control step, and report the loss
+    of success (8: 480 Hz)."""
     map: Path | None = None
-    """Picture to draw of success against speed, tempo, height and direction of the
-    throws, within and beyond what is trained on (a quarter of the episodes each)."""
+    """Picture to write: success against speed, tempo, height and direction of the
+    throws, within and beyond those of training (a quarter of the episodes each)."""
     perturbed: bool = False
-    """Also play on robots that are not their model: other masses, friction, gains and
-    torque limits, late actions, pushes (a quarter of the episodes each)."""
+    """Also evaluate on perturbed robots: other masses, friction, gains and torque
+    limits, delayed actions, pushes (a quarter of the episodes each)."""
     engine: Engine = "mujoco"
-    """What simulates: MuJoCo on the CPU; MuJoCo Warp on the device (extra gpu)."""
+    """Physics engine: MuJoCo on the CPU; MuJoCo Warp on the device (extra gpu)."""
     device: str = "cpu"
     """Device of engine warp ("cpu", "cuda", "cuda:1")."""
     json: Path | None = None
-    """File to write the figures to."""
+    """JSON file to write the results to."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for values with which nothing can be played."""
+        """Raise ValueError for invalid values."""
         check_seed(self.throw_set, "throw_set")
         check_bounds(self)
         check_num_workers(self.episodes, self.num_workers, "episodes")
@@ -105,7 +105,7 @@ def share(value: float | None) -> str:
 
 
 def table(result: Evaluation, title: str, age: float) -> str:
-    """Return the figures as text, with the age of success [s]."""
+    """Return the results as text; success is contact-free survival to an age [s]."""
 
     def interval(value: Estimate, scale: float, unit: str) -> str:
         mean, low, high = (scale * v for v in (value.mean, value.low, value.high))
@@ -135,7 +135,7 @@ def _metres(value: float | None) -> str:
 
 
 def behaviour_table(result: Behaviour) -> str:
-    """Return what the policy does as text."""
+    """Return the behaviour of a policy as text."""
     lines = []
     for kind, groups in result.throws.items():
         lines += ["", f"  {kind:<20} {'success':>8}   of  first hits  later hits   of"]
@@ -182,7 +182,7 @@ def behaviour_table(result: Behaviour) -> str:
 
 
 def perturbed_table(rows: list[Perturbed], age: float) -> str:
-    """Return success under each perturbation as text, with the age of success [s]."""
+    """Return success under each perturbation as text; success as in `table`."""
     lines = [
         f"\n  {'perturbed by':<26} {f'{age:g} s':>8}  {'(95 % interval)':<16} "
         f"{'5 s':>8}  ended by a fall"
@@ -198,7 +198,7 @@ def perturbed_table(rows: list[Perturbed], age: float) -> str:
 
 
 def with_substeps(config: EnvConfig, substeps: int) -> EnvConfig:
-    """Return the configuration with another number of physics steps."""
+    """Return the configuration with other physics steps per control step."""
     physics = dataclasses.replace(config.task.physics, substeps=substeps)
     task = dataclasses.replace(config.task, physics=physics)
     return dataclasses.replace(config, task=task)
@@ -239,7 +239,7 @@ def main(args: list[str]) -> None:
         "on_step": on_step,
     }
     engine: dict[str, Any] = {"engine": config.engine, "device": config.device}
-    # What is played many times.
+    # For evaluations that are repeated many times.
     quarter: dict[str, Any] = {
         "throw_set": config.throw_set,
         "episodes": max(config.episodes // 4, 1),

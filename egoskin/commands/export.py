@@ -31,10 +31,10 @@ class ExportConfig:
     out: Path
     """File to write."""
     to: Literal["onnx"] = "onnx"
-    """Format: ONNX of opset 13, with all that a robot must know as JSON metadata."""
+    """Format: ONNX, opset 13, with all that a robot needs as JSON metadata."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError if nothing can be written."""
+        """Raise ValueError if the file cannot be written or a package is missing."""
         check_output(self.out, "--out")
         check_packages("export", "export", "onnx", "onnxruntime")
 

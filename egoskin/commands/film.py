@@ -1,4 +1,4 @@
-"""Render an episode: a film, and a contact sheet of the moments that tell it best.
+"""Render an episode as a film and a contact sheet of its key moments.
 
 egoskin film runs/NAME --longest-of 16 --out dodge.mp4
 egoskin film runs/NAME --throw-set 0 --episode 7 --standard run
@@ -18,8 +18,8 @@ import tyro
 try:
     import mujoco  # noqa: F401
 except (AttributeError, ImportError, RuntimeError) as fault:
-    # MuJoCo loads the library that MUJOCO_GL names at once; the fault's own text is
-    # PyOpenGL's and does not say so.
+    # MuJoCo loads the library named by MUJOCO_GL when it is imported; the error text
+    # comes from PyOpenGL and does not mention it.
     backend = os.environ.get("MUJOCO_GL", "")
     print(
         f"error: MuJoCo cannot be imported with MUJOCO_GL={backend!r} ({fault}); "
@@ -57,8 +57,8 @@ class RenderConfig:
 
     policy: Annotated[Path | None, tyro.conf.Positional] = None
     """Run folder (its latest checkpoint), checkpoint, policy file, or the name of a
-    policy that comes with the package; None: action 0, which asks the motors for the
-    default pose."""
+    policy that comes with the package; None: action 0, whose target is the default
+    pose."""
     out: Path = Path("episode.mp4")
     """Film to write, .mp4 or .gif."""
     sheet: Path | None = None
@@ -66,15 +66,15 @@ class RenderConfig:
     throw_set: int = 0
     """Seed of the throw set, as in evaluate.py."""
     episode: Annotated[int, NOT_NEGATIVE] = 0
-    """Which episode of the throw set."""
+    """Index of the episode in the throw set."""
     longest_of: Annotated[int, COUNT] = 1
-    """Of this many episodes, from --episode on, show the one that lasts longest."""
+    """Show the longest of this many episodes, from --episode on."""
     standard: Literal["2", "1", "paper", "run"] = "2"
-    """Version of the standard throw; run: the throws and ends of the training."""
+    """Version of the standard throw; run: the throws and terminations of training."""
     seconds: float | None = None
     """Stop at this age at the latest [s]; None: the whole episode."""
     fps: float = 30.0
-    """Pictures for each second of the episode, at most the control rate."""
+    """Frames per second of the episode, at most the control rate."""
     slowdown: Annotated[float, Interval(gt=0, le=100)] = 1.0
     """The film plays this many times slower than real time."""
     size: tuple[int, int] = (960, 540)
@@ -82,12 +82,12 @@ class RenderConfig:
     hold: bool = False
     """Hold the robot rigid in its default pose."""
     camera: CameraConfig = field(default_factory=CameraConfig)
-    """Where the camera is."""
+    """Position of the camera."""
     env: Annotated[EnvConfig, tyro.conf.arg(name="")] = field(default_factory=EnvConfig)
     """Robot, task, skin, sensors; a policy brings its own."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for what cannot be rendered or written."""
+        """Raise ValueError for invalid values or files that cannot be written."""
         check_path(self.out, FILM_SUFFIXES)
         check_path(self.sheet_path, (".png",))
         check_seed(self.throw_set, "throw_set")
@@ -100,7 +100,7 @@ class RenderConfig:
 
     @property
     def sheet_path(self) -> Path:
-        """Where the contact sheet goes."""
+        """Path of the contact sheet."""
         return self.out.with_suffix(".png") if self.sheet is None else self.sheet
 
 
@@ -117,7 +117,7 @@ def main(args: list[str]) -> None:
         env_config = standard_task(env_config, config.standard)
     hz = env_config.task.physics.control_hz
     check_film(hz, config.fps, config.seconds)
-    # Whether it can be drawn is known before anything is played.
+    # Created before playing, so that errors in drawing appear early.
     painter = painter_of(env_config, skin, size=config.size, camera=config.camera)
     line = StatusLine(f"playing {counted(config.longest_of, 'episode')}")
     with painter:

@@ -1,7 +1,7 @@
-"""The first page of help of each command: what people set, and examples.
+"""Short help page of each command: common options, and examples.
 
-They are texts, because the options themselves are known only after seconds of imports;
-the tests hold them against `--help-all`. A value in parentheses is the default.
+They are fixed texts, because the options themselves are known only after seconds of
+imports; tests compare them with `--help-all`. Values in parentheses are defaults.
 """
 
 from __future__ import annotations
@@ -208,11 +208,11 @@ egoskin bench loop --help lists the options of loop, and so for each.
 }
 """Text by command."""
 WITH_SUBCOMMANDS = ("skin", "robot", "study", "bench")
-"""Commands whose first argument is a command of their own."""
+"""Commands whose first argument is a subcommand."""
 
 
 def page(name: str) -> str:
-    """Return the first page of help of a command."""
+    """Return the short help page of a command."""
     if name in WITH_SUBCOMMANDS:
         return f"usage: egoskin {name} COMMAND [OPTIONS]\n\n{PAGES[name].rstrip()}"
     return (
@@ -222,6 +222,6 @@ def page(name: str) -> str:
 
 
 def asked_for(name: str, args: list[str]) -> bool:
-    """Whether the arguments of a command ask for its first page of help."""
+    """Return whether the arguments of a command request its short help page."""
     help_asked = args[:1] if name in WITH_SUBCOMMANDS else args
     return not {"-h", "--help"}.isdisjoint(help_asked)

@@ -1,4 +1,4 @@
-"""Replay an update that was not finite, and say where that began.
+"""Replay an update that was not finite, and show where this began.
 
 egoskin replay runs/NAME/not-finite-000001048576.safetensors
 """
@@ -24,7 +24,7 @@ from egoskin.storage.tensor_file import load_tensors, part
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayConfig:
-    """Replay an update that was not finite: exit status 0 if it is so again."""
+    """Replay an update that was not finite; exit status 0 if it is reproduced."""
 
     dump: Annotated[Path, tyro.conf.Positional]
     """File that the training wrote into its run folder."""
@@ -34,7 +34,7 @@ def load(path: Path) -> tuple[PPO, TensorDict, dict[str, Any]]:
     """Return learner, minibatch and header of a dump.
 
     Raises:
-        ValueError: If the file is no dump.
+        ValueError: If the file is not a dump of an update.
     """
     tensors, header = load_tensors(path)
     if "error" not in header:
@@ -50,7 +50,7 @@ def load(path: Path) -> tuple[PPO, TensorDict, dict[str, Any]]:
 
 
 def forward(agent: Agent, batch: TensorDict) -> dict[str, Tensor]:
-    """Return what every layer gives, by name and in the order of computation."""
+    """Return the output of every layer, by name and in the order of computation."""
     outputs: dict[str, Tensor] = {}
 
     def note(name: str) -> Any:
@@ -69,7 +69,7 @@ def forward(agent: Agent, batch: TensorDict) -> dict[str, Tensor]:
 
 
 def not_finite(tensors: Mapping[str, Tensor]) -> Iterator[str]:
-    """Yield the names of tensors that are not finite, and how much of them."""
+    """Yield the name, shape and number of non-finite values of affected tensors."""
     for name, value in tensors.items():
         bad = int((~torch.isfinite(value)).sum())
         if bad:

@@ -1,4 +1,4 @@
-"""Look at a robot before it is trained.
+"""Check a robot before training.
 
 egoskin robot check my_robot
 egoskin robot check my_robot.py:ROBOT --out robot.png
@@ -28,35 +28,35 @@ from egoskin.robots.own import find_robot, portable
 from egoskin.sensors.config import SkinConfig
 from egoskin.viewer.film import check_path, save_picture
 
-# How long a robot is watched that gets no action [s].
+# Duration of the standing test with zero action [s].
 _STAND_S = 2.0
-# A joint that an action of 1 moves by less can hardly be used [rad].
+# A joint that an action of 1 moves by less than this is hardly usable [rad].
 _SMALL_REACH = 0.1
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was looked at."""
+    """Result of one check."""
 
     kind: Literal["ok", "note", "wrong"]
-    """Fine; worth knowing; or what keeps the robot from being trained."""
+    """Fine; worth knowing; or an error that prevents training."""
     text: str
-    """What was found, and what to do."""
+    """Description of the result, and what to do."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Check:
-    """Tell what would go wrong with a robot, and draw it with its skin."""
+    """Check a robot for problems in training, and draw it with its skin."""
 
     robot: Annotated[str, tyro.conf.Positional]
     """Its folder (with robot.toml), my_robot.py:ROBOT, or a name."""
     skin: SkinConfig = field(default_factory=SkinConfig)
-    """Where the sensors sit."""
+    """Placement of the sensors."""
     out: Path | None = None
     """Picture to write, .png: the robot from the front and from behind."""
 
     def run(self) -> None:
-        """Print what was found; write the picture.
+        """Print the results of the checks; write the picture.
 
         Raises:
             ValueError: If the robot cannot be trained.
@@ -86,11 +86,11 @@ class Check:
 
 
 def findings(robot: RobotConfig, skin: SkinConfig) -> Iterator[Finding]:
-    """Look at a robot, from its file to how it stands.
+    """Check a robot, from its model to how it stands.
 
     Args:
         robot: The robot.
-        skin: Where its sensors are to sit.
+        skin: Placement of its sensors.
     """
     static = [*_joints(robot), *_feet(robot), *_skin(robot, skin)]
     yield from static
@@ -102,7 +102,7 @@ def findings(robot: RobotConfig, skin: SkinConfig) -> Iterator[Finding]:
 
 
 def _joints(robot: RobotConfig) -> Iterator[Finding]:
-    """Look at base, joints, gains and limits."""
+    """Check base, joints, gains and limits."""
     try:
         robot.check_floating_base()
         yield Finding("ok", f"the base {robot.base} floats, all joints are hinges")
@@ -133,12 +133,12 @@ def _joints(robot: RobotConfig) -> Iterator[Finding]:
 
 
 def _names(robot: RobotConfig, which: np.ndarray) -> str:
-    """Return the names of some joints, ``[J]`` bool."""
+    """Return the names of the joints that a mask selects, ``[J]`` bool."""
     return ", ".join(np.array(robot.joints)[which])
 
 
 def _feet(robot: RobotConfig) -> Iterator[Finding]:
-    """Look at what stands on the ground."""
+    """Check the feet and the links that touch the ground."""
     if not robot.feet:
         yield Finding("wrong", "no feet: to touch the floor with anything is a fall")
     if missing := sorted({*robot.feet} - {*robot.links}):
@@ -161,7 +161,7 @@ def _feet(robot: RobotConfig) -> Iterator[Finding]:
 
 
 def _skin(robot: RobotConfig, skin: SkinConfig) -> Iterator[Finding]:
-    """Look at what carries sensors, and at the throws, which are aimed at it."""
+    """Check the links that carry sensors, at which the throws are aimed."""
     if not robot.skin_links:
         yield Finding("wrong", "no skin_links: no sensor sits, no ball is aimed there")
         return
@@ -179,7 +179,7 @@ def _skin(robot: RobotConfig, skin: SkinConfig) -> Iterator[Finding]:
 
 
 def _actuation(robot: RobotConfig) -> Iterator[Finding]:
-    """Look at how far an action moves the joints."""
+    """Check how far an action moves the joints."""
     scale = DodgeballConfig().action_scale
     for name in robot.gains:
         kp, _ = robot.joint_gains(name)
@@ -198,11 +198,11 @@ def _actuation(robot: RobotConfig) -> Iterator[Finding]:
 
 
 def _standing(robot: RobotConfig) -> Iterator[Finding]:
-    """Let it stand without an action, by each set of gains."""
+    """Check whether it stands with zero action, for each set of gains."""
     for name in robot.gains:
         task = DodgeballConfig(
             physics=PhysicsConfig(gains=name),
-            # No ball comes meanwhile.
+            # No ball is thrown during the test.
             throws=ThrowConfig(first_delay=(10 * _STAND_S, 10 * _STAND_S)),
             start_joint_noise=0.0,
         )

@@ -36,18 +36,18 @@ from egoskin.sensors.skin.placement import place_sensors
 from egoskin.viewer.film import check_path, save_picture
 from egoskin.viewer.offscreen import CameraConfig, Painter
 
-# So many sensors take long enough to say so.
+# Placing this many sensors takes long enough for a message.
 _MANY = 10_000
-# Sensors farther from the robot than this are told of [m].
+# Sensors farther than this from the robot's surface cause a warning [m].
 _FAR_OFF = 0.15
-# The picture: size of each of its two views [px], and how normals are drawn [m].
+# Picture: size of each of its two views [px]; length and radius of normals [m].
 _VIEW_SIZE = (640, 960)
 _NORMAL_LENGTH, _NORMAL_RADIUS = 0.08, 0.003
 _NORMAL_RGBA = (0.1, 0.95, 1.0, 1.0)
 
 
 def _pairs(values: Sequence[str], option: str) -> dict[str, str]:
-    """Return what options of the form ``name=value`` say."""
+    """Return the names and values of options of the form ``name=value``."""
     for value in values:
         if not all(value.rpartition("=")[::2]):
             raise ValueError(f"{option} takes name=value, got {value!r}")
@@ -61,7 +61,7 @@ def _meshes(path: Path, robot: RobotConfig) -> Meshes:
             return meshes_in_folder(path, robot.links)
         return meshes_of_mjcf(path)
     except ImportError as error:
-        # It says which package is missing: the user's to mend, not a fault of ours.
+        # It names the missing package, which the user can install: not a bug.
         raise ValueError(f"--meshes: {error}") from error
 
 
@@ -72,11 +72,11 @@ class Place:
     out: Path
     """Skin file to write (JSON)."""
     robot: str = "h1_2"
-    """Robot by name, or its folder, file of Python, MJCF or URDF."""
+    """Name of the robot, or path of its folder, Python file, MJCF or URDF."""
     num_sensors: int | None = 64
-    """Number of sensors; None: as many as the spacing lets in."""
+    """Number of sensors; None: as many as the spacing allows."""
     method: Literal["area_uniform", "poisson_disk"] = "area_uniform"
-    """Independent of each other, or with distances kept between them."""
+    """Independent positions, or with a minimum distance between them."""
     seed: int = 0
     """Seed of the placement."""
     links: tuple[str, ...] | None = None
@@ -85,7 +85,7 @@ class Place:
     """Relative density of sensors on links, LINK=WEIGHT, where LINK may be a shell
     pattern; 1 on the others."""
     spacing: float | None = None
-    """Least distance between sensors [m] (poisson_disk); None: as far as they go."""
+    """Least distance between sensors [m] (poisson_disk); None: as large as possible."""
     stand_off: float = 0.0
     """Height of the sensors above the surface [m]."""
     meshes: Path | None = None
@@ -126,20 +126,20 @@ class Import:
     """Turn an export of GenTact's (CSV, xacro, URDF) into a skin file."""
 
     files: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Files exported from GenTact; their sensors come one after the other."""
+    """Files exported from GenTact; their sensors are concatenated."""
     out: Path
     """Skin file to write (JSON)."""
     robot: str = "h1_2"
-    """Robot by name, or its folder, file of Python, MJCF or URDF."""
+    """Name of the robot, or path of its folder, Python file, MJCF or URDF."""
     scale: float | None = None
-    """Metres of one unit of the files; None: that of the dialect."""
+    """Length of one unit of the files [m]; None: that of the dialect."""
     link_map: tuple[str, ...] = ()
-    """Link for a part of a Parent path, for a whole path, a link of the URDF or the
-    name of a xacro's macro, PART=LINK."""
+    """Names of links, PART=LINK. PART is a part of a Parent path, a whole path, a link
+    of the URDF or the name of a xacro's macro."""
     parent: str | None = None
     """Link of the sensors in a file that names none (xacro)."""
     skip_invalid: bool = False
-    """Leave out sensors that cannot be read for certain, and list them."""
+    """Leave out sensors that cannot be read reliably, and list them."""
 
     def run(self) -> None:
         """Write the skin."""
@@ -176,7 +176,7 @@ def _known_shapes(robot: RobotConfig) -> list[Primitive]:
     """Return the shapes of those links whose shapes are all primitives."""
     shapes: list[Primitive] = []
     for link in robot.links:
-        # Beside a shape that is unknown the others do not tell where the surface is.
+        # If one shape of a link is unknown, the others do not define its surface.
         with suppress(ValueError):
             shapes += robot.primitives_on([link])
     return shapes
@@ -202,14 +202,14 @@ class Export:
 
 @dataclass(frozen=True, kw_only=True)
 class Show:
-    """Say what is in a skin file, and draw it."""
+    """Print the content of a skin file, and draw it."""
 
     skin: Annotated[Path, tyro.conf.Positional]
     """Skin file (JSON)."""
     picture: Path | None = None
     """Picture to write, .png: the robot from the front and from behind."""
     robot: str | None = None
-    """Its robot, if that is none of the package: folder, file of Python, MJCF or
+    """Path of its robot, if that is not in the package: folder, Python file, MJCF or
     URDF."""
 
     def run(self) -> None:
@@ -233,7 +233,7 @@ class Show:
 
 
 def describe(coverage: Coverage | None) -> str:
-    """Return a sensor's type in words: its kind, and what is not the default."""
+    """Return a sensor's type as text: its kind and non-default values."""
     if coverage is None:
         return "as configured"
     default = type(coverage)()
@@ -246,7 +246,7 @@ def describe(coverage: Coverage | None) -> str:
 
 
 def table(skin: Skin, title: str) -> str:
-    """Return how many sensors of which type and range there are on each link."""
+    """Return a table of the sensors on each link, by type and range."""
 
     def distance(value: float) -> str:
         return "as configured" if math.isnan(value) else f"{value:g} m"

@@ -1,4 +1,4 @@
-"""Run a study: many trainings that differ in a few fields, and what they tell.
+"""Run a study: trainings that differ in a few fields, compared over seeds.
 
 egoskin study plan findings --dir studies/findings    # what it will cost
 egoskin study run findings --dir studies/findings     # Ctrl-C; run goes on
@@ -34,11 +34,11 @@ from egoskin.study.runner import LocalRunner, Progress, Runner, slurm_script
 from egoskin.study.shipped import STUDIES
 from egoskin.study.store import RunStatus, StudyFolder, duration
 
-# A server that many have.
+# Cores of a common server.
 _MANY_CORES = 64
-# Environment steps of a study that is long enough to look for its best settings.
+# Environment steps of a study that is long enough to measure its best settings.
 _WORTH_MEASURING = 50_000_000
-# Cells whose warning differs for fewer hits than this see alike.
+# Cells see alike if their warnings differ for a smaller share of hits than this.
 _ALIKE = 0.05
 
 Name = Annotated[str, tyro.conf.Positional]
@@ -49,7 +49,7 @@ def find_study(name: str) -> Manifest:
     """Return the manifest of a shipped study or of a file.
 
     Raises:
-        ValueError: If there is none; the text lists the shipped ones.
+        ValueError: If there is no such study; the text lists the shipped ones.
     """
     if name in STUDIES:
         return resolve(STUDIES[name])
@@ -63,7 +63,7 @@ def find_study(name: str) -> Manifest:
 
 
 def fastest(speeds: list[Speed]) -> Speed:
-    """Print how fast runs are side by side; return the fastest way."""
+    """Print the measured speeds; return the highest."""
     for speed in speeds:
         print(f"  {speed}")
     return max(speeds, key=lambda speed: speed.per_s)
@@ -74,31 +74,31 @@ def _tell(text: str) -> None:
 
 
 def check_parent(folder: Path) -> None:
-    """Raise ValueError if the folder that a study is to be in is not there."""
+    """Raise ValueError if the parent folder of a study's folder does not exist."""
     if not folder.absolute().parent.is_dir():
         raise ValueError(f"--dir: there is no folder {folder.absolute().parent}")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """Say what a study runs and costs; write its manifest, or add to it."""
+    """Print the runs and cost of a study; write or extend its manifest."""
 
     name: Name
     """Study: paper, paper-1000, findings, smoke, or a JSON file."""
     dir: Path | None = None
-    """Folder to begin the study in, or to add cells and seeds to; None: only tell."""
+    """Folder of a new study, or one to add cells and seeds to; None: only print."""
     steps_per_s: Annotated[float | None, POSITIVE] = None
     """Environment steps per second and core; None: measured now, in half a minute for
-    each way to share the cores among runs."""
+    each choice of cores per run."""
     visibility: bool = False
-    """Also say what each coverage and range sees before any training (minutes)."""
+    """Also report what each coverage and range sees (takes minutes, no training)."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for a speed that is none."""
+        """Raise ValueError for invalid values."""
         check_bounds(self)
 
     def execute(self) -> None:
-        """Tell, and write the manifest."""
+        """Print the plan, and write the manifest."""
         if self.dir is not None:
             check_parent(self.dir)
         manifest = find_study(self.name)
@@ -131,7 +131,7 @@ class Plan:
 
 
 def describe(manifest: Manifest) -> None:
-    """Print what a study runs."""
+    """Print the content of a study."""
     print(f"study {manifest.study}: {manifest.purpose}")
     for name, value in manifest.not_default().items():
         print(f"  not the default: {name.removeprefix('env.')} = {brief(value)}")
@@ -147,7 +147,7 @@ def describe(manifest: Manifest) -> None:
 
 
 def what_is_seen(manifest: Manifest) -> dict[str, Any]:
-    """Print and return what the coverages and ranges of a study see of thrown balls."""
+    """Print and return the visibility of thrown balls by coverage and range."""
     sensors = [
         c.config.env.sensor for c in manifest.cells if c.config.env.sensor.uses_skin
     ]
@@ -182,36 +182,36 @@ def what_is_seen(manifest: Manifest) -> dict[str, Any]:
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """Run a study on this machine, or go on with it; runners may share a folder."""
+    """Run or resume a study; several runners may share its folder."""
 
     name: Annotated[str | None, tyro.conf.Positional] = None
-    """Study to begin or add to; None: what the folder's manifest says."""
+    """Study to begin or add to; None: the study of the folder's manifest."""
     dir: Path
     """Folder of the study."""
     on: Literal["local", "ray"] = "local"
-    """Where: the cores of this machine, or an existing Ray cluster (extra `ray`)."""
+    """Where to run: this machine, or an existing Ray cluster (extra `ray`)."""
     ray_address: str = "auto"
-    """Address of the Ray cluster, ``host:port``; auto: the one of this machine."""
+    """Address of the Ray cluster, ``host:port``; auto: the cluster of this machine."""
     parallel: Annotated[int | None, COUNT] = None
-    """Runs side by side; None: as many as fill the cores."""
+    """Number of parallel runs; None: enough to use all cores."""
     cores_per_run: Annotated[int | None, COUNT] = None
     """Workers and learner threads of each run; None: measured, half a minute for each
     choice, unless the whole study is short (results do not depend on it)."""
     tries: Annotated[int, COUNT] = 3
-    """How often a run that fails is tried, in all."""
+    """Maximum number of attempts for each run."""
     again: bool = False
-    """Whether runs that failed too often are tried again."""
+    """Whether to try runs again that failed too often."""
     nice: int = 5
     """Niceness of the runs."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for counts that are none."""
+        """Raise ValueError for invalid values."""
         check_bounds(self)
         if not 0 <= self.nice < 20:
             raise ValueError(f"nice must be from 0 to 19, got {self.nice}")
 
     def execute(self) -> None:
-        """Run what is left to be run."""
+        """Execute the runs that are left."""
         check_parent(self.dir)
         folder = StudyFolder(self.dir)
         if self.name is not None:
@@ -243,7 +243,7 @@ class Run:
         print(f"done; now: egoskin study report {self.dir}")
 
     def _cores_per_run(self, folder: StudyFolder, cores: int) -> int:
-        """Return with how many cores for each run this machine does most."""
+        """Return the number of cores per run with the highest total throughput."""
         status = folder.status(folder.manifest())
         left = [each for each in status if each.state != "done"]
         frames = sum(each.run.end - each.frames for each in left)
@@ -252,11 +252,11 @@ class Run:
         return fastest(measure_all(left[0].run, cores, _tell)).cores_per_run
 
     def _where(self) -> tuple[type[Runner], int]:
-        """Return what runs the study, and the cores it has."""
+        """Return the runner for the study, and its number of cores."""
         if self.on == "local":
             return LocalRunner, available_cores()
         check_packages("--on ray", "ray", "ray")
-        # Only here: nothing else needs it.
+        # Imported here, because only this option needs Ray.
         from egoskin.study.ray_runner import RayRunner, connect
 
         return RayRunner, connect(self.ray_address)
@@ -264,7 +264,7 @@ class Run:
 
 @dataclass(frozen=True, kw_only=True)
 class Status:
-    """Say how far a study is, from its folder alone."""
+    """Print the progress of a study, from its folder alone."""
 
     dir: Folder
     """Folder of the study."""
@@ -277,7 +277,7 @@ class Status:
 
 
 def print_status(manifest: Manifest, status: list[RunStatus]) -> None:
-    """Print how far each run is, by cell and seed, and what has failed."""
+    """Print the progress of each run, by cell and seed, and the failures."""
     told = {(each.run.cell.name, each.run.seed): entry(each) for each in status}
     width = max(len(cell.name) for cell in manifest.cells)
     wide = max(map(len, told.values())) + 2
@@ -296,7 +296,7 @@ def print_status(manifest: Manifest, status: list[RunStatus]) -> None:
 
 
 def entry(status: RunStatus) -> str:
-    """Return how far a run is, in a few words."""
+    """Return the progress of a run in a few words."""
     share = status.frames / status.run.end
     match status.state:
         case "done":
@@ -318,12 +318,12 @@ class Report:
     dir: Folder
     """Folder of the study."""
     out: Path | None = None
-    """Folder to write to; None: report/ in the study's."""
+    """Folder to write to; None: report/ in the study's folder."""
 
     def execute(self) -> None:
         """Write the report."""
         check_packages("a report", "study", "scipy", "matplotlib")
-        # Only here: the rest of this script needs neither.
+        # Imported here, because only the report needs these packages.
         from egoskin.study.report import write_report
 
         folder = StudyFolder(self.dir)
@@ -336,26 +336,26 @@ class Report:
 
 @dataclass(frozen=True, kw_only=True)
 class Slurm:
-    """Print a job array for Slurm whose elements share the work on a study."""
+    """Print a Slurm job array whose elements share the work on a study."""
 
     dir: Folder
-    """Folder of the study, which all nodes see."""
+    """Folder of the study, shared by all nodes."""
     cores: Annotated[int, COUNT] = 16
-    """Cores of each element, and runs side by side."""
+    """Cores of each element, and number of parallel runs."""
     elements: Annotated[int | None, COUNT] = None
-    """Elements of the array; None: as many as have a run for each core."""
+    """Elements of the array; None: enough for one core per run."""
     hours: Annotated[float, POSITIVE] = 24.0
-    """Time limit of each [h]."""
+    """Time limit of each element [h]."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for counts that are none."""
+        """Raise ValueError for invalid values."""
         check_bounds(self)
 
     def execute(self) -> None:
         """Print the script."""
         folder = StudyFolder(self.dir)
         manifest = folder.manifest()
-        # Slurm writes its logs there, and makes no folder.
+        # Slurm writes its logs there but does not create the folder.
         (self.dir / "logs").mkdir(exist_ok=True)
         elements = self.elements or -(-len(manifest.runs) // self.cores)
         path = self.dir.absolute()
@@ -365,12 +365,12 @@ class Slurm:
 
 @dataclass(frozen=True, kw_only=True)
 class Adopt:
-    """Take runs into a study that were made before, by links to their folders."""
+    """Add existing runs to a study, by links to their folders."""
 
     dir: Folder
     """Folder of the study."""
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Run folders; which of the study's each is follows from its configuration."""
+    """Run folders; each is matched to a run of the study by its configuration."""
 
     def execute(self) -> None:
         """Link to the runs."""

@@ -1,4 +1,4 @@
-"""Train a robot to dodge: the main job.
+"""Train a robot to dodge balls.
 
 egoskin train --sensor.signal localization --sensor.range 2 --seed 1
 egoskin train --resume runs/NAME --total-frames 100_000_000
@@ -22,12 +22,12 @@ from egoskin.runs.estimate import estimate_seconds
 from egoskin.runs.run import Run
 from egoskin.runs.trainer import Trainer, open_trainer, train
 
-# So few frames [environment steps] take seconds, as the guess of their time would.
+# Fewer frames [environment steps] take only seconds, like estimating their time.
 _SOON_DONE = 100_000
 
 
 class Stop:
-    """Notes the first signal that ends a script; a second Ctrl-C ends it at once."""
+    """Records the first terminating signal; a second Ctrl-C ends the script at once."""
 
     def __init__(self) -> None:
         self.requested = False
@@ -40,10 +40,10 @@ class Stop:
 
 
 def open_run(config: TrainConfig) -> Run:
-    """Return the run folder of a configuration, new or to go on with; say what it is.
+    """Return the new or resumed run of a configuration, and print a summary of it.
 
     Raises:
-        ValueError: If no such run can be trained here.
+        ValueError: If the run cannot be trained on this machine.
     """
     config.check_machine()
     if config.log == "wandb":
@@ -60,7 +60,7 @@ def open_run(config: TrainConfig) -> Run:
 
 
 def announce(trainer: Trainer) -> None:
-    """Say how much there is to do, how long it will take here, and what to look at."""
+    """Print the amount of work, its estimated time here, and how to watch it."""
     config, done = trainer.config, trainer.frames
     to_do = max(config.total_frames - done, 0)
     workers = check_num_workers(config.num_envs, config.num_workers)
@@ -81,7 +81,7 @@ def announce(trainer: Trainer) -> None:
 
 
 def _rough_time(seconds: float) -> str:
-    """Return a time that is a guess: "2 h 10 min", "7 min", "20 s"."""
+    """Return an estimated time as text: "2 h 10 min", "7 min", "20 s"."""
     if seconds < 60:
         return f"{max(round(seconds, -1), 10):.0f} s"
     hours, minutes = divmod(round(seconds / 60), 60)
@@ -91,17 +91,17 @@ def _rough_time(seconds: float) -> str:
 
 
 def what_came_out(trainer: Trainer, metrics: Mapping[str, float]) -> str:
-    """Return how a training ended, and the commands that show it.
+    """Return a summary of a finished training, and commands to inspect it.
 
     Args:
-        trainer: What was trained, to its end.
-        metrics: Those of its last rollout; empty if there was none to do.
+        trainer: Trainer of the finished run.
+        metrics: Metrics of its last rollout; empty if no rollout was left to do.
     """
     path, task = trainer.run.path, trainer.config.env.task
     told = f"done: {trainer.frames:,} frames"
     if metrics:
         told += f" in {clock(metrics['time/wall_s'])}; while exploring "
-        # No episode may have been old enough.
+        # NaN if no episode could last long enough.
         if not math.isnan(success := metrics["episode/success"]):
             told += f"{success:.1%} untouched for {task.success_s:g} s, "
         told += f"survival {metrics['episode/survival_s']:.2f} s"
@@ -115,7 +115,7 @@ def what_came_out(trainer: Trainer, metrics: Mapping[str, float]) -> str:
 
 @contextmanager
 def saying_how_to_go_on(run: Run) -> Iterator[None]:
-    """End with what to do next, where training fails."""
+    """Turn a failure of training into an error text that says how to resume."""
     try:
         yield
     except (WorkerError, NonFiniteError, OSError) as error:

@@ -1,13 +1,13 @@
-"""Ask what the body could still do when a ball is in reach of the skin.
+"""Search for what the body could still do when a ball is in reach of the skin.
 
 egoskin upper-bound field_proximity
 egoskin upper-bound runs/NAME --throws 64 --ball 2 --json upper-bound.json
 
-The first ball of each episode of a throw set (--ball 2: the second) is played by a
-policy until it is in reach of a sensor. From there on actions are searched that, added
-to the policy's, avoid the ball, and then that it does not fall. What the search finds
-the body and the warning time allow (it may miss what is possible); what the policy
-misses of it is a matter of learning, or of what its sensors do not tell.
+A policy plays the first ball of each episode of a throw set (--ball 2: the second)
+until the ball is in reach of a sensor. From there on, actions are searched that, added
+to the policy's, avoid the ball and, secondly, do not let the robot fall. Whatever the
+search finds is possible for the body in the warning time (it may miss solutions). If
+the policy does worse, it lacks training, or its sensors lack information.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ from egoskin.progress import counted
 from egoskin.rng import check_seed
 from egoskin.storage.files import check_output
 
-# Bounds of the groups by height aimed at [m].
+# Bounds of the groups by the height that the throw is aimed at [m].
 BOUNDS = (0.0, 0.7, 0.9, 1.1, 1.3, 2.0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class UpperBoundConfig:
-    """Search the actions with which the balls of a throw set would be avoided."""
+    """Search for actions that avoid the balls of a throw set."""
 
     policy: Annotated[Path, tyro.conf.Positional]
     """Run folder (its latest checkpoint), checkpoint, policy file, or the name of a
@@ -52,23 +52,23 @@ class UpperBoundConfig:
     throws: Annotated[int, COUNT] = 32
     """Episodes of the throw set."""
     ball: Annotated[int, COUNT] = 1
-    """Which ball of each episode; none is thrown after it."""
+    """Number of the ball in each episode, from 1; it is the last ball thrown."""
     reach: Annotated[float, Interval(gt=0, le=math.inf)] = 2.0
     """Distance from a sensor to the ball's surface at which the search starts [m]."""
     search: SearchConfig = field(default_factory=SearchConfig)
     """The search."""
     json: Path | None = None
-    """File to write the figures to."""
+    """JSON file to write the results to."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for values with which nothing can be searched."""
+        """Raise ValueError for invalid values."""
         check_seed(self.throw_set, "throw_set")
         check_bounds(self)
         check_output(self.json, "--json")
 
 
 def groups(result: UpperBound) -> list[dict[str, float | int]]:
-    """Return counts by height aimed at: throws, and what becomes of them."""
+    """Return counts of throws, of avoided balls and of standing robots, by height."""
     rows = []
     for low, high in zip(BOUNDS, BOUNDS[1:], strict=False):
         member = (result.height >= low) & (result.height < high)

@@ -1,7 +1,7 @@
-"""Verify that training is exact: whatever does not matter changes no bit.
+"""Verify that training gives the same bits with different machine settings.
 
-That is the number of workers, of physics threads and of learner threads, compiled or
-plain sensor kernels, how often there is a checkpoint, and a resume that changes them.
+These are the numbers of workers, physics threads and learner threads, compiled or plain
+sensor kernels, the interval of checkpoints, and a resume that changes them.
 
 egoskin verify --iterations 3
 egoskin verify --iterations 4 --sensor.coverage ray --num-envs 512
@@ -36,18 +36,18 @@ from egoskin.storage.tensor_file import load_tensors
 
 @dataclass(frozen=True, kw_only=True)
 class Machine:
-    """How a training is computed and kept: no result depends on it."""
+    """How a training is computed and saved; results must not depend on it."""
 
     workers: int
-    """Processes."""
+    """Worker processes."""
     physics: int
-    """Physics threads of each."""
+    """Physics threads of each worker."""
     learner: int
     """Threads of the learner."""
     compiled: bool
-    """Whether the sensors are compiled, where they can be."""
+    """Whether the sensor kernels are compiled, if possible."""
     every: bool
-    """Whether there is a checkpoint after every rollout, or at the end alone."""
+    """Whether there is a checkpoint after every rollout, or only at the end."""
 
     def __str__(self) -> str:
         compiled = self.compiled and os.environ.get(SETTING) != "0" and can_compile()
@@ -62,7 +62,7 @@ class Machine:
 
     @property
     def settings(self) -> dict[str, int | float]:
-        """Fields of a training's configuration."""
+        """Values of the fields of a training configuration."""
         return {
             "num_workers": self.workers,
             "learner_threads": self.learner,
@@ -71,7 +71,7 @@ class Machine:
 
     @contextmanager
     def kernels(self) -> Iterator[None]:
-        """Let sensors, here and in workers, be compiled or not."""
+        """Enable or disable compiled sensor kernels, here and in workers."""
         before = os.environ.get(SETTING)
         if not self.compiled:
             os.environ[SETTING] = "0"
@@ -88,14 +88,14 @@ _MACHINES = (
     Machine(workers=2, physics=2, learner=4, compiled=False, every=True),
     Machine(workers=4, physics=3, learner=2, compiled=True, every=False),
 )
-# Divisors of an odd number of agents: rows of a worker that fill no vector.
+# Divisors of an odd number of agents: a worker's rows do not fill whole vectors.
 _ODD_MACHINES = (
     Machine(workers=1, physics=1, learner=2, compiled=False, every=False),
     Machine(workers=3, physics=1, learner=1, compiled=True, every=True),
     Machine(workers=5, physics=2, learner=4, compiled=False, every=False),
 )
 
-# What a training does from some millions of frames on, it does here from the start.
+# Enables from the start what a training normally enables after millions of frames.
 _LATE = PPOConfig(noise_correlation_start=0)
 
 
@@ -110,7 +110,7 @@ class VerifyConfig:
     seed: int = 0
     """Seed of the trainings."""
     env: Annotated[EnvConfig, tyro.conf.arg(name="")] = field(default_factory=EnvConfig)
-    """Robot, task, skin, sensors; with corrupted ones, where they can be, as well."""
+    """Robot, task, skin, sensors; also tried with corrupted sensors if possible."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for sizes that cannot be split."""
@@ -128,17 +128,17 @@ class VerifyConfig:
 
 
 def run_hash(run: Run) -> str:
-    """Return a hash of the values of a run: its checkpoint's tensors, its metrics.
+    """Return a hash of the values of a run: its checkpoint's tensors and its metrics.
 
-    Configuration, times and the order of fields are left out, so that it may be
-    compared with that of another version.
+    Configuration, times and the order of fields do not affect it, so that hashes of
+    different versions can be compared.
     """
     digest = hashlib.sha256()
     tensors, header = load_tensors(run.checkpoint_path)
     numbers = {key: header[key] for key in ("frames", "learning_rate")}
     digest.update(json.dumps(numbers).encode())
     for name in sorted(tensors):
-        # The log is what follows.
+        # The log is hashed below.
         if name.startswith("log/"):
             continue
         value = tensors[name].contiguous()
@@ -160,7 +160,7 @@ def whole(config: TrainConfig, machine: Machine) -> str:
 
 
 def resumed(config: TrainConfig, half: int, first: Machine, then: Machine) -> str:
-    """Return the hash of a run that lost its last rollout and went on elsewhere."""
+    """Return the hash of a run that loses a rollout and resumes with other settings."""
     frames = half * config.frames_per_batch
     run = Run.create(dataclasses.replace(config, total_frames=frames, **first.settings))
     with first.kernels(), open_trainer(run, first.physics) as trainer:

@@ -29,18 +29,18 @@ class ViewConfig:
     """See a policy in the browser, and throw balls at it; or a skin, or a robot."""
 
     policies: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """Run folder (its newest policy is taken up while it trains), checkpoint, policy
-    file, or the name of a policy that comes with the package; two stand side by side
-    and meet the same throws. Without any, field_proximity."""
+    """Run folder (followed while it trains), checkpoint, policy file, or the name of a
+    policy that comes with the package; two stand side by side with the same throws.
+    Without any, field_proximity."""
     skin: Path | None = None
     """A skin file, shown on its robot without a policy."""
     robot: str | None = None
     """A robot without a policy: its name, or an MJCF or URDF."""
     port: Annotated[int, Interval(ge=0, le=65535)] = 8080
-    """Port of 127.0.0.1; 0: any that is free."""
+    """Port of 127.0.0.1; 0: any free port."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for what cannot be shown."""
+        """Raise ValueError for invalid values."""
         check_bounds(self)
         if len(self.policies) > 2:
             raise ValueError(f"at most two policies, got {len(self.policies)}")
@@ -55,7 +55,7 @@ def main(args: list[str]) -> None:
     """Run the command."""
     config = tyro.cli(ViewConfig, args=args, description=__doc__)
     check_packages("egoskin view", "view", "viser")
-    # One robot keeps one core busy at most; threads would only get in each other's way.
+    # One robot uses at most one core; more threads would only slow it down.
     torch.set_num_threads(1)
     if config.skin is None and config.robot is None:
         from egoskin.viewer.web.page import Page
@@ -68,7 +68,7 @@ def main(args: list[str]) -> None:
         page.run()
     finally:
         page.close()
-        # The process ends: to look through all objects once more takes seconds.
+        # Skips a last garbage collection at exit, which would take seconds.
         gc.freeze()
 
 

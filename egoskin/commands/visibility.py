@@ -4,11 +4,11 @@ egoskin visibility --out visibility.png --json visibility.json
 egoskin visibility --skin.path skin.json --coverages field ray --ranges 0.5 1
 egoskin visibility --occlusion
 
-A robot stands still in its default pose. Balls come straight at its base from all
-directions, straight at every part of its surface, and as the task throws them. A ball
-is seen from the first moment at which any sensor detects it. Cells (a coverage at a
-range) that see alike leave a policy the same time to act: in an ablation only their
-signals can set them apart.
+A robot stands still in its default pose. Balls fly straight at its base from all
+directions, straight at every part of its surface, and as thrown in the task. A ball is
+seen from the first moment at which any sensor detects it. Cells (a coverage at a range)
+that see alike leave a policy the same time to act: in an ablation they can differ only
+by their signals.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from egoskin.sensors.config import SensorConfig, SkinConfig
 from egoskin.storage.serialization import to_plain
 from egoskin.viewer.film import check_path
 
-# Cells whose warning differs for fewer hits than this see alike.
+# Cells see alike if their warnings differ for a smaller share of hits than this.
 ALIKE = 0.05
 PICTURE_SUFFIXES = (".png", ".jpg", ".svg", ".pdf")
 BLIND, NOWHERE = "#c1272d", "#e6e6e6"
@@ -58,15 +58,15 @@ class VisibilityConfig:
     """Show what a skin sees, before any training: a picture, a table and JSON."""
 
     robot: str = "h1_2"
-    """Robot by name, or its folder, file of Python, MJCF or URDF."""
+    """Name of the robot, or path of its folder, Python file, MJCF or URDF."""
     skin: SkinConfig = dataclasses.field(default_factory=SkinConfig)
-    """Where the sensors sit; what a sensor's file says of its type and range holds."""
+    """Placement of the sensors; types and ranges in a skin file take precedence."""
     coverages: Annotated[
         tuple[Literal["field", "ray"], ...], tyro.conf.arg(metavar="{field,ray} ...")
     ] = ("field", "ray")
-    """Coverages compared."""
+    """Coverages to compare."""
     ranges: tuple[float, ...] = (0.2, 0.5, 1.0, 2.0)
-    """Ranges compared [m]."""
+    """Ranges to compare [m]."""
     field: Field = dataclasses.field(default_factory=Field)
     """Field sensors."""
     ray: Ray = dataclasses.field(default_factory=Ray)
@@ -76,19 +76,19 @@ class VisibilityConfig:
     throws: ThrowConfig = dataclasses.field(default_factory=ThrowConfig)
     """The balls and how they are thrown."""
     num_throws: int = 2000
-    """Throws followed."""
+    """Number of throws."""
     seed: int = 0
     """Seed of the throws and of the points on the surface."""
     out: Path = Path("visibility.png")
     """Picture to write, .png, .jpg, .svg or .pdf."""
     json: Path = Path("visibility.json")
-    """All figures, to write."""
+    """JSON file to write all results to."""
 
 
 def show_progress(what: str, share: float) -> None:
-    """Show what is in work, on a terminal."""
+    """Show the progress of the current stage, on a terminal."""
     if sys.stdout.isatty():
-        # The line is wiped when it is done.
+        # The line is cleared at the end.
         text = f"{what} {share:.0%}" if share < 1 else ""
         print(f"\r{text}\x1b[K", end="", flush=True)
 
@@ -130,7 +130,7 @@ def print_table(analysis: Analysis, report: dict[str, Any]) -> None:
 def draw_map(axes: Axes, analysis: Analysis, cell: int, seen: float | None) -> Any:
     """Draw the world map of a cell; return its image, for the colour bar."""
     colours = plt.get_cmap("viridis").with_extremes(bad=NOWHERE, under=BLIND)
-    # Just under 0 where nothing is seen before the contact.
+    # Negative where nothing is seen before the contact.
     share = analysis.clearance_map(cell) / analysis.cells[cell].range
     share = np.where(share <= 0, -1.0, share)
     image = axes.imshow(
@@ -142,7 +142,7 @@ def draw_map(axes: Axes, analysis: Analysis, cell: int, seen: float | None) -> A
         vmax=1,
         interpolation="nearest",
     )
-    # As the robot sees it: its left on the left.
+    # From the robot's point of view: its left is on the left.
     axes.set_xlim(180, -180)
     axes.set_xticks([180, 90, 0, -90, -180], ["back", "left", "front", "right", "back"])
     axes.set_yticks([-90, -45, 0, 45, 90])
@@ -156,7 +156,7 @@ def draw_map(axes: Axes, analysis: Analysis, cell: int, seen: float | None) -> A
 
 
 def draw_warnings(axes: Axes, analysis: Analysis, ranges: int) -> None:
-    """Draw the share of hits with at least some warning."""
+    """Draw the share of hits with at least a given warning time."""
     palette = plt.get_cmap("plasma")(np.linspace(0.0, 0.8, ranges))
     for cell, warning in enumerate(analysis.warning.numpy()):
         time = np.append(0.0, np.sort(warning))
@@ -227,7 +227,7 @@ def draw(analysis: Analysis, report: dict[str, Any], title: str) -> Figure:
 def main(args: list[str]) -> None:
     """Run the command."""
     config = tyro.cli(VisibilityConfig, args=args, description=__doc__)
-    # Before the minutes that the analysis takes.
+    # Check before the analysis, which takes minutes.
     check_path(config.out, PICTURE_SUFFIXES)
     check_path(config.json, (".json",))
     robot = find_robot(config.robot)

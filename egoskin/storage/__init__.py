@@ -1,1 +1,1 @@
-"""Files: configurations, tensors, their formats, and reading what others have made."""
+"""Files: configurations, tensors, file formats, and safe reading of external files."""

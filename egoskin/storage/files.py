@@ -1,6 +1,6 @@
-"""Reading files that others have made: regular ones alone, up to a stated size.
+"""Read external files: only regular files, up to a maximum size.
 
-Contract: nothing here waits for a named pipe, opens a device or fills memory.
+Contract: no function here waits for a named pipe, opens a device or fills memory.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import stat
 from pathlib import Path
 
 TEXT_LIMIT = 64 * 2**20
-"""Largest file of text that is read, of a skin, a robot, a configuration [bytes]."""
+"""Maximum size of a text file: a skin, a robot, a configuration [bytes]."""
 
 _KINDS = {
     stat.S_IFDIR: "a folder",
@@ -22,13 +22,13 @@ _KINDS = {
 
 
 def check_regular(path: Path | str, limit: int = TEXT_LIMIT) -> None:
-    """Raise unless a path, or what it links to, is a regular file of bounded size.
+    """Raise unless a path, or its link's target, is a regular file of bounded size.
 
     For files that another library opens; `read_regular` checks by itself.
 
     Args:
         path: The file.
-        limit: Largest size [bytes].
+        limit: Maximum size [bytes].
 
     Raises:
         ValueError: If it is a folder, a pipe or a device, or larger than the limit.
@@ -42,26 +42,27 @@ def read_regular(path: Path | str, limit: int = TEXT_LIMIT) -> bytes:
 
     Args:
         path: The file.
-        limit: Largest size [bytes].
+        limit: Maximum size [bytes].
 
     Raises:
         ValueError: If it is a folder, a pipe or a device, or larger than the limit.
         OSError: If there is no such file, or it cannot be read.
     """
-    # Opening a device may do something, so look before; and a pipe may have come since.
+    # Check before opening, which can have side effects on a device; check again after,
+    # as a pipe may have replaced the file.
     check_regular(path, limit)
     with open(path, "rb", opener=_open_without_waiting) as file:
         status = os.fstat(file.fileno())
         _check(status, path, limit)
-        # Of a file that grows meanwhile, what was there when it was opened.
+        # If the file grows meanwhile, read only the size at opening.
         return file.read(status.st_size)
 
 
 def check_output(path: Path | None, option: str) -> None:
-    """Raise ValueError if a file cannot be written there, before the work starts.
+    """Raise ValueError if a file cannot be written; call this before the work starts.
 
     Args:
-        path: The file; None is none.
+        path: The file; None: there is no file to write.
         option: The option that named it, for the error text.
     """
     if path is None:
@@ -71,11 +72,12 @@ def check_output(path: Path | None, option: str) -> None:
     if os.path.isdir(path):
         raise ValueError(f"{option}: {path} is a folder")
     try:
-        # To open one waits for a reader; that of a shell or /dev/stdout has no path.
+        # Opening a named pipe waits for a reader. Pipes of a shell or /dev/stdout have
+        # no path and are allowed.
         pipe = path.is_fifo() and os.path.lexists(os.path.realpath(path))
         new = not os.path.lexists(path)
         if new or path.is_file():
-            # Appending nothing changes nothing.
+            # Opening to append leaves the content unchanged.
             path.open("ab").close()
         if new:
             path.unlink()
@@ -87,12 +89,12 @@ def check_output(path: Path | None, option: str) -> None:
 
 
 def _open_without_waiting(path: str, flags: int) -> int:
-    """Open a file; a named pipe without a writer, too, returns at once."""
+    """Open a file without waiting, even for a named pipe that has no writer."""
     return os.open(path, flags | os.O_NONBLOCK)
 
 
 def _check(status: os.stat_result, path: Path | str, limit: int) -> None:
-    """Raise ValueError unless it is the status of a regular file of bounded size."""
+    """Raise ValueError unless the status is of a regular file of bounded size."""
     if not stat.S_ISREG(status.st_mode):
         kind = _KINDS.get(stat.S_IFMT(status.st_mode), "something else")
         raise ValueError(f"{path} must be a file, and is {kind}")

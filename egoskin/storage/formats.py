@@ -1,14 +1,14 @@
-"""File formats: their number, the SHA-256 of what a file holds, and migrations.
+"""File formats: version numbers, SHA-256 of the content, and migrations.
 
-Whatever egoskin writes to read again, a JSON file or the JSON header of a file of
-tensors, opens with a seal:
+Each JSON file, and each JSON header of a file of tensors, that egoskin writes to read
+again starts with a seal:
 
-    format    number of the format; files from before there was one have none, and are 1
+    format    number of the format; older files without a number have format 1
     egoskin   version of egoskin that wrote it
-    sha256    of all the rest, tensors included
+    sha256    hash of everything else, tensors included
 
-Contract: what `unseal` returns is what `seal` was given, bit for bit; of a file that
-has no seal it says, once, that nobody can know.
+Contract: `unseal` returns what `seal` was given, bit for bit. For a file without a seal
+it prints once that the content cannot be verified.
 """
 
 from __future__ import annotations
@@ -30,26 +30,26 @@ from torch import Tensor
 from egoskin.storage.serialization import read_json
 
 FORMAT = 5
-"""Number of the format that is written."""
+"""Number of the format in which files are written."""
 _SEAL = ("format", "egoskin", "sha256")
 _ANY = object()
-# What simulated before there was a choice.
+# The physics engine before there was a choice.
 _ENGINE = "mujoco"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Migration:
-    """How a configuration becomes one of the next format, by dotted names of fields."""
+    """Changes of a configuration to the next format, by dotted field names."""
 
     added: Mapping[str, Any] = field(default_factory=dict)
-    """Fields that are new, and their values with which nothing changes."""
+    """New fields, with the values that keep the old behaviour."""
     renamed: Mapping[str, str] = field(default_factory=dict)
-    """Fields that have another name now, by the old one."""
+    """New names of renamed fields, by the old name."""
     removed: Mapping[str, Any] = field(default_factory=dict)
-    """Fields that are no more, and their values without effect (or any)."""
+    """Removed fields, with their values without effect (or any)."""
 
 
-# By the number of the format that a migration starts from.
+# By the number of the format from which a migration starts.
 _MIGRATIONS = {
     1: Migration(
         added={
@@ -57,9 +57,10 @@ _MIGRATIONS = {
             "env.task.throws.aim": "body",
         },
         removed={
-            # Steps over which what of a ball touches grew; the price of the distance
-            # from the start, from "drift_start" on; the speed of the balls, from
-            # "slow_start" on; an oracle told first of the ball that passes next.
+            # Environment steps over which these grew: the touching part of a ball; the
+            # penalty on distance from the start, beginning at "drift_start"; the speed
+            # of the balls, beginning at "slow_start". Further, whether an oracle
+            # observes the ball that passes next first.
             "core_frames": [0, 0],
             "drift_frames": [0, 0],
             "slow_start_frames": 0,
@@ -80,9 +81,10 @@ _MIGRATIONS = {
             "env.task.throws.mass": 0.4,
             "env.task.throws.speed_is": "horizontal",
             "env.task.throws.on_ground": "inactive",
-            # Distance to a ball's centre; an angle of view along each axis; beams from
-            # edge to edge of the view, and several in a zone; a signal for each ball;
-            # whether a signal is one; a position over the range, and in other frames.
+            # Removed options: distance to a ball's centre; angle of view along each
+            # axis; beams from edge to edge of the view; several beams per zone; a
+            # signal per ball; a validity flag; position divided by the range, or in
+            # other frames.
             "env.sensor.field.measure": "surface",
             "env.sensor.ray.fov": "diagonal",
             "env.sensor.ray.beams": "centres",
@@ -121,11 +123,11 @@ def package_version(package: str) -> str | None:
 
 
 def content_hash(content: Any, tensors: Mapping[str, Tensor] | None = None) -> str:
-    """Return the SHA-256 of JSON values and tensors, whatever their order.
+    """Return the SHA-256 of JSON values and tensors, independent of their order.
 
     Args:
         content: JSON values.
-        tensors: Tensors by name; their names, types, shapes and bytes count.
+        tensors: Tensors by name; names, types, shapes and bytes are hashed.
     """
     text = json.dumps(content, sort_keys=True, separators=(",", ":"))
     digest = hashlib.sha256(text.encode())
@@ -139,11 +141,11 @@ def content_hash(content: Any, tensors: Mapping[str, Tensor] | None = None) -> s
 def seal(
     content: Mapping[str, Any], tensors: Mapping[str, Tensor] | None = None
 ) -> dict[str, Any]:
-    """Return the content of a file with its seal before it.
+    """Return the content of a file, preceded by its seal.
 
     Args:
         content: JSON values.
-        tensors: What the file holds beside them.
+        tensors: Tensors of the file.
     """
     assert not content.keys() & set(_SEAL)
     version = package_version("egoskin")
@@ -159,16 +161,16 @@ def unseal(
     *,
     quiet: bool = False,
 ) -> tuple[dict[str, Any], int]:
-    """Return (content without its seal, number of its format).
+    """Return (content without its seal, format number).
 
     Args:
-        content: What the file holds.
+        content: JSON values of the file.
         what: Name of the file.
-        tensors: What it holds beside that.
-        quiet: Whether to say nothing of a file without a seal.
+        tensors: Tensors of the file.
+        quiet: Whether to omit the note about a missing seal.
 
     Raises:
-        ValueError: If the content is not what was written, or of a newer format.
+        ValueError: If the content has been changed, or has a newer format.
     """
     number = content.get("format", 1)
     if not isinstance(number, int) or number < 1:
@@ -195,7 +197,7 @@ def unseal(
 
 @functools.cache
 def _note(what: str) -> None:
-    """Say, once for each file, that it cannot be verified."""
+    """Print, once for each file, that it cannot be verified."""
     print(
         f"note: {what} is of an egoskin without checksums: whether it is whole cannot "
         "be verified",
@@ -204,14 +206,14 @@ def _note(what: str) -> None:
 
 
 def read_sealed(path: Path, *, quiet: bool = False) -> tuple[dict[str, Any], int]:
-    """Return (content, number of its format) of a JSON file with or without a seal.
+    """Return (content, format number) of a JSON file with or without a seal.
 
     Args:
         path: The file.
-        quiet: Whether to say nothing of a file without a seal.
+        quiet: Whether to omit the note about a missing seal.
 
     Raises:
-        ValueError: If it is no JSON object, or not what was written.
+        ValueError: If it is not a JSON object, has been changed, or has a newer format.
         OSError: If it cannot be read.
     """
     content = read_json(path)
@@ -223,22 +225,22 @@ def read_sealed(path: Path, *, quiet: bool = False) -> tuple[dict[str, Any], int
 
 
 def sealed_json(content: Mapping[str, Any]) -> bytes:
-    """Return what `read_sealed` reads."""
+    """Return the bytes of a sealed JSON file, for `read_sealed`."""
     return (json.dumps(seal(content), indent=2) + "\n").encode()
 
 
 def migrate(
     config: Mapping[str, Any], number: int
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return a training configuration, or a part of one, in the present format.
+    """Return a training configuration, or a part of one, in the current format.
 
     Args:
         config: The configuration as plain values, ``{"env": ...}``.
-        number: Its format.
+        number: Its format number.
 
     Returns:
-        The configuration, and the values with an effect of options that are no more,
-        by name.
+        The configuration, and the removed options that had an effect: their values by
+        name.
     """
     config, retired = copy.deepcopy(dict(config)), {}
     for step in range(number, FORMAT):
@@ -253,7 +255,7 @@ def migrate(
                 retired[name] = value
         for name, value in _MIGRATIONS[step].added.items():
             *path, key = name.split(".")
-            # A part of a configuration gets what belongs to it.
+            # A part of a configuration only gets the fields of that part.
             if path[0] in config if path else {"env", "ppo"} <= config.keys():
                 inner = _object(config, path, make=True)
                 inner.setdefault(key, copy.copy(value))
@@ -261,7 +263,7 @@ def migrate(
 
 
 def _object(content: Any, path: Sequence[str], make: bool = False) -> dict[str, Any]:
-    """Return the object at a path, a new one if there is none, which is kept or not."""
+    """Return the object at a path, or a new one, which is stored only if ``make``."""
     for part in path:
         if not isinstance(content, dict):
             return {}
@@ -270,10 +272,10 @@ def _object(content: Any, path: Sequence[str], make: bool = False) -> dict[str, 
 
 
 def present_config(config: Mapping[str, Any], number: int, what: str) -> dict[str, Any]:
-    """Return what `migrate` does, where options that are no more are refused.
+    """Return a configuration in the current format; refuse removed options.
 
     Raises:
-        ValueError: If one of them has an effect; the text names it.
+        ValueError: If a removed option had an effect; the text names it.
     """
     present, retired = migrate(config, number)
     for name, value in retired.items():
@@ -285,10 +287,10 @@ def present_config(config: Mapping[str, Any], number: int, what: str) -> dict[st
 
 
 def present_header(header: Mapping[str, Any], number: int, what: str) -> dict[str, Any]:
-    """Return a header with all configurations in it in the present format.
+    """Return a header with all its configurations in the current format.
 
     Raises:
-        ValueError: If an option that is no more has an effect; the text names it.
+        ValueError: If a removed option had an effect; the text names it.
     """
     header = copy.deepcopy(dict(header))
     if isinstance(header.get("config"), dict):

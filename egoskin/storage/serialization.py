@@ -1,4 +1,4 @@
-"""Configurations as plain values, and JSON files of them."""
+"""Configurations as plain values, and reading JSON files."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from egoskin.bounds import BoundsError, path_to
 from egoskin.storage.files import read_regular
 
 T = TypeVar("T")
-# Deeper than anything that is written, and no trouble for what walks through it.
+# Deeper than anything that egoskin writes, and safe for recursive functions.
 _DEEPEST = 100
 
 
@@ -23,7 +23,7 @@ def read_json(path: Path) -> Any:
     """Return the content of a JSON file.
 
     Raises:
-        ValueError: If it is none; the text names it.
+        ValueError: If it is not valid JSON; the text names the file.
         OSError: If it cannot be read.
     """
     content = read_regular(path)
@@ -37,7 +37,7 @@ def read_json(path: Path) -> Any:
 
 
 def _depth(value: Any) -> int:
-    """Return how deep lists and objects are nested."""
+    """Return the nesting depth of lists and objects."""
     depth, level = 0, [value]
     while level := [x for x in level if isinstance(x, (dict, list))]:
         depth += 1
@@ -65,12 +65,12 @@ def to_plain(value: Any) -> Any:
 
 
 def from_plain(kind: type[T], content: Any, what: str) -> T:
-    """Return a configuration from the values that `to_plain` gave.
+    """Return a configuration from the output of `to_plain`.
 
     Args:
         kind: Dataclass to build.
         content: Plain values.
-        what: Where they came from, for the error text.
+        what: Their source, for the error text.
 
     Raises:
         ValueError: If a field is unknown, of the wrong type or out of bounds; the text
@@ -84,13 +84,13 @@ def from_plain(kind: type[T], content: Any, what: str) -> T:
         return dacite.from_dict(kind, _with_tuples(content), config)
     except BoundsError as error:
         raise ValueError(f"{what}: {path_to(error.owner, kind)}{error}") from error
-    # The last is what a configuration itself refuses.
+    # ValueError is raised by the checks of the configuration itself.
     except (dacite.DaciteError, ValueError) as error:
         raise ValueError(f"{what}: {error}") from error
 
 
 def _with_tuples(content: Any) -> Any:
-    """Return plain values with tuples for lists, as configurations have them."""
+    """Return plain values with lists replaced by tuples, as in configurations."""
     if isinstance(content, dict):
         return {key: _with_tuples(value) for key, value in content.items()}
     if isinstance(content, list):
@@ -99,7 +99,7 @@ def _with_tuples(content: Any) -> Any:
 
 
 def _float(value: Any) -> Any:
-    """Return a number as float, "inf" too; anything else is left to be refused."""
+    """Return a number or "inf" as float; other values unchanged, for later checks."""
     whole = isinstance(value, int) and not isinstance(value, bool)
     try:
         return float(value) if whole or value in ("inf", "-inf") else value
@@ -108,7 +108,7 @@ def _float(value: Any) -> Any:
 
 
 def _path(value: Any) -> Any:
-    """Return a text as path; anything else is left to be refused."""
+    """Return a string as path; other values unchanged, for later checks."""
     return Path(value) if isinstance(value, str) else value
 
 

@@ -20,14 +20,14 @@ from torch import Tensor
 from egoskin.storage.formats import present_header, seal, unseal
 
 _HEADER = "egoskin"
-# Names of files that were being written when their writer was killed.
+# Pattern of the incomplete files of processes that were killed while writing.
 PARTIAL = ".*.partial"
 
 
 def save_tensors(
     path: Path, tensors: Mapping[str, Tensor], header: Mapping[str, Any]
 ) -> None:
-    """Write tensors and a header; the file is complete or as it was before.
+    """Write tensors and a header atomically: the file is complete or unchanged.
 
     Args:
         path: File to write or replace.
@@ -35,7 +35,7 @@ def save_tensors(
         header: JSON values.
 
     Raises:
-        OSError: If it cannot be written; what stood there before is intact.
+        OSError: If it cannot be written; an existing file is unchanged.
     """
     own = {key: value.detach().cpu().contiguous() for key, value in tensors.items()}
     content = save(own, metadata={_HEADER: json.dumps(seal(header, own))})
@@ -43,17 +43,17 @@ def save_tensors(
 
 
 def write_file(path: Path, content: bytes) -> None:
-    """Write a file; it is complete, on disk, or as it was before.
+    """Write a file atomically: it is complete and on disk, or unchanged.
 
-    A process that is killed while it writes leaves a file that `PARTIAL` matches. A
-    link that stands there is replaced, and never followed.
+    A process that is killed while writing leaves a file that `PARTIAL` matches. An
+    existing link is replaced, never followed.
 
     Raises:
         OSError: If it cannot be written; the text names the file.
     """
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
-        # One that was left over, or put there for us to follow.
+        # A leftover file, or a link placed there for us to follow.
         partial.unlink(missing_ok=True)
         with open(partial, "xb") as file:
             file.write(content)
@@ -68,10 +68,10 @@ def write_file(path: Path, content: bytes) -> None:
 
 
 def append(path: Path, content: bytes) -> None:
-    """Append to a file that is there, and is no link.
+    """Append to an existing file that is not a link.
 
     Raises:
-        OSError: If it is not there or cannot be written; the text names it.
+        OSError: If it does not exist or cannot be written; the text names it.
     """
     try:
         with open(path, "ab", opener=_open_to_append) as file:
@@ -86,7 +86,7 @@ def _open_to_append(path: str, flags: int) -> int:
 
 
 def named(error: OSError, path: Path) -> OSError:
-    """Return an error that names a file; the system's own of a full disk names none."""
+    """Return an error that names a file; the system's error of a full disk does not."""
     return OSError(error.errno, error.strerror, str(path))
 
 
@@ -104,15 +104,15 @@ def load_tensors(
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Return (tensors by name, header) of a file that `save_tensors` wrote.
 
-    Configurations in the header are brought into the present format.
+    Configurations in the header are converted to the current format.
 
     Args:
         path: The file.
-        quiet: Whether to say nothing of a file without a seal.
+        quiet: Whether to omit the note about a missing seal.
 
     Raises:
-        ValueError: If the file is missing, damaged or another format; the text names
-            it.
+        ValueError: If the file is missing, damaged or of another format; the text
+            names it.
     """
     if not path.is_file():
         raise ValueError(f"no such file: {path}")

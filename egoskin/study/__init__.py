@@ -1,14 +1,14 @@
-"""Studies: many runs that differ in a few fields, and what their seeds tell.
+"""Studies: sets of runs that differ in a few fields, compared over seeds.
 
-* `manifest`: what is run: cells, seeds, budget, evaluation
+* `manifest`: definition of a study: cells, seeds, budget, evaluation
 * `shipped`: the studies that come with the package
-* `cost`: what a study costs
-* `store`: a study as a folder: what of it is done, and with what result
-* `claims`: one process a run, on one host or many
-* `job`: a run and its evaluation, in a process of its own
-* `runner`: the runs of a study, side by side
+* `cost`: estimate of a study's cost
+* `store`: the study folder: state and result of each run
+* `claims`: locks, so that only one process works on a run, on one host or many
+* `job`: one run and its evaluation, in its own process
+* `runner`: execution of the runs in parallel
 * `statistics`: estimates over seeds, tests, power
 * `findings`: the paper's findings as contrasts, fixed before any run
-* `figures`: pictures
+* `figures`: figures of the report
 * `report`: report.md, index.html, runs.csv
 """

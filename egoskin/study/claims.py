@@ -1,11 +1,11 @@
-"""Claims: one process works on one thing, on one host or on many with a shared folder.
+"""Claims: locks that let only one process work on a run, on one host or many.
 
-A claim has two parts. A lock (``NAME.lock``) that the system takes from a process that
-ends, however it ends; it works among the processes of a host, and among hosts where the
-file system shares locks. And an owner file (``NAME.owner.3``: the third owner) whose
-time of change is its heartbeat, for hosts among which locks are not shared: an owner on
-another host is dead once its heart has not beaten for a while. The next owner creates
-the file of the next number, which only one can.
+A claim has two parts. The lock (``NAME.lock``) is released by the system when its
+process ends, however it ends. It works between the processes of a host, and between
+hosts if their shared file system supports locks. The owner file (``NAME.owner.3``: the
+third owner) is for hosts that do not share locks: its modification time is a heartbeat,
+and an owner on another host counts as dead when the heartbeat is too old. The next
+owner creates the file with the next number, which only one process can do.
 """
 
 from __future__ import annotations
@@ -24,26 +24,27 @@ from pathlib import Path
 from typing import IO
 
 HEARTBEAT_S = 15.0
-"""Time between two beats of an owner's heart [s]."""
+"""Interval between heartbeats of an owner [s]."""
 STALE_S = 180.0
-"""An owner on another host is dead after this long without one [s]."""
+"""An owner on another host counts as dead this long after its last heartbeat [s]."""
 
 
 def this_host() -> str:
-    """Return what tells this host, since it was started, from all others."""
+    """Return an identifier of this host that is unique since its last boot."""
     with suppress(OSError):
-        # Containers of one machine share its locks, whatever their host names.
+        # Containers on one machine share its locks even if their host names differ.
         return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
     return f"{socket.gethostname()}-{uuid.getnode():x}"
 
 
 def is_claimed(folder: Path, name: str, stale: float = STALE_S) -> bool:
-    """Return whether a living process works on something.
+    """Return whether a living process holds a claim.
 
     Args:
         folder: Folder of the claims.
-        name: What is worked on.
-        stale: An owner elsewhere without a heartbeat for this long [s] is dead.
+        name: Name of the claim.
+        stale: An owner on another host counts as dead this long after its last
+            heartbeat [s].
     """
     try:
         with _lock(folder / f"{name}.lock", create=False) as free:
@@ -70,14 +71,16 @@ def claimed(
     stale: float = STALE_S,
     lost: Callable[[], None] = lambda: os._exit(1),
 ) -> Iterator[bool]:
-    """Claim something while the context is open; yield whether it could be claimed.
+    """Hold a claim while the context is open; yield whether it could be obtained.
 
     Args:
         folder: Folder of the claims.
-        name: What to work on.
-        heartbeat: Time between two beats of this owner's heart [s].
-        stale: An owner elsewhere without one for this long [s] is dead.
-        lost: Called if somebody else took it: this host slept, or its clock stood.
+        name: Name of the claim.
+        heartbeat: Interval between heartbeats of this owner [s].
+        stale: An owner on another host counts as dead this long after its last
+            heartbeat [s].
+        lost: Called if another process took over the claim, because this host was
+            suspended or its clock stood still.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with _lock(folder / f"{name}.lock", create=True) as free:
@@ -89,7 +92,7 @@ def claimed(
 
         def beat() -> None:
             while not ended.wait(heartbeat):
-                # A file system that fails may come back: the next beat looks again.
+                # File system errors may be temporary: the next heartbeat tries again.
                 with suppress(OSError):
                     if _owners(folder, name)[-1:] != [owner]:
                         return lost()
@@ -110,7 +113,7 @@ def claimed(
 
 @contextmanager
 def _lock(path: Path, *, create: bool) -> Iterator[bool]:
-    """Hold a lock; yield whether nobody else does."""
+    """Try to lock a file; yield whether the lock was free."""
     with _open(path, create=create) as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -121,18 +124,18 @@ def _lock(path: Path, *, create: bool) -> Iterator[bool]:
 
 
 def _open(path: Path, *, create: bool) -> IO[str]:
-    """Open a file to lock; some shared folders lock only what is open to be written."""
+    """Open a file to lock; some file systems only lock files open for writing."""
     if create:
         return open(path, "a")
     try:
         return open(path, "r+")
     except PermissionError:
-        # Who may only read may still look.
+        # Readers without write permission can still check the lock.
         return open(path)
 
 
 def _owners(folder: Path, name: str) -> list[Path]:
-    """Return the owner files, the present owner's last."""
+    """Return the owner files, that of the current owner last."""
     pattern = re.compile(re.escape(name) + r"\.owner\.(\d+)")
     with suppress(FileNotFoundError):
         found = [(pattern.fullmatch(p.name), p) for p in folder.iterdir()]
@@ -141,7 +144,7 @@ def _owners(folder: Path, name: str) -> list[Path]:
 
 
 def _own(folder: Path, name: str, stale: float) -> Path | None:
-    """Become the owner; return the owner file, None if somebody lives elsewhere."""
+    """Become the owner; return the owner file, or None if another process is."""
     owners = _owners(folder, name)
     if _lives_elsewhere(folder, name, stale):
         return None
@@ -151,22 +154,22 @@ def _own(folder: Path, name: str, stale: float) -> Path | None:
     temporary = folder / f".{name}.{uuid.uuid4().hex}"
     temporary.write_text(json.dumps(content))
     try:
-        # Whole at once, and for one process alone.
+        # Atomic: the file appears complete, and only one process can create it.
         os.link(temporary, path)
     except FileExistsError:
         return None
     finally:
         temporary.unlink()
-    # Who was faster may have ended since, and its files with it.
+    # A faster process may have ended since and removed its files.
     return path if _owners(folder, name)[-1:] == [path] else None
 
 
 def _lives_elsewhere(folder: Path, name: str, stale: float) -> bool:
-    """Whether the owner is on another host and its heart beats."""
+    """Return whether the owner is on another host and has a recent heartbeat."""
     for path in reversed(_owners(folder, name)):
         with suppress(FileNotFoundError, ValueError, KeyError):
             content = json.loads(path.read_text())
-            # Of this host the lock tells all.
+            # For owners on this host the lock decides.
             if content["host"] == this_host():
                 return False
             return _now(folder) - path.stat().st_mtime < stale
@@ -180,7 +183,7 @@ def _now(folder: Path) -> float:
         path.touch()
         return path.stat().st_mtime
     except OSError:
-        # A folder that can only be read.
+        # The folder is read-only.
         return time.time()
     finally:
         with suppress(OSError):

@@ -1,4 +1,4 @@
-"""What a study costs: a run is tried for a moment, and the rest is multiplication."""
+"""Cost of a study, extrapolated from a short measurement of one run."""
 
 from __future__ import annotations
 
@@ -16,24 +16,25 @@ from egoskin.runs.run import Run, TrainConfig
 from egoskin.runs.trainer import open_trainer
 from egoskin.study.manifest import Manifest, PlannedRun
 
-# Rollouts that are measured, after one that warms up.
+# Rollouts measured, after one warm-up rollout.
 _ROLLOUTS = 3
-# Of a policy and a line of metrics with its events [bytes]; a checkpoint of an agent.
+# Size of a policy, of a line of metrics with its events, and of a checkpoint per
+# environment [bytes].
 _POLICY, _LINE, _CHECKPOINT = 36_000, 1_000, 3_800
 
 
 @dataclass(frozen=True, kw_only=True)
 class Cost:
-    """What a study costs."""
+    """Cost of a study."""
 
     runs: int
-    """Runs."""
+    """Number of runs."""
     frames: int
-    """Environment steps of all."""
+    """Environment steps of all runs."""
     per_s: float
     """Environment steps per second and core."""
     disk: float
-    """Disk space of all [bytes], of an order of magnitude."""
+    """Disk space of all runs [bytes], to an order of magnitude."""
 
     @property
     def core_s(self) -> float:
@@ -41,16 +42,16 @@ class Cost:
         return self.frames / self.per_s
 
     def wall_s(self, cores: int) -> float:
-        """Return the time on some cores [s]: whole runs, each on a core of its own."""
+        """Return the wall time on a number of cores [s], with one run per core."""
         one = self.core_s / self.runs
         return -(-self.runs // cores) * one
 
 
 def cost(manifest: Manifest, per_s: float) -> Cost:
-    """Return what a study costs at a number of environment steps per second and core.
+    """Return the cost of a study at a number of environment steps per second and core.
 
-    Disk space grows with the policies and lines of metrics; it is taken from runs of
-    the default networks.
+    Disk space grows with the number of policies and lines of metrics; their sizes are
+    those of the default networks.
     """
     disk = 0.0
     for run in manifest.runs:
@@ -64,14 +65,14 @@ def cost(manifest: Manifest, per_s: float) -> Cost:
 
 @dataclass(frozen=True, kw_only=True)
 class Speed:
-    """How fast runs are side by side on this machine."""
+    """Speed of parallel runs on this machine."""
 
     cores_per_run: int
-    """Workers and learner threads of each."""
+    """Workers and learner threads of each run."""
     parallel: int
-    """Runs side by side."""
+    """Number of parallel runs."""
     per_s: float
-    """Environment steps per second of all together, learning included."""
+    """Environment steps per second of all runs together, learning included."""
 
     def __str__(self) -> str:
         """Return a line of text."""
@@ -84,14 +85,14 @@ class Speed:
 def measure_all(
     run: PlannedRun, cores: int, tell: Callable[[str], None] = lambda text: None
 ) -> list[Speed]:
-    """Return how fast a run is with 1, 2, 4, ... cores each, the machine full of them.
+    """Return the speeds with 1, 2, 4, ... cores per run, with all cores in use.
 
-    Each takes about half a minute; they train in temporary folders.
+    Each measurement takes about half a minute and trains in temporary folders.
 
     Args:
         run: The run.
-        cores: Cores that may be used.
-        tell: Told what is measured.
+        cores: Number of cores to use.
+        tell: Called with a line of text before each measurement.
     """
     choices = [2**k for k in range(cores.bit_length()) if cores % 2**k == 0]
     fit = [n for n in choices if run.config.num_envs % n == 0]
@@ -104,13 +105,13 @@ def measure(
     parallel: int = 1,
     tell: Callable[[str], None] = lambda text: None,
 ) -> Speed:
-    """Return how fast some runs are side by side.
+    """Return the speed of some runs in parallel.
 
     Args:
-        run: What each of them runs.
-        cores_per_run: Workers and learner threads of each.
-        parallel: Runs side by side, each in a process of its own.
-        tell: Told what is measured.
+        run: The run, the same in each process.
+        cores_per_run: Workers and learner threads of each run.
+        parallel: Number of parallel runs, each in its own process.
+        tell: Called with a line of text before the measurement.
     """
     each = f"{counted(cores_per_run, 'core')} each"
     tell(f"measuring {counted(parallel, 'run')} of {run.cell.name} on {each} ...")

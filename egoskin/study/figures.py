@@ -1,4 +1,4 @@
-"""Pictures of a study, as PNG and SVG: colours that all readers tell apart, units."""
+"""Figures of a study, as PNG and SVG, with units and colour-blind safe colours."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from egoskin.study.metrics import frames_to
 from egoskin.study.statistics import Effect, Table, contrast, spread
 from egoskin.study.store import Result
 
-# Okabe and Ito's colours, told apart by colour-blind readers; and a mark of each.
+# Colours of Okabe and Ito, which are colour-blind safe, and markers.
 _STYLES = {
     "localization": ("#0072B2", "o"),
     "proximity": ("#D55E00", "s"),
@@ -39,10 +39,10 @@ _GRID = {f"env.sensor.{name}" for name in ("coverage", "signal", "range", "reduc
 
 @dataclass(frozen=True)
 class Place:
-    """Where a cell stands in the paper's grid."""
+    """Position of a cell in the paper's grid."""
 
     geometry: str
-    """Coverage, and what of a ray is given."""
+    """Coverage and, for rays, the reduction of their beams."""
     signal: str
     """Signal."""
     range: float
@@ -50,9 +50,10 @@ class Place:
 
 
 def places(manifest: Manifest) -> dict[str, Place]:
-    """Return where the cells stand that differ in nothing but the paper's fields.
+    """Return the positions of the cells that differ only in the paper's fields.
 
-    Localization is the same with all beams and the closest: it stands for both.
+    Localization is the same with all beams and with the closest beam: one cell serves
+    for both.
     """
     found = {}
     for cell in manifest.cells:
@@ -76,7 +77,7 @@ def _geometry(name: str, grid: Mapping[str, Place]) -> dict[tuple[str, float], s
 
 
 def _unskinned(manifest: Manifest, coverage: str) -> Cell | None:
-    """Return the cell without a skin, of those that differ in nothing else."""
+    """Return the blind or oracle cell that differs only in the paper's fields."""
     for cell in manifest.cells:
         own = cell.config.env.sensor.coverage
         if own == coverage and set(manifest.overrides(cell)) <= _GRID:
@@ -85,7 +86,7 @@ def _unskinned(manifest: Manifest, coverage: str) -> Cell | None:
 
 
 def save(figure: Figure, folder: Path, name: str) -> None:
-    """Write a figure as PNG and SVG, the same bytes for the same figures."""
+    """Write a figure as PNG and SVG; equal figures give equal bytes."""
     with mpl.rc_context({"svg.hashsalt": name, "svg.fonttype": "path"}):
         figure.savefig(folder / f"{name}.png", dpi=130, metadata={"Software": None})
         figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
@@ -97,9 +98,9 @@ def _plain(axes: Axes) -> None:
 
 
 def success_by_range(manifest: Manifest, table: Table) -> Figure | None:
-    """Draw the paper's figure: success against range; None without its cells.
+    """Draw the paper's figure, success against range; return None without its cells.
 
-    A line for each signal, a panel for each geometry; interquartile mean and range over
+    One line per signal and one panel per geometry: interquartile mean and range over
     seeds, and each seed as a small dot.
     """
     grid = {k: v for k, v in places(manifest).items() if table.get(k)}
@@ -161,7 +162,8 @@ def _legend_above(figure: Figure, panels: Iterable[Axes]) -> None:
 def learning_curves(manifest: Manifest, results: Sequence[Result]) -> Figure | None:
     """Draw success in training against frames: each seed thin, their mean thick.
 
-    Rows are geometries, columns ranges; cells of another kind have a row of their own.
+    Rows are geometries, columns are ranges; all other cells share a panel in an extra
+    row.
     """
     by_cell: dict[str, list[Result]] = {}
     for result in results:
@@ -265,7 +267,7 @@ def _draw_effect(axes: Axes, y: float, effect: Effect, colour: str) -> None:
 
 
 def forest(judged: Sequence[Judged]) -> Figure:
-    """Draw the claims of the findings: where each should lie, and where it does."""
+    """Draw the claimed region and the estimated effect of each claim."""
     rows = sum(len(j.claims) + 1 for j in judged)
     figure = Figure(figsize=(10.5, 0.8 + 0.24 * rows), layout="constrained")
     axes = figure.subplots()
@@ -299,10 +301,10 @@ def forest(judged: Sequence[Judged]) -> Figure:
 
 
 def equivalence(manifest: Manifest, table: Table) -> Figure | None:
-    """Draw which signals of one geometry and range are equivalent; None without pairs.
+    """Draw which signals of a geometry and range are equivalent; None without pairs.
 
-    Equivalent is a pair whose 90 % interval lies within the margin; different, one
-    whose 95 % interval does not hold 0.
+    A pair is equivalent if its 90 % interval lies within the margin, and different if
+    its 95 % interval does not contain 0.
     """
     grid = {k: v for k, v in places(manifest).items() if table.get(k)}
     pairs = []
@@ -358,7 +360,7 @@ def equivalence(manifest: Manifest, table: Table) -> Figure | None:
 
 
 def sample_efficiency(manifest: Manifest, results: Sequence[Result]) -> Figure | None:
-    """Draw the frames until 50 % and 90 % of a run's own end, by cell and seed."""
+    """Draw the frames to 50 % and 90 % of a run's final success, by cell and seed."""
     grid = places(manifest)
     rows: list[tuple[str, str, list[float], list[float]]] = []
     for cell in manifest.cells:

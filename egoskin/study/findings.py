@@ -1,13 +1,14 @@
 """The paper's findings as contrasts of cells, fixed before any run.
 
-A finding is one or more claims, all of which must hold: each says in which region a
-contrast of cells lies. A claim is *confirmed* by a test that it lies there, *refuted*
-by a test that it lies beyond; otherwise it is undecided. A finding is confirmed if all
-of its claims are (the largest p-value), refuted if any is (Bonferroni); and the whole
-family is corrected by Holm's method.
+A finding consists of one or more claims, all of which must hold. A claim states the
+region in which a contrast of cells lies. It is *confirmed* by a test that the contrast
+lies inside the region, *refuted* by a test that it lies outside, and otherwise
+undecided. A finding is confirmed if all of its claims are (the largest p-value) and
+refuted if any of them is (Bonferroni). The p-values of all findings are corrected by
+Holm's method.
 
-Two findings of the paper speak of its own budget, of 3000 and of 1000 epochs. For them
-stands another one, of our budget, which is called a stand-in.
+Two findings of the paper refer to its own budget, of 3000 and of 1000 epochs. They are
+replaced by a similar statement about our budget, called a stand-in.
 """
 
 from __future__ import annotations
@@ -31,24 +32,24 @@ from egoskin.study.statistics import (
 )
 
 MARGIN = 5.0
-"""Two successes closer than this are equivalent [percentage points]."""
+"""Success rates closer than this are equivalent [percentage points]."""
 ABOVE, SAME = Region(low=0.0), Region(low=-MARGIN, high=MARGIN)
 NOT_BELOW = Region(low=-MARGIN)
 
 Verdict = Literal["confirmed", "refuted", "undecided"]
-"""What the runs say of a finding."""
+"""Outcome of the tests of a finding."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Claim:
-    """That a contrast lies in a region."""
+    """Statement that a contrast lies in a region."""
 
     name: str
-    """What is compared."""
+    """Description of the contrast."""
     weights: Mapping[str, float]
     """Weight of each cell."""
     region: Region
-    """Where the contrast is claimed to lie."""
+    """Region in which the contrast is claimed to lie."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,47 +57,47 @@ class Finding:
     """A finding of the paper."""
 
     label: str
-    """Its number in the paper, with a letter for each of several claims."""
+    """Its number in the paper, with a letter if that number makes several claims."""
     text: str
-    """What the paper says."""
+    """Statement of the paper."""
     claims: tuple[Claim, ...]
-    """What of it is tested; all must hold."""
+    """Its testable claims; all must hold."""
     metric: str = "success_3s"
     """Metric of the contrasts, see `egoskin.study.report.METRICS`."""
     stand_in: str = ""
-    """What stands for a finding of another budget, "" if it is tested as it is."""
+    """Statement tested instead, if the paper's is about another budget; else ""."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Tested:
-    """A claim and what the runs say of it."""
+    """A claim and the results of its tests."""
 
     claim: Claim
     """The claim."""
     effect: Effect | None
     """The contrast; None if one of its cells has no run."""
     p_confirm: float
-    """P-value of "it lies in its region"."""
+    """P-value of "it lies inside its region"."""
     p_refute: float
-    """P-value of "it lies beyond"."""
+    """P-value of "it lies outside its region"."""
     seeds_needed: int | None
-    """Seeds that would decide it; None if unknown or none would."""
+    """Seeds needed to decide it; None if unknown or if no number is enough."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Judged:
-    """A finding and what the runs say of it."""
+    """A finding and its verdict."""
 
     finding: Finding
     """The finding."""
     claims: tuple[Tested, ...]
     """Its claims."""
     verdict: Verdict
-    """What the runs say."""
+    """The verdict."""
     p_value: float
-    """P-value of the verdict, or of the likelier one, after Holm's correction."""
+    """P-value of the verdict (or of the likelier one), after Holm's correction."""
     seeds_needed: int | None
-    """Seeds a cell that would decide it; None if unknown or none would."""
+    """Seeds per cell needed to decide it; None if unknown or if no number is enough."""
 
 
 def cell(coverage: str, signal: str, reach: float, *, reduced: bool = False) -> str:
@@ -110,7 +111,7 @@ def _difference(one: str, other: str, region: Region) -> Claim:
 
 
 def _best(coverage: str, *, reduced: bool, ranges: tuple[float, ...]) -> list[Claim]:
-    """That localization is better than what else a geometry can give."""
+    """Return the claims that localization beats the other signals of a geometry."""
     return [
         _difference(
             cell(coverage, "localization", reach),
@@ -121,7 +122,7 @@ def _best(coverage: str, *, reduced: bool, ranges: tuple[float, ...]) -> list[Cl
     ]
 
 
-# Of full and reduced rays the study has no pairs at 0.2 m.
+# The study has no pairs of full and reduced rays at 0.2 m.
 _RAY_RANGES = RANGES[1:]
 _DEFICIT = [
     {cell("field", "localization", r): 1.0, cell("ray", "localization", r): -1.0}
@@ -236,7 +237,7 @@ FINDINGS = (
 
 
 def judge_findings(tables: Mapping[str, Table]) -> list[Judged]:
-    """Return what runs say of the findings.
+    """Return the verdict on each finding.
 
     Args:
         tables: Values by metric, then by cell and seed [%].
@@ -269,12 +270,12 @@ def judge_findings(tables: Mapping[str, Table]) -> list[Judged]:
 
 def _test(finding: Finding, table: Table) -> list[Tested]:
     result = []
-    # As if the whole family were to be decided at once.
+    # Bonferroni, as if all findings were to be decided at once.
     alpha, one = ALPHA / len(FINDINGS), seed_sd(table)
     for claim in finding.claims:
         effect = contrast(claim.weights, table)
         known = effect is not None
-        # As if cells with one seed had the others' spread, and pairing did nothing.
+        # Assumed for cells with one seed: the spread of the others, and unpaired seeds.
         sd = one * math.sqrt(sum(w**2 for w in claim.weights.values()))
         result.append(
             Tested(
@@ -291,7 +292,7 @@ def _test(finding: Finding, table: Table) -> list[Tested]:
 
 
 def _needed(claims: list[Tested]) -> int | None:
-    """Return how many seeds decide a finding for the side that it leans to."""
+    """Return the number of seeds that decides a finding in its present direction."""
     against = [
         t.seeds_needed
         for t in claims
@@ -300,7 +301,7 @@ def _needed(claims: list[Tested]) -> int | None:
         and t.seeds_needed is not None
     ]
     if against:
-        # One that is refuted is enough.
+        # A single refuted claim is enough.
         return min(against)
     needed = [t.seeds_needed for t in claims]
     known = [n for n in needed if n is not None]

@@ -1,10 +1,10 @@
-"""A run of a study and its evaluation, in a process of its own.
+"""Train and evaluate one run of a study, in its own process.
 
 python -m egoskin.study.job FOLDER NAME
 
-Whoever is called first claims the run, trains it from its last checkpoint to its end,
-judges its policy, and stores the result. A signal, or the end of the process that
-started it (``--parent``), stops it with a checkpoint. Its exit status says which.
+The first job of a run claims it, trains it from its last checkpoint to its end,
+evaluates its policy and stores the result. A signal, or the end of the parent process
+(``--parent``), stops it with a checkpoint. The exit status tells these cases apart.
 """
 
 from __future__ import annotations
@@ -26,25 +26,25 @@ from egoskin.study.claims import claimed
 from egoskin.study.store import StudyFolder, judge_run, now
 
 FAILED = 1
-"""Exit status after an error; it has been written to stderr."""
+"""Exit status after an error, which has been written to stderr."""
 CLAIMED = 75
 """Exit status if another process works on the run (EX_TEMPFAIL)."""
 STOPPED = 76
 """Exit status after a stop, with a checkpoint."""
 
-# How often is looked whether the parent lives [s].
+# Interval between checks that the parent is alive [s].
 _LOOK = 1.0
 
 
 class _StoppedError(Exception):
-    """An evaluation is stopped."""
+    """Raised to stop an evaluation."""
 
 
 class Stop:
-    """Whether the job is to stop: after a signal, or its parent's end.
+    """Request to stop the job, after a signal or when its parent has ended.
 
     Args:
-        parent: Process id of the parent; None: it may end.
+        parent: Process id of the parent; None: no parent is watched.
     """
 
     def __init__(self, parent: int | None = None) -> None:
@@ -63,24 +63,24 @@ class Stop:
         self.requested = True
 
     def check(self, step: int, running: int) -> None:
-        """Raise _StoppedError if it is to stop; called as ``on_step``."""
+        """Raise _StoppedError if a stop is requested; called as ``on_step``."""
         if self.requested:
             raise _StoppedError
 
 
 def work(folder: StudyFolder, name: str, stop: Stop, cores: int = 1) -> int:
-    """Train and judge a run, as far as it has not been done; return the exit status.
+    """Train and evaluate a run, skipping what is done; return the exit status.
 
     Args:
         folder: The study.
         name: Name of the run.
-        stop: Whether it is to stop.
-        cores: Workers and learner threads, which change no result.
+        stop: Request to stop.
+        cores: Workers and learner threads; results do not depend on them.
 
     Raises:
-        ValueError: If its folder is that of another run, or damaged.
-        OSError: If something cannot be written.
-        WorkerError: If a worker ends.
+        ValueError: If its folder belongs to another run or is damaged.
+        OSError: If a file cannot be written.
+        WorkerError: If a worker process ends.
         NonFiniteError: If an update is not finite.
     """
     manifest = folder.manifest()
@@ -110,7 +110,7 @@ def work(folder: StudyFolder, name: str, stop: Stop, cores: int = 1) -> int:
 
 
 def command(folder: Path, name: str, nice: int, cores: int) -> list[str]:
-    """Return the command that works on a run, for a child of this process."""
+    """Return the command that starts a run's job as a child of this process."""
     module = [sys.executable, "-m", "egoskin.study.job"]
     options = ["--parent", str(os.getpid()), "--nice", str(nice)]
     options += ["--cores", str(cores)]

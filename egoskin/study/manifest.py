@@ -1,11 +1,11 @@
-"""A study: cells, seeds, budget, evaluation; and its manifest, the file it begins with.
+"""Definition of a study (cells, seeds, budget, evaluation) and its manifest file.
 
 A study *describes* runs by the fields in which they differ from the default. Its
-manifest *fixes* them: the complete configuration of the first day, in the format of
-that day, and each cell's differences from it, so that neither a default that changes
-nor an option that is renamed changes a study that has begun.
+manifest *fixes* them: it stores the complete configuration at its creation, in the
+format of that time, and each cell's differences from it. Later changes of defaults or
+option names therefore do not affect a study that has begun.
 
-Contract: cells and seeds may be added to a manifest, nothing of it changes.
+Contract: cells and seeds can be added to a manifest; nothing in it is changed.
 """
 
 from __future__ import annotations
@@ -43,44 +43,44 @@ from egoskin.storage.serialization import (
 from egoskin.storage.tensor_file import write_file
 
 Overrides = Mapping[str, Any]
-"""Values by the dotted names of fields, as on the command line: ``sensor.range``."""
+"""Values by dotted field names, as on the command line: ``sensor.range``."""
 
-# What a study decides by itself, and what all its cells share.
+# Fields that a study sets itself, and fields that are the same in all its cells.
 _NOT_OF_A_STUDY = MACHINE_FIELDS | {"seed", "total_frames", "device", "engine"}
 _OF_ALL_CELLS = {"snapshot_frames", "checkpoint_interval"}
-# It is compared as a whole: one is a name, another is data.
+# Compared as a whole: a robot is either a name or data.
 _ROBOT = "env.robot"
-# What names a cell already.
+# Fields that the sensor's label already contains.
 _LABEL = ("env.sensor.coverage", "env.sensor.signal", "env.sensor.range")
 
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationPlan:
-    """How the policy of each run is judged."""
+    """How the policy of each run is evaluated."""
 
     standard: Standard = "2"
     """Version of the standard throw."""
     throw_set: int = 1000
-    """Seed of the throw set: one that nothing was chosen on."""
+    """Seed of the throw set, which was not used for any tuning."""
     episodes: Annotated[int, COUNT] = 4096
     """Throw sequences in the set."""
     masked: bool = True
-    """Whether to judge it with all its sensors masked, too."""
+    """Whether to evaluate it also with all its sensors masked."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for a throw set that is none."""
+        """Raise ValueError for invalid values."""
         check_seed(self.throw_set, "throw_set")
         check_bounds(self)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Study:
-    """What is to be run."""
+    """Description of a study."""
 
     name: str
     """Name of the study."""
     purpose: str
-    """What it is to find out, in a sentence."""
+    """Its purpose, in a few words."""
     cells: tuple[dict[str, Any], ...]
     """`Overrides` of each cell."""
     seeds: tuple[int, ...]
@@ -88,14 +88,14 @@ class Study:
     frames: Annotated[int, COUNT]
     """Environment steps of each run."""
     standard: Standard = "2"
-    """Version of the standard throw that is trained on."""
+    """Version of the standard throw used in training."""
     base: dict[str, Any] = field(default_factory=dict)
     """`Overrides` that all cells share."""
     evaluation: EvaluationPlan = field(default_factory=EvaluationPlan)
-    """How the policies are judged."""
+    """How the policies are evaluated."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for a study of nothing, or seeds that are none."""
+        """Raise ValueError for an empty study or invalid values."""
         if not self.cells or not self.seeds:
             raise ValueError(f"study {self.name}: needs at least a cell and a seed")
         if not re.fullmatch(r"[\w.-]+", self.name):
@@ -110,10 +110,10 @@ class Study:
 
 @dataclass(frozen=True, kw_only=True)
 class Cell:
-    """A cell of a manifest: runs that differ in nothing but their seed."""
+    """A cell of a manifest: runs that differ only in their seed."""
 
     name: str
-    """Name, of the fields in which it differs from the default."""
+    """Name, built from the fields in which it differs from the default."""
     config: TrainConfig
     """Its configuration, with seed 0."""
     skin_sha256: str
@@ -125,7 +125,7 @@ class PlannedRun:
     """A run of a manifest."""
 
     cell: Cell
-    """What is run."""
+    """Its cell."""
     seed: int
     """Its seed."""
 
@@ -136,21 +136,21 @@ class PlannedRun:
 
     @property
     def config(self) -> TrainConfig:
-        """Its configuration: one worker and one learner thread."""
+        """Its configuration, with one worker and one learner thread."""
         return dataclasses.replace(
             self.cell.config, seed=self.seed, num_workers=1, learner_threads=1
         )
 
     @property
     def end(self) -> int:
-        """Environment steps at its end: whole rollouts."""
+        """Environment steps at its end, rounded up to whole rollouts."""
         size = self.config.frames_per_batch
         return math.ceil(self.config.total_frames / size) * size
 
     def differences(self, other: TrainConfig) -> list[str]:
-        """Return the names of the fields that make another configuration another run.
+        """Return the names of the fields in which a configuration is not this run's.
 
-        Its length is none: a shorter run may be gone on with.
+        The length is not compared: a shorter run can be continued.
         """
         names = changed_fields(to_plain(self.config), to_plain(other))
         free = MACHINE_FIELDS | {"total_frames"}
@@ -159,12 +159,12 @@ class PlannedRun:
 
 @dataclass(frozen=True, kw_only=True)
 class Manifest:
-    """What a study runs, resolved and fixed."""
+    """The runs of a study, resolved and fixed."""
 
     study: str
     """Name of the study."""
     purpose: str
-    """What it is to find out."""
+    """Its purpose."""
     base: TrainConfig
     """Configuration that the cells differ from."""
     cells: tuple[Cell, ...]
@@ -172,7 +172,7 @@ class Manifest:
     seeds: tuple[int, ...]
     """The seeds."""
     evaluation: EvaluationPlan
-    """How the policies are judged."""
+    """How the policies are evaluated."""
 
     @cached_property
     def runs(self) -> tuple[PlannedRun, ...]:
@@ -180,10 +180,10 @@ class Manifest:
         return tuple(PlannedRun(cell=c, seed=s) for s in self.seeds for c in self.cells)
 
     def run(self, name: str) -> PlannedRun:
-        """Return the run of a name.
+        """Return the run with the given name.
 
         Raises:
-            ValueError: If there is none; the text names the closest.
+            ValueError: If there is no such run; the text names the closest.
         """
         named = {run.name: run for run in self.runs}
         if name not in named:
@@ -203,7 +203,7 @@ class Manifest:
         """Return this manifest with the cells and seeds that another one adds.
 
         Raises:
-            ValueError: If the other changes anything that this one has.
+            ValueError: If the other changes existing content.
         """
         for name in ("study", "evaluation"):
             own, new = getattr(self, name), getattr(other, name)
@@ -251,10 +251,10 @@ class Manifest:
 
     @classmethod
     def load(cls, path: Path) -> Manifest:
-        """Return the manifest of a file, its configurations in the present format.
+        """Return the manifest of a file, its configurations in the current format.
 
         Raises:
-            ValueError: If it is none, or has options that are no more.
+            ValueError: If it is not a manifest or has options that no longer exist.
         """
         if not path.is_file():
             raise ValueError(
@@ -265,7 +265,7 @@ class Manifest:
         what = str(path)
 
         def config(overrides: Overrides) -> TrainConfig:
-            # In the format that they were written in, and only then migrated.
+            # Override in the format of the file, and only then migrate.
             plain = copy.deepcopy(content["base"])
             for name, value in overrides.items():
                 _set(plain, name, value, known=False)
@@ -292,19 +292,19 @@ class Manifest:
 
 
 def load_study(path: Path) -> Study:
-    """Return the study that a JSON file describes: the fields of `Study`.
+    """Return the study of a JSON file with the fields of `Study`.
 
     Raises:
-        ValueError: If it describes none; the text names the field.
+        ValueError: If it is not a valid study; the text names the field.
     """
     return from_plain(Study, read_json(path), str(path))
 
 
 def resolve(study: Study) -> Manifest:
-    """Return the manifest of a study that begins today.
+    """Return the manifest of a new study, with the current defaults.
 
     Raises:
-        ValueError: If a cell cannot exist, or two are one; the text names the cell.
+        ValueError: If a cell is invalid or occurs twice; the text names the cell.
     """
     task = training_task(study.standard, TrainConfig().env.task)
     default = TrainConfig(env=EnvConfig(task=task), total_frames=study.frames)
@@ -321,7 +321,7 @@ def resolve(study: Study) -> Manifest:
                 skin = config.env.skin.build(config.env.robot_config)
                 skins[key] = skin, content_hash(skin.to_dict())
             skin, digest = skins[key]
-            # Sensors that do not fit each other.
+            # Raises for sensors that do not fit each other.
             config.env.pipeline(skin)
         except (ValueError, OSError) as error:
             raise ValueError(f"{what}: {error}") from error
@@ -342,16 +342,16 @@ def resolve(study: Study) -> Manifest:
 def override(
     config: TrainConfig, overrides: Overrides, what: str, fixed: Collection[str] = ()
 ) -> TrainConfig:
-    """Return a configuration with other values of some fields.
+    """Return a configuration with the values of some fields replaced.
 
     Args:
         config: The configuration.
         overrides: The values.
-        what: What they belong to, for the error text.
-        fixed: Fields that must not be given.
+        what: Name of their owner, for the error text.
+        fixed: Fields that cannot be overridden.
 
     Raises:
-        ValueError: If there is no such field, or the value is none of it.
+        ValueError: If a field does not exist or is fixed, or a value is invalid.
     """
     plain = to_plain(config)
     for name, value in overrides.items():
@@ -375,7 +375,7 @@ def override(
 
 
 def cell_name(base: TrainConfig, config: TrainConfig) -> str:
-    """Return the name of a cell: its sensor's, then what else differs from the base."""
+    """Return a cell's name: its sensor's label, then other differences to the base."""
     parts = [config.env.sensor.label()]
     for name, value in _differences(base, config).items():
         if name not in _LABEL:
@@ -385,12 +385,12 @@ def cell_name(base: TrainConfig, config: TrainConfig) -> str:
 
 
 def brief(value: Any) -> str:
-    """Return the value of a field as text: of a robot that is data, its name."""
+    """Return the value of a field as text; for a robot given as data, its name."""
     return str(value.get("name", value) if isinstance(value, dict) else value)
 
 
 def _differences(base: TrainConfig, config: TrainConfig) -> dict[str, Any]:
-    """Return the values in which a configuration differs, but for its seed."""
+    """Return the values in which a configuration differs, except its seed."""
     found = _plain_differences(base, config)
     return {name: value for name, value in found.items() if name != "seed"}
 
@@ -411,7 +411,7 @@ def _get(content: Any, name: str) -> Any:
 
 
 def _set(content: Any, name: str, value: Any, *, known: bool) -> None:
-    """Set the plain value at a dotted name, of a field that is there if it is known."""
+    """Set the plain value at a dotted name; if ``known``, the field must exist."""
     *path, last = name.split(".")
     for i, key in enumerate(path):
         _check_key(content, key, ".".join(path[:i]))

@@ -1,4 +1,4 @@
-"""What is told of each run: one row of a tidy table, and a table for each metric."""
+"""Metrics of runs: a tidy table with a row per run, and a table per metric."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ from egoskin.study.manifest import Manifest
 from egoskin.study.statistics import Table
 from egoskin.study.store import Result
 
-# The end of a learning curve is its mean over this last share of the frames; of less
-# than this success there is no sample efficiency to speak of.
+# Final success is the mean of the learning curve over this last share of the frames;
+# below this final success, sample efficiency is not computed.
 _END_SHARE, _LEAST_END = 0.05, 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
 class Metric:
-    """A figure of a run."""
+    """A metric of a run."""
 
     name: str
     """Name of its column."""
     label: str
-    """What it is."""
+    """Description."""
     unit: str
     """Its unit."""
     of: Callable[[Result], float | None]
-    """The figure; None if a run has none."""
+    """Function that computes it; None if a run has no value."""
 
 
 def frames_to(result: Result, share: float) -> float | None:
-    """Return the frames until a run's success in training is a share of its own end.
+    """Return the frames until success in training reaches a share of its final value.
 
-    None if it never learnt: if its end is below 5 %.
+    None if the run did not learn: if its final success is below 5 %.
     """
     frames, success = result.stored.frames, result.stored.success
     if not len(frames):
@@ -49,7 +49,7 @@ def frames_to(result: Result, share: float) -> float | None:
     first = int(np.argmax(success >= share * end))
     if first == 0:
         return float(frames[0])
-    # Linear between the stored lines.
+    # Interpolate linearly between the stored lines.
     x, y = frames[first - 1 : first + 1], success[first - 1 : first + 1]
     return float(x[0] + (share * end - y[0]) / (y[1] - y[0]) * (x[1] - x[0]))
 
@@ -138,17 +138,17 @@ METRICS = (
         of=_share_to_90,
     ),
 )
-"""The figures of a run; success, survival, balls and falls are of the throw set, frames
-of the success in training, exploration on."""
+"""Metrics of a run. Success, survival, balls and falls are from the throw set; frames
+are from the success in training, with exploration."""
 
 
 def metric(name: str) -> Metric:
-    """Return the metric of a name."""
+    """Return the metric with the given name."""
     return next(m for m in METRICS if m.name == name)
 
 
 def tables(results: Sequence[Result]) -> Mapping[str, Table]:
-    """Return the values of each metric by cell and seed; of None there is no entry."""
+    """Return the finite values of each metric by cell and seed."""
     found: dict[str, dict[str, dict[int, float]]] = {m.name: {} for m in METRICS}
     for result in results:
         for each in METRICS:
@@ -160,10 +160,10 @@ def tables(results: Sequence[Result]) -> Mapping[str, Table]:
 
 
 def runs_csv(manifest: Manifest, results: Sequence[Result]) -> str:
-    """Return a tidy table: a row for each run, in full precision.
+    """Return a tidy table with a row for each run, in full precision.
 
-    Two studies of one manifest differ in nothing but the columns that are named after
-    wall time and speed (``wall_s``, ``frames_per_s``).
+    Two executions of one manifest differ only in the columns of wall time and speed
+    (``wall_s``, ``frames_per_s``).
     """
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")

@@ -1,8 +1,8 @@
-"""The runs of a study on a Ray cluster, their files in a folder that all nodes see.
+"""Execute the runs of a study on a Ray cluster, in a folder shared by all nodes.
 
-Each run is a Ray task on its cores, which starts the run's job and waits for it. Ray
-chooses the node, and runs the task again on another one if its node is lost: the run
-goes on from its last checkpoint. (Extra `ray`.)
+Each run is a Ray task that reserves the run's cores, starts its job and waits for it.
+Ray chooses the node. If a node is lost, Ray repeats the task on another one, where the
+run resumes from its last checkpoint. Requires the extra `ray`.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from egoskin.study.runner import (
 )
 from egoskin.study.store import StudyFolder
 
-# How long the address of a cluster is tried [s].
+# Timeout for connecting to the address of a cluster [s].
 _CONNECT_S = 10.0
-# How often a task looks at its job, and a task that is to stop is told so [s].
+# Intervals at which a task polls its job, and tasks are repeatedly cancelled [s].
 _POLL_S, _TELL_S = 0.2, 2.0
-# How long a task may take to say that its job has ended [s].
+# Time allowed for a task to report that its job has ended [s].
 _ANSWER_S = 10.0
-# Otherwise a worker that ends, as when the runner is killed, kills its job.
+# Without this, a Ray worker that ends (as when the runner is killed) kills its job.
 _LET_LIVE = {"RAY_kill_child_processes_on_worker_exit": "false"}
 
 
@@ -44,10 +44,10 @@ def connect(address: str) -> int:
     """Connect to an existing cluster; return its number of cores.
 
     Args:
-        address: Its address, ``host:port``, or "auto": the one of this machine.
+        address: Its address, ``host:port``, or "auto": the cluster of this machine.
 
     Raises:
-        ValueError: If there is none.
+        ValueError: If there is no cluster at the address.
     """
     handler = signal.getsignal(signal.SIGTERM)
     try:
@@ -55,7 +55,7 @@ def connect(address: str) -> int:
             host, _, port = address.rpartition(":")
             if not host or not port.isdecimal():
                 raise ValueError("host:port, as in 10.0.0.1:6379")
-            # Ray would ask for minutes.
+            # Ray itself would keep trying for minutes.
             socket.create_connection((host, int(port)), _CONNECT_S).close()
         ray.init(
             address=address,
@@ -70,20 +70,20 @@ def connect(address: str) -> int:
             "ray start --head"
         ) from None
     finally:
-        # Ray's own would end this process with another status.
+        # Ray's handler would end this process with another exit status.
         signal.signal(signal.SIGTERM, handler)
     return int(ray.cluster_resources().get("CPU", 1))
 
 
 class RayRunner(Runner):
-    """Works on the cluster that `connect` has connected to.
+    """Runner on the cluster that `connect` has connected to.
 
     Raises:
-        ValueError: If no node has the cores that each run is to have.
+        ValueError: If no node has enough cores for a run.
     """
 
     def __init__(self, folder: StudyFolder, **options: Any) -> None:
-        # Nodes have other working folders.
+        # Nodes have other working directories: the path must be absolute.
         super().__init__(StudyFolder(folder.path.resolve()), **options)
         cores = [int(n["Resources"].get("CPU", 0)) for n in ray.nodes() if n["Alive"]]
         if self._cores > max(cores, default=0):
@@ -97,7 +97,7 @@ class RayRunner(Runner):
         return self._tasks
 
     def _begin(self, run: PlannedRun) -> None:
-        # Of a task whose node is lost Ray keeps the count.
+        # Ray itself counts the retries after lost nodes.
         work: Any = _work
         task = work.options(max_retries=self._tries, num_cpus=self._cores)
         path = str(self._folder.path)
@@ -120,17 +120,17 @@ class RayRunner(Runner):
         deadline = time.monotonic() + PATIENCE_S + _ANSWER_S
         while left and time.monotonic() < deadline:
             for task in left:
-                # One that waits for a core never begins. A worker that still imports
-                # may miss it.
+                # A task that waits for cores never starts. A worker that is still
+                # importing may miss the request, so it is repeated.
                 ray.cancel(task)
             _, left = ray.wait(left, num_returns=len(left), timeout=_TELL_S)
 
 
 class _Cancel:
-    """Whether Ray cancels the task that this worker runs, while it is entered.
+    """Context manager that notes whether Ray cancels the task of this worker.
 
-    Ray sends no signal: it asks Python to call the handler of SIGINT, which Python does
-    between two instructions, and so never while it waits in the system without end.
+    Ray sends no signal: it asks Python to call the handler of SIGINT. Python does so
+    between two instructions, and thus never during an endless blocking system call.
     """
 
     def __init__(self) -> None:
@@ -149,7 +149,7 @@ class _Cancel:
 
 @ray.remote
 def _work(path: str, name: str, nice: int, cores: int) -> tuple[int, str]:
-    """Return (exit status, last error) of a run's job, which runs on this node."""
+    """Execute a run's job on this node; return (exit status, last error)."""
     folder = StudyFolder(Path(path))
     if not folder.manifest_path.is_file():
         node = ray.util.get_node_ip_address()
@@ -160,7 +160,7 @@ def _work(path: str, name: str, nice: int, cores: int) -> tuple[int, str]:
             while job.poll() is None and not cancel.requested:
                 time.sleep(_POLL_S)
         finally:
-            # The runner stops, or this worker has got a SIGTERM.
+            # The runner stops, or this worker has received SIGTERM.
             if job.poll() is None:
                 job.terminate()
                 end_job(job, PATIENCE_S)
@@ -168,6 +168,6 @@ def _work(path: str, name: str, nice: int, cores: int) -> tuple[int, str]:
 
 
 def _lines(error: BaseException) -> list[str]:
-    """Return the lines of an error's text, its type if it has none."""
+    """Return the lines of an error's text, or its type if there is no text."""
     lines = [line.strip() for line in str(error).strip().splitlines()]
     return lines or [type(error).__name__]

@@ -1,7 +1,7 @@
 """The report of a study: report.md, index.html, runs.csv and figures in one folder.
 
-Contract: it is written from the manifest and the results alone, and says of everything
-that is missing that it is.
+Contract: it needs only the manifest and the results, and lists everything that is
+missing.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class Rows:
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure that has been saved, by its name."""
+    """A saved figure, by its name."""
 
     name: str
     caption: str
@@ -74,11 +74,11 @@ def write_report(folder: StudyFolder, out: Path) -> None:
 
     Args:
         folder: The study.
-        out: Folder to write to, made if it is not there.
+        out: Folder to write to, created if missing.
 
     Raises:
-        ValueError: If a result is damaged or not the manifest's.
-        OSError: If something cannot be written.
+        ValueError: If a result is damaged or does not match the manifest.
+        OSError: If a file cannot be written.
     """
     manifest = folder.manifest()
     results = folder.results(manifest)
@@ -106,7 +106,7 @@ def _pictures(
     success: Table,
     judged: Sequence[Judged],
 ) -> dict[str, tuple[Figure, str]]:
-    """Return the figures that there is something to draw of, with their captions."""
+    """Return the figures for which there are data, with their captions."""
     drawn = {
         "success-by-range": (
             success_by_range(manifest, success),
@@ -240,7 +240,7 @@ def _answer(judged: Sequence[Judged]) -> str:
 
 
 def _deciding(judged: Judged) -> Tested:
-    """Return the claim that a verdict hangs on: the least sure, or the refuted one."""
+    """Return the claim that decides a verdict: the least certain or the refuted one."""
     if judged.verdict == "refuted":
         return min(judged.claims, key=lambda c: c.p_refute)
     known = [c for c in judged.claims if c.effect is not None]
@@ -340,7 +340,7 @@ def _seen_rows(seen: dict) -> Rows:
 
 
 def markdown(blocks: Iterable[Block]) -> str:
-    """Return blocks as Markdown; figures lie beside it."""
+    """Return blocks as Markdown that refers to the figures in the same folder."""
     parts = []
     for number, block in enumerate(blocks):
         match block:
@@ -371,12 +371,12 @@ figcaption { color: #555; font-size: 13px; }
 
 
 def page(title: str, blocks: Iterable[Block], folder: Path) -> str:
-    """Return blocks as one HTML page that needs no other file.
+    """Return blocks as one self-contained HTML page.
 
     Args:
         title: Its title.
         blocks: The blocks.
-        folder: Where the figures were saved.
+        folder: Folder of the saved figures.
     """
     parts = []
     for number, block in enumerate(blocks):
@@ -411,7 +411,7 @@ def page(title: str, blocks: Iterable[Block], folder: Path) -> str:
 
 
 def _inline(text: str) -> str:
-    """Return a text with its **bold** and *slanted* parts as HTML."""
+    """Return a text with its **bold** and *italic* parts as HTML."""
     result, tags = html.escape(text), {"**": "strong", "*": "em"}
     for mark, tag in tags.items():
         pieces = result.split(mark)

@@ -1,9 +1,9 @@
-"""The runs of a study side by side, each in a process of its own.
+"""Execute the runs of a study in parallel, each in its own process.
 
-`LocalRunner` works on this machine; `egoskin.study.ray_runner.RayRunner` on a cluster.
+`LocalRunner` uses this machine, `egoskin.study.ray_runner.RayRunner` a Ray cluster.
 
-Contract: nothing is run twice, whoever else works on the folder; what ends the runner,
-even SIGKILL, ends its runs with a checkpoint, and whoever starts it again goes on.
+Contract: no run is executed twice, even if several runners share the folder. When a
+runner ends, even by SIGKILL, its runs stop with a checkpoint; a new one resumes them.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from egoskin.study.job import CLAIMED, STOPPED, command
 from egoskin.study.manifest import Manifest, PlannedRun
 from egoskin.study.store import START, RunStatus, StudyFolder, duration, now
 
-# How often the runner looks at its processes, and a claimed run is asked for again [s].
+# Intervals at which processes are polled, and a claimed run is tried again [s].
 _POLL, _AGAIN = 0.2, 5.0
-# How often the progress line is written: on a terminal, in a file [s].
+# Intervals between progress lines: on a terminal, in a file [s].
 _SHOW_LIVE, _SHOW_FILE = 2.0, 60.0
 PATIENCE_S = 120.0
 """How long a run may take to stop with a checkpoint [s]."""
@@ -34,25 +34,25 @@ PATIENCE_S = 120.0
 
 @dataclass(frozen=True, kw_only=True)
 class Progress:
-    """How far a whole study is."""
+    """Progress of a whole study."""
 
     counts: dict[str, int]
     """Number of runs in each state."""
     share: float
-    """Share of all environment steps that is done."""
+    """Share of all environment steps that are done."""
     left_s: float | None
     """Time left at the present speed [s], None if unknown."""
 
     @classmethod
     def of(cls, status: list[RunStatus]) -> Progress:
-        """Return how far a study is."""
+        """Return the progress for the status of all runs."""
         counts = {"done": 0, "running": 0, "failed": 0, "begun": 0, "missing": 0}
         for each in status:
             counts[each.state] += 1
         total = sum(each.run.end for each in status)
         done = sum(each.frames for each in status)
         speeds = [s.per_s for s in status if s.state == "running" and s.per_s]
-        # Those that have just begun are as fast as the others.
+        # Runs that have just begun are assumed to be as fast as the others.
         speed = sum(speeds) / len(speeds) * counts["running"] if speeds else 0.0
         left = (total - done) / speed if speed else None
         left = 0.0 if counts["done"] == len(status) else left
@@ -65,15 +65,15 @@ class Progress:
 
 
 class Runner(ABC):
-    """Works on the runs of a study until all are done or have failed too often.
+    """Executes the runs of a study until all are done or have failed too often.
 
     Args:
         folder: The study.
-        parallel: Runs side by side.
-        tries: How often a run that fails is tried in all.
+        parallel: Number of parallel runs.
+        tries: Maximum number of attempts for each run.
         nice: Niceness of the runs.
         cores_per_run: Workers and learner threads of each run.
-        show: Told the progress line, and each failure.
+        show: Called with the progress line, and with each failure.
     """
 
     def __init__(
@@ -90,16 +90,16 @@ class Runner(ABC):
         self._parallel, self._tries, self._nice = parallel, tries, nice
         self._cores, self._show = cores_per_run, show
         self._finished: set[str] = set()
-        # When to ask again for a run that somebody else has claimed.
+        # When to try a run again that another process has claimed.
         self._again: dict[str, float] = {}
 
     @abstractmethod
     def _running(self) -> Collection[str]:
-        """Return the names of the runs that are ours."""
+        """Return the names of the runs that this runner is executing."""
 
     @abstractmethod
     def _begin(self, run: PlannedRun) -> None:
-        """Begin to work on a run."""
+        """Start a run."""
 
     @abstractmethod
     def _ended(self) -> dict[str, tuple[int, str]]:
@@ -107,10 +107,10 @@ class Runner(ABC):
 
     @abstractmethod
     def _stop(self) -> None:
-        """Stop our runs, with checkpoints."""
+        """Stop this runner's runs, with checkpoints."""
 
     def run(self) -> list[RunStatus]:
-        """Work; return how far each run is at the end.
+        """Execute the runs; return the final status of each.
 
         Raises:
             OSError: If a log or a failure cannot be written.
@@ -135,7 +135,7 @@ class Runner(ABC):
             self._stop()
 
     def _open_runs(self) -> list[PlannedRun]:
-        """Return the runs that somebody still has to work on, but for our own."""
+        """Return the runs that are left to do, except this runner's."""
         result = []
         for run in self._manifest.runs:
             if run.name in self._finished or run.name in self._running():
@@ -161,7 +161,7 @@ class Runner(ABC):
             self._begin(run)
 
     def _reap(self) -> None:
-        """Look what has ended, and how."""
+        """Handle the runs that have ended."""
         for name, (status, error) in self._ended().items():
             if status == CLAIMED:
                 self._again[name] = time.monotonic() + _AGAIN
@@ -173,7 +173,7 @@ class Runner(ABC):
 
 
 class LocalRunner(Runner):
-    """Works on this machine, as many runs side by side as are asked for."""
+    """Runner on this machine, with several runs in parallel."""
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
@@ -210,7 +210,7 @@ class LocalRunner(Runner):
 def start_job(
     folder: StudyFolder, name: str, nice: int, cores: int
 ) -> subprocess.Popen[bytes]:
-    """Return the process that works on a run; what it says goes to the run's log."""
+    """Start and return the process of a run, which writes to the run's log."""
     with open(folder.log_path(name), "ab") as log:
         log.write(f"{START} {now()}\n".encode())
         log.flush()
@@ -219,14 +219,14 @@ def start_job(
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=subprocess.STDOUT,
-            # A terminal's Ctrl-C reaches the runner alone, which passes it on.
+            # A terminal's Ctrl-C reaches only the runner, which passes it on.
             start_new_session=True,
             env={**os.environ, "OMP_NUM_THREADS": "1"},
         )
 
 
 def end_job(job: subprocess.Popen[bytes], patience: float) -> None:
-    """Wait until a job that is to stop has ended; end it if it takes too long [s]."""
+    """Wait until a stopping job has ended; kill it after ``patience`` [s]."""
     try:
         job.wait(max(0.0, patience))
     except subprocess.TimeoutExpired:
@@ -244,14 +244,14 @@ def how_it_ended(folder: StudyFolder, name: str, status: int) -> str:
 def slurm_script(
     manifest: Manifest, folder: Path, *, cores: int, elements: int, hours: float
 ) -> str:
-    """Return a job array for Slurm, whose elements share the work on a folder.
+    """Return a Slurm job array whose elements share the work on a folder.
 
     Args:
         manifest: The study.
-        folder: Its folder, which all nodes see.
-        cores: Cores of each element, and runs side by side.
+        folder: Its folder, shared by all nodes.
+        cores: Cores of each element, and number of parallel runs.
         elements: Elements of the array.
-        hours: Time limit of each; one that reaches it stops with checkpoints.
+        hours: Time limit of each element, at which it stops with checkpoints.
     """
     minutes = max(round(60 * hours), 1)
     logs = shlex.quote(str(folder / "logs" / "slurm-%A-%a.log"))

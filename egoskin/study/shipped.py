@@ -14,7 +14,7 @@ SIGNALS = ("localization", "proximity", "binary")
 """Signals of the paper."""
 # Frames of an epoch of the paper: 16 steps of 4096 agents.
 _EPOCH = 16 * 4096
-# A ray sensor reduced to its closest beam; of a binary signal, "any beam".
+# A ray sensor reduced to its closest beam; with a binary signal, "any beam".
 _REDUCED = {"sensor.reduce": "min"}
 
 
@@ -50,7 +50,7 @@ def _paper(name: str, epochs: int) -> Study:
         seeds=tuple(range(10)),
         frames=epochs * _EPOCH,
         standard="paper",
-        # Its critic is told the velocity alone.
+        # The critic's only privileged observation is the velocity.
         base={"privileged": "velocity"},
     )
 
@@ -58,13 +58,13 @@ def _paper(name: str, epochs: int) -> Study:
 PAPER = _paper("paper", 3000)
 """The paper's study."""
 PAPER_1000 = _paper("paper-1000", 1000)
-"""The same at 1000 epochs."""
+"""The same with 1000 epochs."""
 
 FINDINGS = Study(
     name="findings",
     purpose="the fewest cells that decide the paper's six findings",
     cells=(
-        # In the order of what they tell: what is broken off has the first.
+        # The most informative cells first, in case the study is interrupted.
         *(
             _sensor("field", signal, reach)
             for reach, signal in itertools.product(reversed(RANGES), SIGNALS)
@@ -81,7 +81,7 @@ FINDINGS = Study(
     seeds=(0, 1, 2),
     frames=TrainConfig().total_frames,
 )
-"""What decides the findings, with the default recipe and budget."""
+"""The cells that decide the findings, with the default recipe and budget."""
 
 SMOKE = Study(
     name="smoke",
@@ -92,7 +92,7 @@ SMOKE = Study(
     base={"num_envs": 64},
     evaluation=EvaluationPlan(episodes=64),
 )
-"""A study of a minute that tells nothing of skins."""
+"""A test study of about a minute, without meaning for the comparison of skins."""
 
 STUDIES = {s.name: s for s in (PAPER, PAPER_1000, FINDINGS, SMOKE)}
 """The studies by name."""

@@ -1,9 +1,9 @@
 """Statistics over seeds: estimates, tests, power.
 
-The unit is the seed, never the episode: an interval over thousands of throws says how
-exactly a policy is measured, and nothing of what another seed would have learnt.
+The unit is the seed, never the episode: an interval over thousands of throws shows how
+precisely one policy is measured, but not how much policies differ between seeds.
 
-Contract: a spread that is zero, or unknown because there is one seed, decides nothing.
+Contract: nothing is decided if the spread is zero, or unknown as there is one seed.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ import numpy as np
 from scipy import stats
 
 ALPHA = 0.05
-"""Level of every test, and of the whole family after Holm's correction."""
+"""Significance level of every test, and of all together after Holm's correction."""
 POWER = 0.8
-"""Power at which a number of seeds is called enough."""
-# Numbers of seeds beyond this are as good as infinite.
+"""Power at which a number of seeds is considered enough."""
+# Numbers of seeds beyond this are not considered.
 _MOST_SEEDS = 1000
 
 Table = Mapping[str, Mapping[int, float]]
@@ -29,8 +29,8 @@ Table = Mapping[str, Mapping[int, float]]
 def interquartile_mean(values: Sequence[float] | np.ndarray) -> float:
     """Return the mean without the top and bottom 25 %.
 
-    Of a number of values that 4 does not divide, the values at the bounds count in
-    part: of three, the outer ones by a quarter each.
+    If the number of values is not a multiple of 4, the values at the bounds have
+    fractional weights: of three values, the outer two have a weight of 1/4 each.
     """
     x, n = np.sort(np.asarray(values, dtype=float)), len(values)
     index = np.arange(n)
@@ -47,7 +47,7 @@ def interquartile_range(values: Sequence[float] | np.ndarray) -> tuple[float, fl
 
 @dataclass(frozen=True, kw_only=True)
 class Spread:
-    """Values over the seeds of a cell, as the paper gives them."""
+    """Summary of values over the seeds of a cell, as in the paper."""
 
     iqm: float
     """Interquartile mean."""
@@ -61,7 +61,7 @@ class Spread:
 
 @dataclass(frozen=True, kw_only=True)
 class Effect:
-    """An estimate with what is known of its error."""
+    """An estimate with its standard error."""
 
     mean: float
     """Estimate."""
@@ -70,7 +70,7 @@ class Effect:
     df: float
     """Degrees of freedom of the standard error."""
     seeds: int
-    """Seeds it rests on: pairs, or the fewest of a cell."""
+    """Seeds it is based on: pairs, or the fewest of any cell."""
     paired: bool = True
     """Whether the cells were compared seed by seed."""
 
@@ -94,7 +94,7 @@ class Effect:
 
 @dataclass(frozen=True, kw_only=True)
 class Region:
-    """Where a claim says that an effect lies, open at its ends."""
+    """Open interval in which an effect is claimed to lie."""
 
     low: float = -math.inf
     """Lower end."""
@@ -102,20 +102,20 @@ class Region:
     """Upper end."""
 
     def __contains__(self, value: float) -> bool:
-        """Whether a value lies in it."""
+        """Return whether a value lies inside."""
         return self.low < value < self.high
 
     def p_inside(self, effect: Effect) -> float:
-        """Return the p-value of "the effect lies in it".
+        """Return the p-value of "the effect lies inside".
 
-        With two ends these are two one-sided tests (TOST): of equivalence.
+        With two ends this is an equivalence test by two one-sided tests (TOST).
         """
         ends = [effect.p_above(self.low)] if math.isfinite(self.low) else []
         ends += [effect.p_below(self.high)] if math.isfinite(self.high) else []
         return max(ends)
 
     def p_outside(self, effect: Effect) -> float:
-        """Return the p-value of "the effect lies beyond an end of it"."""
+        """Return the p-value of "the effect lies outside, beyond one of the ends"."""
         ends = [effect.p_below(self.low)] if math.isfinite(self.low) else []
         ends += [effect.p_above(self.high)] if math.isfinite(self.high) else []
         # Bonferroni over the ends.
@@ -136,9 +136,9 @@ def mean_effect(values: Sequence[float]) -> Effect:
 
 
 def contrast(weights: Mapping[str, float], table: Table) -> Effect | None:
-    """Return a weighted sum of cells, seed by seed where they share two or more.
+    """Return a weighted sum of cells, paired by seed if they share two or more seeds.
 
-    Cells that do not are compared by Welch's test for the sum of their means.
+    Otherwise it is a weighted sum of their means, with the error of Welch's test.
 
     Args:
         weights: Weight of each cell.
@@ -183,19 +183,19 @@ def holm(p_values: Sequence[float]) -> list[float]:
 def seeds_needed(
     effect: Effect, region: Region, alpha: float = ALPHA, sd: float = math.nan
 ) -> int | None:
-    """Return how many seeds decide a claim, if effect and spread are as observed.
+    """Return the number of seeds that decides a claim, with the effect as observed.
 
-    They decide for the side on which the effect lies, with a power of `POWER`; the
-    seeds are taken as paired.
+    The claim is decided in the direction of the observed effect, with a power of
+    `POWER`; seeds are assumed to be paired.
 
     Args:
         effect: The effect observed so far.
         region: The claim.
         alpha: Level of the test.
-        sd: Standard deviation between seeds, if one seed of the effect tells none.
+        sd: Standard deviation between seeds, used if that of the effect is unknown.
 
     Returns:
-        Number of seeds in all; None if the spread is unknown or no number is enough.
+        Total number of seeds; None if the spread is unknown or no number is enough.
     """
     if effect.error > 0:
         sd = effect.error * math.sqrt(effect.seeds)
@@ -204,14 +204,14 @@ def seeds_needed(
     bounds = [b for b in (region.low, region.high) if math.isfinite(b)]
     inside = effect.mean in region
     if not inside:
-        # The end that it lies beyond; Bonferroni over the ends.
+        # Only the end beyond which it lies; Bonferroni over the ends.
         alpha /= len(bounds)
         bounds = [min(bounds, key=lambda b: abs(effect.mean - b))]
     distances = [abs(effect.mean - b) / sd for b in bounds]
 
     def power(n: int) -> float:
         critical = float(stats.t.ppf(1 - alpha, n - 1))
-        # The power of a one-sided t test; of two, what both miss at most.
+        # The power of a one-sided t test; for two tests, a lower bound.
         missed = sum(
             float(stats.nct.cdf(critical, n - 1, d * math.sqrt(n))) for d in distances
         )
@@ -227,12 +227,12 @@ def seeds_needed(
 
 
 def separation(table: Table) -> float:
-    """Return how far a metric sets cells apart, relative to the spread of seeds.
+    """Return how well a metric separates cells, relative to the spread of seeds.
 
-    The standard deviation of the cells' true means (estimated: a part of what is seen
-    between cells is the seeds' spread) over that of the seeds of a cell, pooled. 1 says
-    that two cells differ about as much as two seeds. NaN if no cell has two seeds or
-    there are fewer than two cells.
+    This is the standard deviation of the cells' true means (estimated by subtracting
+    the part due to seeds) divided by that of the seeds of a cell, pooled. At 1, two
+    cells differ about as much as two seeds. NaN if no cell has two seeds or there are
+    fewer than two cells.
     """
     groups = [np.array(list(x.values())) for x in table.values() if len(x)]
     within = seed_sd(table) ** 2

@@ -1,13 +1,13 @@
-"""A study as a folder, from which alone anybody can tell how far it is.
+"""The folder of a study, which alone determines the state of all its runs.
 
-    manifest.json      what is run, see `egoskin.study.manifest`
-    runs/NAME/         a run folder, or a link to one made before
-    results/NAME/      of a finished run what is small, see `egoskin.study.stored`; its
-                       evaluation is written last, and marks the run as finished
-    claims/            who works on what, see `egoskin.study.claims`
-    logs/NAME.log      what the run's processes said
-    failed/NAME.json   how often it failed, and its last error
-    report/            what `egoskin.study.report` wrote
+    manifest.json      definition of the runs, see `egoskin.study.manifest`
+    runs/NAME/         a run folder, or a link to an existing one
+    results/NAME/      the small files of a finished run, see `egoskin.study.stored`;
+                       the evaluation is written last and marks the run as finished
+    claims/            locks of runs being worked on, see `egoskin.study.claims`
+    logs/NAME.log      output of the run's processes
+    failed/NAME.json   number of failures, and the last error
+    report/            output of `egoskin.study.report`
 
 Contract: ``manifest.json`` and ``results/`` are all that a report needs.
 """
@@ -40,36 +40,36 @@ from egoskin.study.manifest import EvaluationPlan, Manifest, PlannedRun
 from egoskin.study.stored import StoredRun, load_run, record, thin, to_json
 
 State = Literal["done", "running", "failed", "begun", "missing"]
-"""How far a run is; begun: nobody works on it, and it can be gone on with."""
+"""State of a run; begun: no process works on it, and it can be resumed."""
 
 START = "--- started"
-"""What a log begins with at each start."""
+"""Beginning of the line that each start adds to a log."""
 
-# Lines of metrics that are stored of a run, at most about this many.
+# Approximate maximum number of lines of metrics that are stored of a run.
 _LINES = 250
 _EVALUATION = "evaluation_*.json"
-# The end of a log in which its last line is looked for [bytes].
+# Size of the end of a log that is searched for its last line [bytes].
 _TAIL = 2**16
 
 
 @dataclass(frozen=True, kw_only=True)
 class Failure:
-    """What went wrong with a run."""
+    """Failures of a run."""
 
     tries: int
-    """How often it failed."""
+    """Number of failures."""
     error: str
     """Its last error."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunStatus:
-    """How far a run is."""
+    """Status of a run."""
 
     run: PlannedRun
     """The run."""
     state: State
-    """How far it is."""
+    """Its state."""
     frames: int = 0
     """Environment steps done."""
     per_s: float | None = None
@@ -92,11 +92,11 @@ class Result:
     """A finished run."""
 
     run: PlannedRun
-    """What was planned."""
+    """The planned run."""
     stored: StoredRun
-    """What is stored of it."""
+    """Its stored files."""
     policy_sha256: str
-    """Hash of the weights and of what else its policy holds."""
+    """Hash of its policy, see `policy_hash`."""
 
 
 class StudyFolder:
@@ -124,11 +124,11 @@ class StudyFolder:
         return self.path / "runs" / name
 
     def result_path(self, name: str) -> Path:
-        """Folder of what is stored of a run."""
+        """Folder of the stored files of a run."""
         return self.path / "results" / name
 
     def log_path(self, name: str) -> Path:
-        """What the processes of a run said."""
+        """Log of the processes of a run."""
         return self.path / "logs" / f"{name}.log"
 
     def _failure_path(self, name: str) -> Path:
@@ -138,15 +138,15 @@ class StudyFolder:
         """Return the manifest.
 
         Raises:
-            ValueError: If there is none.
+            ValueError: If it is missing or invalid.
         """
         return Manifest.load(self.manifest_path)
 
     def plan(self, manifest: Manifest) -> Manifest:
-        """Write a manifest, or add to the one that is there; return what holds now.
+        """Write a manifest or extend the existing one; return the result.
 
         Raises:
-            ValueError: If the one that is there is changed by it.
+            ValueError: If it would change the existing manifest.
         """
         if self.manifest_path.exists():
             before = self.manifest()
@@ -160,16 +160,16 @@ class StudyFolder:
     # --- a run ----------------------------------------------------------------------
 
     def open_run(self, planned: PlannedRun, cores: int = 1) -> Run:
-        """Return the run folder of a run, made now if there is none.
+        """Return the run folder of a run, created if missing.
 
-        Only who has claimed the run may call it.
+        Only a process that has claimed the run may call this.
 
         Args:
             planned: The run.
             cores: Its workers and learner threads.
 
         Raises:
-            ValueError: If the one that is there is that of another run.
+            ValueError: If the existing folder belongs to another run.
         """
         path, config = self.run_path(planned.name), planned.config
         if not path.exists():
@@ -178,7 +178,7 @@ class StudyFolder:
                     f"{path} is a link to {os.readlink(path)}, which is not there: put "
                     "it back, or remove the link to train the run anew"
                 )
-            # Under its name there is a whole one or none.
+            # Renamed when complete: no incomplete folder has the run's name.
             new = path.with_name(f".{planned.name}.new")
             shutil.rmtree(new, ignore_errors=True)
             Run.create(dataclasses.replace(config, run_dir=new))
@@ -208,41 +208,41 @@ class StudyFolder:
         return run
 
     def is_trained(self, planned: PlannedRun) -> bool:
-        """Return whether a run has been trained to its end, and its policy is there."""
+        """Return whether a run has been trained to its end, and its policy exists."""
         path = self.run_path(planned.name)
         run = Run(path, planned.config)
         if not run.policy_path(planned.end).is_file():
             return False
         if run.checkpoint_path.is_file():
-            # The policy is written before the checkpoint, too.
+            # The policy is written before the checkpoint: it does not prove the end.
             _, header = load_tensors(run.checkpoint_path)
             return header.get("frames", 0) >= planned.end
         return _last_row(path / "metrics.csv").get("frames") == planned.end
 
     def is_trained_elsewhere(self, name: str) -> bool:
-        """Return whether somebody else trains a run, such as ppo.py an adopted one."""
+        """Return whether another process trains a run, for example ppo.py."""
         return is_locked(self.run_path(name) / "lock")
 
     def is_running(self, name: str) -> bool:
-        """Return whether a process has a run: one of a study, or another."""
+        """Return whether any process works on a run, a job of the study or another."""
         return is_claimed(self.claims, name) or self.is_trained_elsewhere(name)
 
     def is_finished(self, name: str) -> bool:
-        """Return whether a run has been trained and judged."""
+        """Return whether a run has been trained and evaluated."""
         return any(self.result_path(name).glob(_EVALUATION))
 
     def finish(self, planned: PlannedRun, evaluation: Mapping[str, Any]) -> None:
-        """Store what is small of a trained run, and mark it as finished.
+        """Store the small files of a trained run, and mark it as finished.
 
         Args:
             planned: The run.
-            evaluation: What `judge` returned for its policy.
+            evaluation: Result of `judge` for its policy.
         """
         source, end = self.run_path(planned.name), planned.end
         run, folder = Run.open(source), self.result_path(planned.name)
         policy, made = run.policy_path(end), record(run, end)
         if made.command.startswith("python scripts/job.py"):
-            # It was begun by a study; where its folder was is of no interest.
+            # The run was started by a study; its folder's location is irrelevant.
             command = f"python -m egoskin.study.job FOLDER {planned.name}"
             made = dataclasses.replace(made, command=command)
         (folder / "policies").mkdir(parents=True, exist_ok=True)
@@ -270,7 +270,7 @@ class StudyFolder:
         """Return a finished run.
 
         Raises:
-            ValueError: If it is damaged, or not the run that was planned.
+            ValueError: If it is damaged, or not the planned run.
         """
         folder = self.result_path(planned.name)
         stored = load_run(folder)
@@ -295,14 +295,14 @@ class StudyFolder:
         """Return the finished runs, in the manifest's order.
 
         Raises:
-            ValueError: If one is damaged, or not the run that was planned.
+            ValueError: If one is damaged, or not the planned run.
         """
         return [self.result(run) for run in manifest.runs if self.is_finished(run.name)]
 
     # --- failures -------------------------------------------------------------------
 
     def failure(self, name: str) -> Failure | None:
-        """Return how a run failed, None if it has not."""
+        """Return the failures of a run, None if there are none."""
         try:
             content = read_json(self._failure_path(name))
         except FileNotFoundError:
@@ -310,7 +310,7 @@ class StudyFolder:
         return Failure(tries=content["tries"], error=content["error"])
 
     def note_failure(self, name: str, error: str) -> Failure:
-        """Count a failure of a run; return all there is to say of it."""
+        """Add a failure of a run; return its failures."""
         before = self.failure(name)
         failure = Failure(tries=(before.tries if before else 0) + 1, error=error)
         path = self._failure_path(name)
@@ -319,13 +319,13 @@ class StudyFolder:
         return failure
 
     def forget_failures(self) -> None:
-        """Let runs that failed too often be tried again."""
+        """Delete all failures, so that runs that failed too often are tried again."""
         for path in (self.path / "failed").glob("*.json"):
-            # A run that finishes forgets its own.
+            # A run that finishes meanwhile deletes its own.
             path.unlink(missing_ok=True)
 
     def last_words(self, name: str) -> str:
-        """Return the last line that a run's last process said, its error first."""
+        """Return the last error of a run's latest process, or else its last line."""
         with suppress(FileNotFoundError), open(self.log_path(name), "rb") as file:
             file.seek(max(0, file.seek(0, os.SEEK_END) - _TAIL))
             text = file.read().decode(errors="replace").rpartition(START)[2]
@@ -337,7 +337,7 @@ class StudyFolder:
     # --- how far it is --------------------------------------------------------------
 
     def status(self, manifest: Manifest) -> list[RunStatus]:
-        """Return how far each run is, in the manifest's order."""
+        """Return the status of each run, in the manifest's order."""
         return [self._status(run) for run in manifest.runs]
 
     def _status(self, run: PlannedRun) -> RunStatus:
@@ -365,11 +365,11 @@ class StudyFolder:
         )
 
     def adopt(self, manifest: Manifest, source: Path) -> PlannedRun:
-        """Link to a run that was made before; return which of the study's it is.
+        """Link to an existing run; return the planned run that it matches.
 
         Raises:
-            ValueError: If it is none of the study's; the text names what differs from
-                the closest.
+            ValueError: If it matches no run of the study; the text names the
+                differences to the closest.
         """
         config = Run.open(source).config
         differs = {run: run.differences(config) for run in manifest.runs}
@@ -397,11 +397,11 @@ def judge(
     plan: EvaluationPlan,
     on_step: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
-    """Return the figures of a policy on a study's throw set, as JSON values.
+    """Evaluate a policy on a study's throw set; return the results as JSON values.
 
     Args:
         policy: The policy.
-        plan: The throw set.
+        plan: The throw set and how to evaluate on it.
         on_step: Called with (steps done, episodes still running).
     """
     config = standard_task(policy.env_config, plan.standard)
@@ -436,15 +436,15 @@ def judge_run(
     plan: EvaluationPlan,
     on_step: Callable[[int, int], None] | None = None,
 ) -> None:
-    """Judge the policy of a trained run, and mark the run as finished."""
+    """Evaluate the policy of a trained run, and mark the run as finished."""
     run = Run(folder.run_path(planned.name), planned.config)
     policy = load_policy(run.policy_path(planned.end))
     folder.finish(planned, judge(policy, plan, on_step))
 
 
 def policy_hash(path: Path) -> str:
-    """Return the hash of what a policy computes with, whoever wrote its file."""
-    # Who asks compares it with another.
+    """Return a hash of a policy's weights, skin, sizes and frames, not of its file."""
+    # No note about a missing seal: callers compare the hash.
     tensors, header = load_tensors(path, quiet=True)
     spec = header["policy"]
     kept = {k: spec[k] for k in ("skin", "sizes", "num_actions", "frames")}
@@ -452,7 +452,7 @@ def policy_hash(path: Path) -> str:
 
 
 def _last_row(path: Path) -> dict[str, float]:
-    """Return the last whole line of a log of metrics, nothing if there is none."""
+    """Return the last complete line of a metrics file, empty if there is none."""
     try:
         with open(path, "rb") as file:
             columns = file.readline().decode().strip().split(",")

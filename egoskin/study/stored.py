@@ -1,11 +1,11 @@
-"""What is stored of a finished run: how it was made, its curve, its evaluation.
+"""Stored files of a finished run: its record, learning curve and evaluation.
 
 config.json                     the resolved configuration
 skin.json                       its skin
 run.json                        a `Record`: how it was made
-metrics.csv                     thinned, see `thin`
+metrics.csv                     its metrics, thinned by `thin`
 policies/FRAMES.safetensors     the policy
-evaluation_FRAMES.json          its figures on the throw set of the study
+evaluation_FRAMES.json          its results on the throw set of the study
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ class Record:
     command: str
     """The command that started it."""
     commit: str
-    """Commits of its starts, abbreviated; "+" where the tree was changed."""
+    """Abbreviated commits of its starts; "+" if the working tree had changes."""
     seed: int
     """Its seed."""
     frames: int
     """Environment steps of the stored policy."""
     wall_s: float
-    """Time that collecting and learning took up to there [s]."""
+    """Wall time of collecting and learning up to there [s]."""
     machine: str
     """Machines it ran on."""
 
@@ -57,18 +57,17 @@ class StoredRun:
     record: Record
     """How it was made."""
     frames: np.ndarray
-    """Environment steps of the learning curve, ``[n]``, rising."""
+    """Environment steps of the learning curve, ``[n]``, increasing."""
     success: np.ndarray
     """Share of episodes that last 3 s, estimated in training, ``[n]``."""
     evaluation: dict[str, Any]
-    """Figures of its policy."""
+    """Evaluation of its policy."""
 
 
 def thin(text: str, every: int) -> str:
     """Return a run's metrics with fewer lines and digits.
 
-    Kept are the first line at or past each multiple of some environment steps and the
-    last one.
+    Keeps the first line at or after each multiple of ``every``, and the last line.
 
     Args:
         text: Content of a ``metrics.csv``.
@@ -103,7 +102,7 @@ def record(run: Run, frames: int) -> Record:
         frames: Environment steps of the policy that is stored.
 
     Raises:
-        ValueError: If the folder does not say.
+        ValueError: If the run has not been started.
     """
     starts = run.starts()
     if not starts:
@@ -111,7 +110,7 @@ def record(run: Run, frames: int) -> Record:
     lines = csv.DictReader(io.StringIO(run.metrics()))
     rows = [row for row in lines if int(row["frames"]) <= frames]
     script, *args = starts[0]["command"]
-    # Where a run's folder was is of no interest anywhere else.
+    # The location of the run folder is irrelevant elsewhere.
     args = _without(args, "--run-dir")
     commits = [
         "unknown"
@@ -124,7 +123,7 @@ def record(run: Run, frames: int) -> Record:
         f"torch {start['packages']['torch']}, mujoco {start['packages']['mujoco']}"
         for start in starts
     ]
-    # A script's path, or "egoskin train".
+    # Either a script's path or "egoskin train".
     called = f"python scripts/{Path(script).name}" if script.endswith(".py") else script
     return Record(
         command=" ".join([called, *args]),
@@ -154,7 +153,7 @@ def load_run(path: Path) -> StoredRun:
     """Return the run stored in a folder.
 
     Raises:
-        ValueError: If it is not whole.
+        ValueError: If it is incomplete.
     """
     what = path / "run.json"
     evaluations = sorted(path.glob("evaluation_*.json"))
@@ -168,11 +167,11 @@ def load_run(path: Path) -> StoredRun:
     curve = np.array(
         [(float(r["frames"]), float(r["episode/success"])) for r in rows]
     ).reshape(-1, 2)
-    # No estimate before an episode could have lasted so long.
+    # There is no estimate before an episode can have lasted that long.
     curve = curve[np.isfinite(curve[:, 1])]
     evaluation, _ = read_sealed(evaluations[-1])
     return StoredRun(
-        # Stored runs are under version control, with a seal or without.
+        # No note about a missing seal: stored runs are under version control.
         config=load_config(path, quiet=True),
         record=from_plain(Record, read_json(what), str(what)),
         frames=curve[:, 0],

@@ -1,4 +1,4 @@
-"""Measure how fast and how exact the parts of the project are.
+"""Measure the speed and accuracy of parts of the project.
 
 egoskin bench loop --json loop.json
 egoskin bench sensors

@@ -1,4 +1,4 @@
-"""How far the default physics rate is from a finer one: standing, forces, impacts."""
+"""Differences of the default physics rate to a finer one: standing, forces, impacts."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from egoskin.envs.throws import Release, ThrowConfig, Thrower
 from egoskin.make import EnvConfig
 from egoskin.robots.config import RobotConfig
 
-# A zero action does not stand for ever: it is compared for as long as it does [s].
+# Duration of standing that is compared [s]; with zero action the robot falls later.
 _STAND = 0.5
-# After this an impact is over, and what it did to the robot shows [s].
+# Time after which an impact is over and its effect on the robot is visible [s].
 _AFTER = 0.1
 _LONGEST_FLIGHT = 2.0
 
@@ -29,7 +29,7 @@ class AccuracyBench:
     """Differences between the default physics rate and a finer one."""
 
     finer: int = 4
-    """How many times finer the steps compared with are."""
+    """Factor by which the steps of the finer rate are smaller."""
     throws: int = 200
     """Balls thrown at the robot, one for each impact."""
     seed: int = 0
@@ -40,17 +40,17 @@ class AccuracyBench:
     """File to write the rows to."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for counts that compare nothing."""
+        """Raise ValueError for invalid values."""
         if self.finer < 2 or self.throws < 1:
             raise ValueError("finer must be at least 2 and throws at least 1")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Stand:
-    """Half a second in the default pose."""
+    """Result of standing for half a second in the default pose."""
 
     qpos: np.ndarray
-    """Where the robot ends, base and joints, ``[7 + J]``."""
+    """Final positions of base and joints, ``[7 + J]``."""
     force: float
     """Mean vertical force of the floor on the robot [N]."""
 
@@ -64,9 +64,9 @@ class _Impact:
     link: int
     """Body hit first, -1 without contact."""
     impulse: float
-    """Change of the ball's momentum until a moment after [N s]."""
+    """Change of the ball's momentum from contact until `_AFTER` later [N s]."""
     base: np.ndarray
-    """Change of the base's velocity until a moment after contact [m/s], ``[3]``."""
+    """Change of the base's velocity in the same time [m/s], ``[3]``."""
 
 
 class _Simulation:
@@ -133,7 +133,7 @@ class _Simulation:
             nothing = np.full(3, np.nan)
             return _Impact(time=np.nan, link=-1, impulse=np.nan, base=nothing)
         change = OBJECT_MASS * self.data.qvel[-3:] - momentum
-        # Gravity's share of the time since.
+        # Remove the effect of gravity since the contact.
         change[2] += OBJECT_MASS * self._gravity * _AFTER
         return _Impact(
             time=met,
@@ -151,7 +151,7 @@ class _Simulation:
 
 
 def _throws(config: AccuracyBench, robot: RobotConfig) -> Release:
-    """Standard throws at the default pose."""
+    """Return standard throws at the robot in its default pose."""
     thrower = Thrower(ThrowConfig(), robot, config.physics.timestep)
     rows = torch.arange(config.throws)
     draw = thrower.draw(config.seed, rows, rows * 0, rows * 0)

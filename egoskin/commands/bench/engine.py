@@ -1,4 +1,4 @@
-"""How fast engine warp is with more and more worlds, and what memory they take."""
+"""Speed and memory of engine warp against the number of worlds."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ from egoskin.runs.trainer import make_training_env
 class EngineBench:
     """Environment steps/s of engine warp against the number of worlds.
 
-    Of physics alone; with throws, sensors and what networks read of them, for the field
-    and the full ray grid; and with learning. Memory is that of the device, or on the
-    CPU that of the process.
+    The layers are physics alone; with throws, sensors and the encoding of observations,
+    for the field and the full ray grid; and with learning. Memory is that of the
+    device or, on the CPU, of the process.
     """
 
     device: str = "cpu"
@@ -47,14 +47,14 @@ class EngineBench:
     """File to write the rows to."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for what cannot be measured here."""
+        """Raise ValueError for values that cannot be measured on this machine."""
         check_bounds(self)
         device_of(self.device)
         engine_of("warp")
 
 
 def engine_rows(config: EngineBench) -> list[Row]:
-    """Return the rows of the engine benchmark; ratios are to the worlds' physics."""
+    """Return the rows of the engine benchmark; ratios are to physics alone."""
     return [row for worlds in config.worlds for row in _rows(config, worlds)]
 
 
@@ -65,7 +65,7 @@ def _rows(config: EngineBench, worlds: int) -> list[Row]:
 
     def measure(coverage: str) -> Row:
         layers = _layers(coverage, worlds, config.device)
-        # A rollout of each first: kernels compile, and robots are no longer at rest.
+        # Warm up by a rollout of each: kernels compile, and robots leave their rest.
         for work in layers.values():
             work()
         for _ in range(config.rounds):
@@ -82,7 +82,7 @@ def _rows(config: EngineBench, worlds: int) -> list[Row]:
     memory = []
     for coverage in ("field", "ray"):
         memory.append(measure(coverage))
-        # What it took is free before the next takes its own.
+        # Free its memory before the next measurement.
         gc.collect()
         if device.type == "cuda":
             torch.cuda.empty_cache()
@@ -101,7 +101,7 @@ def _rows(config: EngineBench, worlds: int) -> list[Row]:
 
 
 def _layers(coverage: str, worlds: int, device: str) -> dict[str, Callable[[], None]]:
-    """Return what is measured, a rollout of each, by name."""
+    """Return the functions to measure by name; each runs a rollout."""
     sensor = dataclasses.replace(EnvConfig().sensor, coverage=coverage)
     config = TrainConfig(
         env=EnvConfig(sensor=sensor), engine="warp", device=device, num_envs=worlds

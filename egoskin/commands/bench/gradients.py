@@ -1,4 +1,4 @@
-"""How much of an update is signal: gradients of rollouts of one policy, compared."""
+"""Signal in an update: agreement of the gradients of rollouts of one policy."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from egoskin.runs.trainer import open_trainer
 
 @dataclass(frozen=True, kw_only=True)
 class GradientBench:
-    """The actor's gradients of several rollouts of a run's policy, compared."""
+    """Compare the actor's gradients of several rollouts of a run's policy."""
 
     run: Path
-    """Run folder; a copy of it goes on from its checkpoint, without learning."""
+    """Run folder; a copy of it is resumed from its checkpoint, without learning."""
     rollouts: int = 8
     """Rollouts to compare."""
     lambdas: tuple[float, ...] = (0.0, 0.5, 0.8, 0.9, 0.95, 1.0)
-    """Decays of the advantage estimate, after the run's own."""
+    """Decays of the advantage estimate (GAE lambda), in addition to the run's own."""
     json: Path | None = None
     """File to write the rows to."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for counts that compare nothing."""
+        """Raise ValueError for invalid values."""
         if self.rollouts < 3:
             raise ValueError(f"rollouts must be at least 3, got {self.rollouts}")
         if not all(0 <= decay <= 1 for decay in self.lambdas):
@@ -43,9 +43,10 @@ class GradientBench:
 def gradient_rows(config: GradientBench) -> list[Row]:
     """Return the agreement for each decay.
 
-    The value is the mean cosine between the gradients of two rollouts: that between one
-    of them and the true gradient is its square root. The ratio is that of the cosines
-    with the gradient at lambda 1 of all other rollouts, which has the least bias.
+    The value is the mean cosine between the gradients of two rollouts; its square root
+    is the cosine between one of them and the true gradient. The ratio, to the run's own
+    decay, is that of the cosines with the gradient at lambda 1 of all other rollouts,
+    which has the least bias.
     """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "run"
@@ -72,7 +73,7 @@ def gradient_rows(config: GradientBench) -> list[Row]:
 
 
 def agreement(gradients: Tensor) -> float:
-    """Return the mean cosine between two of several gradients, ``[n, P]``."""
+    """Return the mean cosine between pairs of gradients, ``[n, P]``."""
     unit = torch.nn.functional.normalize(gradients, dim=1)
     n = len(unit)
     return float(((unit @ unit.t()).sum() - n) / (n * (n - 1)))

@@ -1,4 +1,4 @@
-"""What Gymnasium's forms of the environment cost."""
+"""Speed of the environment's Gymnasium interfaces."""
 
 from __future__ import annotations
 
@@ -21,30 +21,30 @@ from egoskin.make import EnvConfig, check_num_workers, make_env
 
 @dataclass(frozen=True, kw_only=True)
 class GymnasiumBench:
-    """Environment steps/s of Gymnasium's forms, beside our own TorchRL environment.
+    """Environment steps/s of the Gymnasium interfaces and the TorchRL environment.
 
-    Robots do nothing, fall, and begin anew; nobody learns.
+    Robots get zero actions, fall and are reset; nothing is trained.
     """
 
     num_envs: int = 1024
-    """Robots of the vector form and of our own."""
+    """Robots of the vector interface and of the TorchRL environment."""
     num_workers: int | None = None
     """Processes; None: the largest divisor of num_envs <= cores."""
     steps: Annotated[int, COUNT] = 64
     """Control steps in each measurement."""
     rounds: Annotated[int, COUNT] = 5
-    """How often each form is measured, in turn."""
+    """How often each interface is measured, in turn."""
     json: Path | None = None
     """File to write the rows to."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for values that cannot be measured."""
+        """Raise ValueError for invalid values."""
         check_bounds(self)
         check_num_workers(self.num_envs, self.num_workers)
 
 
 def gymnasium_rows(config: GymnasiumBench) -> list[Row]:
-    """Return the rows of the Gymnasium benchmark; ratios are to our own environment."""
+    """Return the rows of the Gymnasium benchmark; ratios are to the TorchRL row."""
     number = config.num_envs
     own = make_env(EnvConfig(), num_envs=number, seed=0, num_workers=config.num_workers)
     vector = gymnasium.make_vec(ENV_ID, number, num_workers=config.num_workers)

@@ -41,8 +41,9 @@ class LoopConfig:
 
     Every layer starts from the same recorded state of a training and replays its
     actions (raw also its throws and resets). Ratios to raw are medians over pairs
-    measured in turn, so that a busy machine does not bend them. What a layer adds to
-    the one before is told as wall time and as CPU time of all processes.
+    measured in turn, so that other load on the machine does not bias them. The time
+    that a layer adds to the previous one is given as wall time and as CPU time of all
+    processes.
     """
 
     num_envs: int = 4096
@@ -63,24 +64,24 @@ class LoopConfig:
     """File to write the rows to."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for values that cannot be measured."""
+        """Raise ValueError for invalid values."""
         if self.rounds < 1 or self.warmup < 0:
             raise ValueError("rounds must be at least 1 and warmup at least 0")
         check_num_workers(self.num_envs, self.num_workers)
 
 
 class Recording(MujocoPhysics):
-    """Physics that writes down what is asked of it, to do it again bare."""
+    """Physics that records its method calls, to replay them with raw MuJoCo steps."""
 
     written: list[tuple[str, tuple]]
 
     def set_target(self, target: Tensor) -> None:
-        """Set the targets, and write it down."""
+        """Set the targets, and record the call."""
         self.written.append(("set_target", (target,)))
         super().set_target(target)
 
     def park(self, objects: Tensor) -> None:
-        """Park objects; write down those that were in play."""
+        """Park objects; record those that were not parked before."""
         fresh = objects & ~self._parked
         self._parked = objects.clone()
         if fresh.any():
@@ -88,29 +89,29 @@ class Recording(MujocoPhysics):
         super().park(objects)
 
     def reset(self, rows: Tensor, base_pose: Tensor, joint_pos: Tensor) -> None:
-        """Reset rows, and write it down."""
+        """Reset rows, and record the call."""
         self.written.append(("reset", (rows, base_pose, joint_pos)))
         super().reset(rows, base_pose, joint_pos)
 
     def throw(
         self, rows: Tensor, objects: Tensor, position: Tensor, velocity: Tensor
     ) -> None:
-        """Throw, and write it down."""
+        """Throw, and record the call."""
         self.written.append(("throw", (rows, objects, position, velocity)))
         super().throw(rows, objects, position, velocity)
 
     def forget(self) -> None:
-        """Write down from here on."""
+        """Delete the recorded calls."""
         self.written = []
         self._parked = torch.zeros(self.num_envs, self.num_objects, dtype=torch.bool)
 
 
 Layer = tuple[Callable[[], Any], Callable[[Any], object]]
-"""What makes a layer ready, and what is timed."""
+"""Function that prepares a layer, and function that is timed."""
 
 
 def replay_raw(physics: MujocoPhysics, written: list[tuple[str, tuple]]) -> None:
-    """Do again what was written down, with nothing but MuJoCo's steps."""
+    """Replay recorded calls with only MuJoCo's steps."""
     for method, args in written:
         getattr(MujocoPhysics, method)(physics, *args)
         if method == "set_target":
@@ -118,7 +119,7 @@ def replay_raw(physics: MujocoPhysics, written: list[tuple[str, tuple]]) -> None
 
 
 def loop(config: LoopConfig) -> list[Row]:
-    """Return the rows of the loop benchmark, of the field and of the ray grid."""
+    """Return the rows of the loop benchmark, for the field and the ray grid."""
     check_num_workers(config.num_envs, config.num_workers)
     rows = []
     for coverage in ("field", "ray"):
@@ -139,7 +140,7 @@ class _Loop:
         self._steps = config.ppo.rollout_steps
 
     def rows(self) -> list[Row]:
-        """Measure; return what is known of this training."""
+        """Measure the layers; return their rows."""
         pool = self._pool = self._make_pool()
         pools = [pool]
         try:
@@ -175,7 +176,7 @@ class _Loop:
         )
 
     def _train_and_record(self) -> Row:
-        """Train for a while, note a rollout to do again; return the memory it took."""
+        """Train for a while and record a rollout to replay; return the peak memory."""
         config, env = self.config, self._pool
         torch.manual_seed(config.seed)
         network, sources = config.ppo.network, self._sources
@@ -216,9 +217,9 @@ class _Loop:
         self._ppo.update(collect(self._pool, self._agent, root, self._steps)[0])
 
     def _serial(self) -> Row:
-        """Return what no other thread or process can do meanwhile, however many.
+        """Return the serial time, which more threads or processes cannot reduce.
 
-        That is the CPU time of this process's first thread. The ratio is to the CPU
+        This is the CPU time of this process's first thread. The ratio is to the CPU
         time of all workers.
         """
         pool, serial, ratios = self._pool, [], []
@@ -240,7 +241,7 @@ class _Loop:
         )
 
     def _normalise(self, _: None) -> None:
-        """Take a rollout into the normalisers, as an update does, and back out."""
+        """Update the normalisers with a rollout, as in training, and restore them."""
         norms = self._agent.norms
         before = {k: v.clone() for k, v in norms.state_dict().items()}
         for key, norm in norms.items():
@@ -263,7 +264,7 @@ class _Loop:
         return env
 
     def _raw(self) -> Layer:
-        """MuJoCo's steps alone, in this process."""
+        """Return the layer of MuJoCo's steps alone, in this process."""
         env, simulation = self._recorder(), part("simulation", self._start)
         physics = env.physics
         assert isinstance(physics, Recording)
@@ -291,7 +292,7 @@ class _Loop:
         return restore, self._replay(env)
 
     def _time(self, layers: dict[str, Layer]) -> list[Row]:
-        """Time the layers in turn; return their speeds and what each adds."""
+        """Time the layers in turn; return their speeds and the time that each adds."""
         frames = self._steps * self.config.num_envs
         wall: dict[str, list[float]] = {name: [] for name in layers}
         cpu: dict[str, list[float]] = {name: [] for name in layers}
@@ -323,18 +324,18 @@ class _Loop:
 
 
 def _processes() -> list[psutil.Process]:
-    """This process and all that it started."""
+    """Return this process and all its descendants."""
     return [psutil.Process(), *psutil.Process().children(recursive=True)]
 
 
 def _cpu_time(processes: list[psutil.Process]) -> float:
-    """CPU time of processes so far [s]."""
+    """Return the CPU time of processes so far [s]."""
     times = [process.cpu_times() for process in processes]
     return sum(t.user + t.system for t in times)
 
 
 def _pss(process: psutil.Process) -> int:
-    """Proportional set size of a process, 0 if it has ended meanwhile."""
+    """Return the proportional set size of a process, 0 if it has ended."""
     try:
         return process.memory_full_info().pss
     except psutil.NoSuchProcess:
@@ -342,7 +343,7 @@ def _pss(process: psutil.Process) -> int:
 
 
 def _parts(times: dict[str, list[float]], kind: str) -> list[Row]:
-    """What each layer adds to the one before, as shares of physics [us]."""
+    """Return the time that each layer adds to the previous one [us]."""
     median = {name: statistics.median(values) for name, values in times.items()}
     loss = median["train_field"] - median["policy"] - median["normalisation"]
     parts = {
@@ -366,7 +367,7 @@ def _parts(times: dict[str, list[float]], kind: str) -> list[Row]:
 
 
 class PeakMemory:
-    """Largest proportional set size of all processes while it is open."""
+    """Measures the peak proportional set size of all processes while it is open."""
 
     def __init__(self) -> None:
         self.peak = 0

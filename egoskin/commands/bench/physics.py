@@ -1,4 +1,4 @@
-"""What the choices of the robot model cost in raw physics."""
+"""Cost of modelling choices of the robot in raw physics."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from egoskin.make import EnvConfig
 
 @dataclass(frozen=True, kw_only=True)
 class PhysicsBench:
-    """What the choices of the model cost: environment steps/s of raw physics.
+    """Cost of modelling choices, as environment steps/s of raw physics.
 
     One thread, CPU time. "stand" holds the default pose, "flail" draws new targets
     (standard deviation 0.4 rad) in every control step and falls.
@@ -38,7 +38,7 @@ class PhysicsBench:
     """File to write the rows to."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for values that cannot be measured."""
+        """Raise ValueError for invalid values."""
         check_bounds(self)
 
 
@@ -57,7 +57,7 @@ def physics_rows(config: PhysicsBench) -> list[Row]:
         )
         model = build_scene(scene)
         if name == "no_self_collision":
-            # All bits but those of balls and floor.
+            # Keep only the bits of balls and floor.
             model.geom_contype[:] &= 3
             model.geom_conaffinity[:] &= 3
         if name == "frictionloss":

@@ -1,4 +1,4 @@
-"""Rows of figures, on the screen and as JSON."""
+"""Benchmark results in rows, printed and as JSON."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def show(text: str) -> None:
 
 
 def report(rows: list[Row], path: Path | None) -> None:
-    """Print the rows, and write them as JSON where asked."""
+    """Print the rows, and write them as JSON if a path is given."""
     for row in rows:
         number = f"{row.value:,.0f}" if row.value >= 1000 else f"{row.value:.3g}"
         print(f"{row.name:<36} {number:>10} {row.unit}  ratio {row.ratio:.3f}")

@@ -1,4 +1,4 @@
-"""Time of the sensor kernels against writing their results' bytes."""
+"""Time of the sensor kernels, compared with writing as many bytes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from egoskin.robots.config import H1_2
 from egoskin.sensors import FieldSensor, Proximity, RaySensor, Skin
 from egoskin.shapes import Sphere
 
-# States are taken this often along the rollout [control steps]: balls are in flight.
+# Interval between recorded states of the rollout [control steps]; balls are in flight.
 _STRIDE = 8
 # Balls of the close set are within this of a sensor [m].
 _CLOSE = 0.5
@@ -31,9 +31,9 @@ _RANGE = 2.0
 class SensorBench:
     """Time of the sensor kernels, on one thread, from joint positions to result.
 
-    Poses and balls come from a rollout of the default task under random actions; the
-    rows "close" have every ball within 0.5 m of a sensor. The ratio is to writing as
-    many bytes as the row's result into a buffer that exists, measured in turn.
+    Poses and balls come from a rollout of the default task under random actions; in the
+    rows "close", every ball is within 0.5 m of a sensor. The ratio is to writing as
+    many bytes as the row's result into an existing buffer, measured in turn.
     """
 
     num_envs: Annotated[int, COUNT] = 4096
@@ -48,7 +48,7 @@ class SensorBench:
     """File to write the rows to."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for values that cannot be measured."""
+        """Raise ValueError for invalid values."""
         check_bounds(self)
 
 
@@ -57,7 +57,7 @@ State = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
 def _rollout(config: SensorBench, skin: Skin) -> list[State]:
-    """States of the default task under random actions."""
+    """Return states of the default task under random actions."""
     env = make_worker_env(
         EnvConfig(), skin, num_envs=config.num_envs, seed=config.seed, keep_raw=True
     )
@@ -76,7 +76,7 @@ def _rollout(config: SensorBench, skin: Skin) -> list[State]:
 
 
 def _with_two_balls(state: State) -> State:
-    """The first ball, and beside it the first ball of the next row."""
+    """Return the state with two balls: its first, and that of a neighbouring row."""
     base, joints, objects, active = state
     first = objects[:, 0]
     second = first.roll(1, 0)
@@ -86,7 +86,7 @@ def _with_two_balls(state: State) -> State:
 
 
 def _close(state: State, sensor: FieldSensor, seed: int) -> State:
-    """The same with every ball within 0.5 m of a sensor, straight out from it."""
+    """Return the state with two balls, each within 0.5 m of a sensor on its z-axis."""
     base, joints, objects, active = _with_two_balls(state)
     generator = torch.Generator().manual_seed(seed)
     batch, balls = active.shape
@@ -96,7 +96,7 @@ def _close(state: State, sensor: FieldSensor, seed: int) -> State:
     gap = _CLOSE * torch.rand(batch, balls, 1, generator=generator) + Sphere().radius
     away_b = position[rows, pick] + gap * rotation[rows, pick, :, 2]
     objects = objects.clone()
-    # The base's own turn is left out: balls and body are turned alike.
+    # The rotation of the base is left out, as it turns balls and body alike.
     base = torch.cat((base[:, :3], torch.tensor([1.0, 0, 0, 0]).expand(batch, 4)), -1)
     objects[..., :3] = base[:, None, :3] + away_b
     return base, joints, objects, torch.ones_like(active)
@@ -108,7 +108,7 @@ def _one_ball(state: State) -> State:
 
 
 def _reference(sensor: FieldSensor, skin: Skin) -> Callable[[Tensor], Any]:
-    """The pytorch-kinematics calls that give the same frames."""
+    """Return a function that computes the same frames by pytorch-kinematics."""
     chain = H1_2.chain.to(dtype=torch.float32)
     links = list(dict.fromkeys(skin.links))
     offsets = torch.eye(4).repeat(len(skin), 1, 1)
@@ -149,7 +149,7 @@ def _measure(config: SensorBench) -> list[Row]:
     poses = torch.empty(n, len(skin), 3), torch.empty(n, len(skin), 3, 3)
     frames_bytes, field_bytes = n * len(skin) * 48, n * len(skin) * 24
     grid_bytes = grid.numel() * 4
-    # Row: result's bytes, states, and what is timed.
+    # By row: bytes of the result, states, and the function that is timed.
     jobs: dict[str, tuple[int, list[State], Callable[..., Any]]] = {}
     proximity = Proximity(_RANGE)
 
@@ -196,7 +196,7 @@ def _row(
     run: Callable[[State], Any],
     rounds: int,
 ) -> Row:
-    """Time a job and, in turn with it, the writing of as many bytes."""
+    """Time a job, alternating with writing as many bytes."""
     show(name)
     buffer = torch.empty(size // 4)
     for state in states:
