@@ -1,13 +1,14 @@
-// The sensor kernels for balls and a transparent robot: what geometry.py, field.py and
-// ray.py compute, fused, row block by row block, so that all but the result stays in
-// the cache. kernels.py builds and calls this; the PyTorch code is the reference.
+// Sensor kernels for balls and a transparent robot. They fuse the computations of
+// geometry.py, field.py and ray.py over blocks of rows, so that intermediate results
+// stay in the cache. kernels.py builds and calls them; the PyTorch code is the
+// reference.
 //
-// Contract: every number has the bits that the PyTorch code gives it (but for the sign
-// of a zero). So the order of sums is that of the Python code, and nothing may be
+// Contract: every number is bit-identical to that of the PyTorch code (except for the
+// sign of zero). Sums are therefore in the order of the Python code, and nothing may be
 // contracted or reassociated: compile with -ffp-contract=off, never with -ffast-math.
 //
-// Only float32 and float64 kernels of plain C linkage are exported; all pointers are
-// to contiguous arrays unless a stride is given.
+// Only float32 and float64 kernels with C linkage are exported; all pointers are to
+// contiguous arrays unless a stride is given.
 
 #include <algorithm>
 #include <cmath>
@@ -23,34 +24,34 @@
 
 extern "C" {
 
-// What does not change from call to call. Numbers behind `const void*` are of the
-// kernel's type; matrices are row-major.
+// Data that is constant over calls. `const void*` points to numbers of the kernel's
+// type; matrices are row-major.
 struct Tables {
   int64_t joints, steps, links, sensors, objects;
-  int64_t beams;               // of each sensor; 0 for a field
-  int64_t cull, reduce, apart; // flags: skip what cannot hit, minimum, per object
+  int64_t beams;               // per sensor; 0 for a field
+  int64_t cull, reduce, apart; // flags: skip pairs that cannot hit, minimum, per object
   const int64_t *joint;        // of each step; -1: none               [steps]
-  const int64_t *parent;       // frame that a step starts from        [steps]
+  const int64_t *parent;       // frame in which a step starts         [steps]
   const int64_t *frame;        // of each link; 0 is the base          [links]
   const int64_t *link;         // of each sensor                       [sensors]
   const void *constant, *by_cos, *by_sin; // rotation of a step        [steps, 3, 3]
   const void *shift, *slide;   // its translation                      [steps, 3]
   const void *offset;          // of the sensor in its link            [sensors, 3]
-  const void *axes;            // of the sensor frame, one a row       [sensors, 3, 3]
+  const void *axes;            // of the sensor frame, as rows         [sensors, 3, 3]
   const void *range;           //                                      [sensors]
   const void *radius, *squared, *bound; // of each object              [objects]
-  const void *farthest;        // from the base that it is in range    [objects]
+  const void *farthest;        // largest distance from base in range  [objects]
   // Field.
-  const void *cos_half;        // null: every sensor sees all around   [sensors]
+  const void *cos_half;        // null: all are omnidirectional        [sensors]
   // Ray.
-  const void *reach;           // farthest that a beam may hit         [sensors]
+  const void *reach;           // largest distance of a hit            [sensors]
   const void *pyramid;         // cosines, then sines of the half angles [sensors, 4]
   const void *directions;      // of each kind of grid          [grids, 3, beams]
   const int64_t *grid;         // of each sensor                       [sensors]
-  const uint8_t *depth;        // null: all measure along the beam     [sensors]
+  const uint8_t *depth;        // null: distances along the beam       [sensors]
 };
 
-// Rows of base pose, joint positions, object poses and active flags, and how far apart.
+// Rows of base pose, joint positions, object poses and active flags, and their strides.
 struct Inputs {
   int64_t rows;
   const void *data[4];
@@ -60,7 +61,7 @@ struct Inputs {
 
 namespace {
 
-// Rows of a block: one vector of them is one AVX-512 register of float32.
+// Rows per block: one float32 for each fills an AVX-512 register.
 constexpr int W = 16;
 
 template <class T> struct Vector;
@@ -97,8 +98,8 @@ template <class T> Bytes bytes(Mask<T> mask) {
   return __builtin_convertvector(mask, Bytes);
 }
 
-// A bit for each lane: of eight bytes that are -1 or 0, a product gathers the bits.
-// Byte 0 is the lowest (little-endian).
+// One bit per lane. A product gathers the bits of eight bytes that are -1 or 0; byte 0
+// is the lowest (little-endian).
 uint32_t bits(Bytes mask) {
   uint64_t halves[2];
   std::memcpy(halves, &mask, W);
@@ -113,7 +114,7 @@ bool any(Bytes mask) {
   return halves[0] | halves[1];
 }
 
-// The lesser; NaN if one is.
+// Minimum; NaN if either is NaN.
 template <class T> V<T> least(V<T> a, V<T> b) {
   V<T> low = b < a ? b : a;
   return b != b ? b : low;
@@ -121,7 +122,7 @@ template <class T> V<T> least(V<T> a, V<T> b) {
 
 template <class T> T lesser(T a, T b) { return b < a || b != b ? b : a; }
 
-// The least of lanes of which none is NaN, without a branch.
+// Minimum over lanes, none of which may be NaN, without branches.
 template <class T> T least_of(V<T> x) {
   T lanes[W];
   std::memcpy(lanes, &x, sizeof(x));
@@ -132,7 +133,8 @@ template <class T> T least_of(V<T> x) {
   return lanes[0];
 }
 
-// Vectors of a number of each row become rows of numbers: W x W, in halves of halves.
+// Transposes a W x W matrix by recursive halving: vector i, with number i of each row,
+// becomes row i.
 template <class T> void transpose(V<T> (&x)[W]) {
 #pragma GCC unroll 4
   for (int half = W / 2; half; half /= 2) {
@@ -185,7 +187,7 @@ template <class T> struct Frame {
   V<T> r[3][3], p[3];
 };
 
-// What is known of a block of rows.
+// Intermediate results for a block of rows.
 template <class T> struct Block {
   explicit Block(const Tables &t)
       : turns(t.steps), frames(t.steps + 1), centre(t.objects * t.links),
@@ -195,8 +197,8 @@ template <class T> struct Block {
     V<T> joint, sine, cosine;
   };
   std::vector<Turn> turns;      // of each step
-  std::vector<Frame<T>> frames; // in the base frame; the base first
-  bool finite = true;           // whether no input of any row is NaN or infinite
+  std::vector<Frame<T>> frames; // in the base frame; the base is the first
+  bool finite = true;           // whether all inputs of all rows are finite
   struct Point {
     V<T> x[3];
   };
@@ -210,9 +212,9 @@ template <class T> const T *as(const void *pointer) {
 
 enum Input { BASE, JOINT_POS, OBJECT_POSE, ACTIVE };
 
-// A block of rows and its part of the inputs; lanes behind the last row repeat it.
+// A block of rows and their inputs; lanes beyond the last row repeat it.
 struct Rows {
-  // The rows from number `first` of a list on.
+  // Takes up to W rows of a list, starting at index `first`.
   Rows(const Inputs &in, const std::vector<int64_t> &list, size_t first)
       : in(in), count(std::min<int64_t>(W, list.size() - first)) {
     for (int i = 0; i < W; i++) row[i] = list[std::min(first + i, list.size() - 1)];
@@ -228,7 +230,7 @@ struct Rows {
     return x;
   }
 
-  // 0 or, if one of the numbers of a row is NaN or infinite, NaN.
+  // 0, or NaN if any of the numbers of a row is NaN or infinite.
   template <class T> V<T> poison(Input input, int64_t first, int64_t count) const {
     V<T> sum{};
     for (int64_t i = first; i < first + count; i++) sum += column<T>(input, i) * T(0);
@@ -240,7 +242,8 @@ struct Rows {
   int64_t row[W], offset[4][W];
 };
 
-// Writes `count` numbers of each row, `stride` apart: vector i holds all numbers i.
+// Writes `count` numbers per row, to rows `stride` apart; vector i holds number i of
+// all rows.
 template <class T>
 void write_rows(const V<T> *numbers, int64_t count, const Rows &rows, T *out,
                 int64_t stride) {
@@ -248,13 +251,13 @@ void write_rows(const V<T> *numbers, int64_t count, const Rows &rows, T *out,
   for (; i + W <= count; i += W) {
     V<T> tile[W];
     std::copy_n(numbers + i, W, tile);
-    // Rows are too many streams for the processor to foresee: two tiles ahead.
+    // Prefetch two tiles ahead: these are too many streams for the hardware prefetcher.
     T *to = out + i;
 #pragma GCC unroll 16
     for (int k = 0; k < W; k++)
       __builtin_prefetch(to + rows.row[k] * stride + 2 * W, 1);
     transpose<T>(tile);
-    // Lanes behind the last row write it again. Unrolled: the tile stays in registers.
+    // Lanes beyond the last row rewrite it. Unrolled to keep the tile in registers.
 #pragma GCC unroll 16
     for (int k = 0; k < W; k++)
       std::memcpy(to + rows.row[k] * stride, &tile[k], sizeof(tile[k]));
@@ -263,8 +266,7 @@ void write_rows(const V<T> *numbers, int64_t count, const Rows &rows, T *out,
     for (int k = 0; k < rows.count; k++) out[rows.row[k] * stride + i] = numbers[i][k];
 }
 
-// Whether `count` numbers of each row are neither NaN nor infinite, as most are: by
-// their exponents.
+// Whether `count` numbers of each row are all finite, tested by their exponents.
 template <class T>
 inline bool finite(const Inputs &in, Input input, int64_t first, int64_t count) {
   using Bits = std::conditional_t<sizeof(T) == 8, uint64_t, uint32_t>;
@@ -273,7 +275,7 @@ inline bool finite(const Inputs &in, Input input, int64_t first, int64_t count) 
   std::memcpy(&exponent, &infinity, sizeof(T));
   const Bits *data = as<Bits>(in.data[input]) + first;
   if (in.stride[input] == count) {
-    // Rows without a gap are one.
+    // Rows without gaps are treated as a single row.
     for (int64_t i = 0; i < in.rows * count; i++)
       found |= (data[i] & exponent) == exponent ? Bits(1) : Bits(0);
     return !found;
@@ -291,8 +293,8 @@ template <class T> bool finite(const Tables &t, const Inputs &in) {
   return all;
 }
 
-// ProximitySensor._rows_in_reach: rows in which an active object may be in range,
-// whatever the pose of the robot, or is NaN. In all others nothing is sensed.
+// ProximitySensor._rows_in_reach: rows in which an active object may be in range for
+// some robot pose, or is NaN. In all other rows nothing is detected.
 template <class T>
 std::vector<int64_t> rows_in_reach(const Tables &t, const Inputs &in, bool finite) {
   std::vector<int64_t> rows(in.rows);
@@ -318,7 +320,7 @@ std::vector<int64_t> rows_in_reach(const Tables &t, const Inputs &in, bool finit
   return rows;
 }
 
-// LinkKinematics: the frames of all steps.
+// LinkKinematics: computes the frames of all steps.
 template <class T>
 void place_frames(const Tables &t, const Rows &rows, Block<T> &block) {
   Frame<T> &base = block.frames[0];
@@ -326,7 +328,7 @@ void place_frames(const Tables &t, const Rows &rows, Block<T> &block) {
     for (int j = 0; j < 3; j++) base.r[i][j] = filled<T>(i == j);
     base.p[i] = filled<T>(0);
   }
-  // First of all steps: none waits for another.
+  // In a separate loop, since these computations are independent of each other.
   for (int64_t step = 0; step < t.steps; step++) {
     auto &[q, s, c] = block.turns[step];
     q = t.joint[step] < 0 ? V<T>{} : rows.column<T>(JOINT_POS, t.joint[step]);
@@ -354,7 +356,8 @@ void place_frames(const Tables &t, const Rows &rows, Block<T> &block) {
   }
 }
 
-// ProximitySensor.views: where the links see the objects. NaN in a row is everywhere.
+// ProximitySensor.views: object centres in the link frames. A NaN in the base pose
+// or joints makes all centres of the row NaN; a NaN in an object's pose, its own.
 template <class T>
 void place_objects(const Tables &t, const Rows &rows, Block<T> &block) {
   V<T> base[7], poison{};
@@ -388,7 +391,7 @@ void place_objects(const Tables &t, const Rows &rows, Block<T> &block) {
   }
 }
 
-// From a sensor to an object's centre, in the sensor's link.
+// Vector from a sensor to an object's centre, in the frame of the sensor's link.
 template <class T>
 void to_centre(const Tables &t, const Block<T> &block, int64_t object, int64_t sensor,
                V<T> (&away)[3]) {
@@ -439,7 +442,7 @@ void field(const Tables &t, const Inputs &in, T *out, uint8_t *detected) {
     }
     if (!t.apart) write_rows<T>(nearest.data(), t.sensors, rows, out, t.sensors);
   }
-  // All other rows.
+  // All other rows: nothing detected.
   T *next = out;
   for (int64_t plane = 0; plane < (t.apart ? t.objects : 1); plane++)
     for (int64_t row : reached) {
@@ -459,7 +462,7 @@ void poses(const Tables &t, const Inputs &in, T *position, T *rotation) {
   for (size_t begin = 0; begin < all.size(); begin += W) {
     const Rows rows(in, all, begin);
     place_frames<T>(t, rows, block);
-    // As many sensors as make whole vectors of a row.
+    // In groups of W sensors, so that the numbers per row fill whole vectors.
     for (int64_t first = 0; first < t.sensors; first += W) {
       int64_t some = std::min<int64_t>(W, t.sensors - first);
       V<T> p[W][3], r[W][3][3];
@@ -482,13 +485,13 @@ void poses(const Tables &t, const Inputs &in, T *position, T *rotation) {
   }
 }
 
-// A sensor and an object that it may see from one row of the block, and where.
+// A sensor and an object that it may detect, in one row of the block.
 template <class T> struct Pair {
   int64_t sensor, object;
   T centre[3]; // in the sensor's frame
 };
 
-// RaySensor.margins: which pairs may hit; NaN may.
+// RaySensor.margins: finds the pairs with possible hits, including pairs with NaN.
 template <class T>
 void find_pairs(const Tables &t, const Block<T> &block, int64_t count,
                 std::vector<Pair<T>> (&pairs)[W]) {
@@ -521,8 +524,8 @@ void find_pairs(const Tables &t, const Block<T> &block, int64_t count,
   }
 }
 
-// RaySensor.read: what the beams of a pair measure; returns the least. `out` has room
-// for whole vectors.
+// RaySensor.read: writes the readings of a pair's beams and returns their minimum.
+// `out` has room for whole vectors.
 template <class T> T read_beams(const Tables &t, const Pair<T> &pair, V<T> *out) {
   const T inf = std::numeric_limits<T>::infinity();
   const int64_t sensor = pair.sensor, vectors = (t.beams + W - 1) / W;
@@ -549,13 +552,13 @@ template <class T> T read_beams(const Tables &t, const Pair<T> &pair, V<T> *out)
     out[i] = distance;
     nearest = distance < nearest ? distance : nearest;
   }
-  // Only where the centre is NaN or infinite may a reading be NaN.
+  // Readings can be NaN only if the centre is NaN or infinite.
   if (away - away == T(0)) return least_of<T>(nearest);
   const T *reading = reinterpret_cast<const T *>(out);
   return std::accumulate(reading, reading + t.beams, inf, lesser<T>);
 }
 
-// What a sensor reads of one object, or of the nearest.
+// Delivers the readings of each sensor, per object or the minimum over objects.
 template <class T, class Deliver>
 void each_reading(const Tables &t, const std::vector<Pair<T>> &pairs, V<T> *read,
                   V<T> *other, uint8_t *detected, Deliver deliver) {
@@ -575,7 +578,7 @@ void each_reading(const Tables &t, const std::vector<Pair<T>> &pairs, V<T> *read
   }
 }
 
-// RaySensor: the readings that are not infinite, in the order of the grid.
+// RaySensor: delivers the readings of sensors with a hit, in the order of the grid.
 template <class T, class Deliver>
 void rays(const Tables &t, const Inputs &in, uint8_t *detected, Deliver deliver) {
   Block<T> block(t);
@@ -598,12 +601,12 @@ void rays(const Tables &t, const Inputs &in, uint8_t *detected, Deliver deliver)
   }
 }
 
-// A large array, written from its first number to its last: past the cache, which it
-// would empty, so that the processor need not read what it overwrites.
+// Sequential writer of an array. Large arrays bypass the cache: they would evict
+// its contents, and make the processor read each line before overwriting it.
 template <class T> class Stream {
 public:
-  // Whether an array is one to write past the cache: far larger than it, and of pieces
-  // that are whole lines.
+  // Whether to bypass the cache: if the array is far larger than it and its pieces are
+  // whole cache lines.
   static bool serves(const T *out, int64_t piece, int64_t size) {
 #ifdef __SSE2__
     return size * sizeof(T) > MANY && piece * sizeof(T) % LINE == 0 &&
@@ -634,7 +637,7 @@ public:
     for (const T *end = next + count; next < end; from += LINE / sizeof(T)) write(from);
   }
 
-  // What was written is then seen by other threads, too.
+  // Makes the written data visible to other threads.
   static void finish() {
 #ifdef __SSE2__
     _mm_sfence();
@@ -657,7 +660,7 @@ private:
   }
 };
 
-// The grid, or of each sensor the least.
+// The readings of all beams, or the minimum of each sensor.
 template <class T>
 void ray(const Tables &t, const Inputs &in, T *out, uint8_t *detected) {
   const T inf = std::numeric_limits<T>::infinity();
@@ -676,8 +679,8 @@ void ray(const Tables &t, const Inputs &in, T *out, uint8_t *detected) {
   Stream<T>::finish();
 }
 
-// RaySensor.hits: places in the grid, ascending, and readings; returns their number,
-// of which at most `capacity` are written.
+// RaySensor.hits: ascending indices of hits in the grid, and their readings. Returns
+// the number of hits, of which at most `capacity` are written.
 template <class T>
 int64_t hits(const Tables &t, const Inputs &in, int64_t capacity, int64_t *place,
              T *reading) {
