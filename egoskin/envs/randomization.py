@@ -48,7 +48,10 @@ class RandomizationConfig:
         for field in fields(self):
             low, high = getattr(self, field.name)
             if low > high:
-                raise ValueError(f"{field.name} must be (low, high), got {low, high}")
+                raise ValueError(
+                    f"{field.name} must be (low, high) with low <= high, got "
+                    f"{low, high}"
+                )
 
     @property
     def varies_robot(self) -> bool:

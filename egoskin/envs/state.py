@@ -92,7 +92,9 @@ STATE = (
     StateKey("object_active", ("O",), "whether the object is in play", _WORKER, _FLAG),
     _event("tactile", "L", "whether each link touched ball or floor", "sensors"),
     StateKey("displacement_w", (2,), "planar displacement from the start [m]", _OWN),
-    StateKey("previous_action", ("J",), "action of the step before (0 at first)", _OWN),
+    StateKey(
+        "previous_action", ("J",), "action of the previous step (0 at first)", _OWN
+    ),
     _event("reward_terms", "R", "weighted terms, as TERMS", "trainer", kind=_NUMBER),
     _event("hit", 1, "a ball touched the robot", *_PARENT),
     _event("fallen", 1, "a link other than a foot touched the floor", *_PARENT),

@@ -85,7 +85,9 @@ class ThrowConfig:
         for field in fields(self):
             value = getattr(self, field.name)
             if isinstance(value, tuple) and not value[0] <= value[1]:
-                raise ValueError(f"{field.name} must be (low, high), got {value}")
+                raise ValueError(
+                    f"{field.name} must be (low, high) with low <= high, got {value}"
+                )
         for name, (option, value) in _ONLY_WITH.items():
             changed = getattr(self, name) != getattr(ThrowConfig, name)
             if changed and getattr(self, option) != value:

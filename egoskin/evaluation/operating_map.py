@@ -125,8 +125,9 @@ def check_map(config: EnvConfig) -> None:
     """Raise ValueError for an oracle actor, whose observation fixes the ball count."""
     if config.sensor.coverage == "oracle":
         raise ValueError(
-            f"a map takes more balls than the {config.task.throws.num_balls} that an "
-            "oracle observes, each in its place: no map can be made of it"
+            "an operating map may need more balls than the "
+            f"{config.task.throws.num_balls} that an oracle observes: "
+            "oracles are not supported"
         )
 
 
@@ -254,7 +255,7 @@ def _draw_line(axis: Axes, line: Line) -> None:
         color="#0072b2",
         alpha=0.2,
         lw=0,
-        label="its 95 % interval",
+        label="95 % interval",
     )
     axis.plot(
         x,

@@ -220,7 +220,7 @@ def play_throws(
                 if not action.isfinite().all():
                     raise ValueError(
                         f"the policy's action is not finite at step {step}: its "
-                        "weights, or what it was given, are not those of training"
+                        "weights or its observations differ from those of training"
                     )
             root["action"] = action.reshape(*root.batch_size, -1)
             data, root = env.step_and_maybe_reset(root)

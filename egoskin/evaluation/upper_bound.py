@@ -142,7 +142,7 @@ def find_upper_bound(
     """
     if config.sensor.corruption != "none":
         raise ValueError(
-            "an upper bound is searched with ideal sensors, but the policy's have "
+            "an upper bound requires ideal sensors, but the policy's have "
             f"corruption={config.sensor.corruption}"
         )
     hz, seed = config.task.physics.control_hz, throw_seed(config, throw_set)

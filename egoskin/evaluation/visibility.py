@@ -309,14 +309,14 @@ def analyse(
     if not sensors or not ranges:
         raise ValueError("an analysis needs at least one coverage and one range")
     if len(set(ranges)) < len(ranges):
-        raise ValueError(f"a range is given twice: {list(ranges)}")
+        raise ValueError(f"ranges must be distinct, got {list(ranges)}")
     if not all(0 < r < math.inf for r in ranges):
         raise ValueError(f"ranges must be positive and finite, got {list(ranges)}")
     if np.isinf(skin.range).any():
         sensor = int(np.isinf(skin.range).argmax())
         raise ValueError(
-            f"sensor {sensor} of the skin has an infinite range: there are no seconds "
-            "of warning of what is always in sight"
+            f"sensor {sensor} of the skin has an infinite range: a warning time "
+            "requires a finite one"
         )
     check_seed(seed)
     if num_throws < 1:

@@ -86,9 +86,9 @@ def _body_frames(
         kind = mujoco.mjtJoint(int(joint.type[0]))
         if kind not in JOINT_TYPES:
             raise ValueError(
-                f"joint {own_name!r} of body {name!r} is a {kind.name}: below the "
-                "base there may only be hinges and slides; write a ball joint as three "
-                "hinges, and choose a body with a free joint as the base"
+                f"joint {own_name!r} of body {name!r} is a {kind.name}: only hinges "
+                "and slides are supported below the base; replace a ball joint by "
+                "three hinges, and choose a body with a free joint as the base"
             )
         # R(q - ref) = R(-ref) R(q), and likewise for a slide.
         reference = float(model.qpos0[joint.qposadr[0]])
@@ -157,6 +157,6 @@ def build_chain(
         return pk.Chain(root, dtype=dtype)
     except RecursionError:
         raise ValueError(
-            f"too many bodies hang on each other below {base!r}: pytorch-kinematics "
-            f"follows a row of about {sys.getrecursionlimit() - 100} at most"
+            f"bodies below {base!r} are nested too deeply: pytorch-kinematics supports "
+            f"about {sys.getrecursionlimit() - 100} levels"
         ) from None

@@ -124,8 +124,7 @@ class RobotConfig:
         """Raise ValueError unless exactly one model is given."""
         if (self.model_path is None) == (self.model_xml is None):
             raise ValueError(
-                f"robot {self.name!r} must have a model_path or a model_xml, one of "
-                "the two"
+                f"robot {self.name!r} must have exactly one of model_path and model_xml"
             )
 
     def __hash__(self) -> int:
@@ -186,7 +185,7 @@ class RobotConfig:
         """Return the error for a model that MuJoCo cannot read, on one line."""
         what = self.model_path or f"the model of {self.name!r}"
         return ValueError(
-            f"{what} is no robot that MuJoCo can read: {' '.join(str(error).split())}"
+            f"MuJoCo cannot load {what} as a robot: {' '.join(str(error).split())}"
         )
 
     @cached_property
@@ -225,7 +224,7 @@ class RobotConfig:
         if not free or model.jnt_bodyid[0] != self._bodies[0]:
             raise ValueError(
                 f"{self.name}: the first joint must be the free joint of its base "
-                f"{self.base!r} (sensors can be placed without, but no balls thrown)"
+                f"{self.base!r} (required to throw balls, not to place sensors)"
             )
         hinges = kinds[self._joint_ids] == mujoco.mjtJoint.mjJNT_HINGE
         if hinges.sum() != model.njnt - 1:
@@ -268,8 +267,8 @@ class RobotConfig:
         """
         if not self.gains:
             raise ValueError(
-                f"{self.name} has no gains: no torque holds its joints (sensors can be "
-                "placed without, but no balls thrown)"
+                f"{self.name} has no gains to hold its joints (required to throw "
+                "balls, not to place sensors)"
             )
         if gain_set is None:
             gain_set = next(iter(self.gains))
@@ -426,9 +425,9 @@ def _primitive_kind(model: mujoco.MjModel, geom: int) -> str:
         link = body_name(model, int(model.geom_bodyid[geom]))
         name = model.geom(geom).name or geom
         raise ValueError(
-            f"link {link!r} has a collision shape, geom {name!r}, of kind {kind}, not "
-            "sphere, capsule or box: place sensors with that link's meshes instead, "
-            f"meshes={{{link!r}: [...]}}, or put one of those three in its place"
+            f"link {link!r} has a collision shape, geom {name!r}, of kind {kind}; it "
+            "must be a sphere, capsule or box: replace it, or place sensors on the "
+            f"link's meshes with meshes={{{link!r}: [...]}}"
         )
     return kind
 

@@ -261,8 +261,8 @@ def _check_different(what: str, names: Sequence[str]) -> None:
     twice = [name for name, number in Counter(names).items() if number > 1]
     if twice:
         raise ValueError(
-            f"two {what} of the chain have the name {twice[0]!r}: give each a name of "
-            "its own in the robot's file"
+            f"two {what} of the chain have the name {twice[0]!r}: give each a unique "
+            "name in the robot's file"
         )
 
 
@@ -281,8 +281,8 @@ def _step(parent: int, frame: pk.Frame, joint_index: Mapping[str, int]) -> tuple
     number = -1 if joint.joint_type == "fixed" else joint_index[str(joint.name)]
     if number >= 0 and not np.isfinite(axis).all():
         raise ValueError(
-            f"the axis of joint {joint.name!r} must have a direction; the robot's file "
-            "says 0 0 0"
+            f"the axis of joint {joint.name!r} must not be zero, got 0 0 0 in the "
+            "robot's file"
         )
     return (
         *(parent, number),

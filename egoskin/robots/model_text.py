@@ -33,22 +33,24 @@ def checked_model(text: str, what: str) -> str:
         raise ValueError(f"{what}: its model is longer than {_LONGEST:,} characters")
     # Entities could refer to files, or expand without bounds.
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise ValueError(f"{what}: its model declares a document type, as none may")
+        raise ValueError(f"{what}: DOCTYPE and ENTITY are not allowed in its model")
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
-        raise ValueError(f"{what}: its model is no XML: {error}") from error
+        raise ValueError(f"{what}: its model is not valid XML: {error}") from error
     if root.tag != "mujoco":
-        raise ValueError(f"{what}: its model must be <mujoco>, not <{root.tag}>")
+        raise ValueError(
+            f"{what}: the root element of its model must be <mujoco>, got <{root.tag}>"
+        )
     level, depth = [root], 0
     while level:
         for element in level:
             if element.tag not in _ELEMENTS:
                 raise ValueError(
-                    f"{what}: its model holds <{element.tag}>: a robot that is kept as "
-                    "data is made of bodies, joints and primitives, and names no file"
+                    f"{what}: its model contains <{element.tag}>; a robot stored as "
+                    "data may have only bodies, joints and primitives, and no files"
                 )
         level, depth = [child for element in level for child in element], depth + 1
         if depth > _DEEPEST:
-            raise ValueError(f"{what}: its model is nested more than {_DEEPEST} deep")
+            raise ValueError(f"{what}: its model is nested more than {_DEEPEST} levels")
     return ElementTree.tostring(root, encoding="unicode")

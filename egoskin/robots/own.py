@@ -82,7 +82,7 @@ def find_robot(name: str) -> RobotConfig:
         return read_folder(path.parent)
     if path.suffix == ".py" and path.is_file():
         raise ValueError(
-            f"which robot of {name}? Say {name}:ROBOT, the variable's name"
+            f"{name} lacks the name of the robot's variable: use {name}:ROBOT"
         )
     if path.exists():
         return read_robot(path)
@@ -133,14 +133,14 @@ def robot_of(robot: str | RobotConfig) -> RobotConfig:
     if isinstance(robot, str):
         if robot not in ROBOTS:
             raise ValueError(
-                f"no robot {robot!r}: it must be one of {', '.join(ROBOTS)}, or data: "
-                "egoskin.robots.own.portable(find_robot(PATH))"
+                f"no robot {robot!r}: it must be one of {', '.join(ROBOTS)}, or data "
+                "from egoskin.robots.own.portable(find_robot(PATH))"
             )
         return ROBOTS[robot]
     if robot.model_path is not None:
         raise ValueError(
-            f"robot {robot.name!r} is kept in a file, {robot.model_path}, and what is "
-            "loaded elsewhere must hold it: egoskin.robots.own.portable(robot)"
+            f"robot {robot.name!r} refers to a file, {robot.model_path}, but must be "
+            "self-contained: use egoskin.robots.own.portable(robot)"
         )
     return robot
 
@@ -148,13 +148,13 @@ def robot_of(robot: str | RobotConfig) -> RobotConfig:
 def _from_python(path: Path, variable: str) -> RobotConfig:
     """Run a Python file and return the robot in one of its variables."""
     if not path.is_file():
-        raise ValueError(f"no file {path}: a robot is my_robot.py:ROBOT")
+        raise ValueError(f"no file {path}: a robot is given as my_robot.py:ROBOT")
     names = runpy.run_path(str(path))
     robot = names.get(variable)
     if not isinstance(robot, RobotConfig):
         robots = [n for n, value in names.items() if isinstance(value, RobotConfig)]
         raise ValueError(
-            f"{path} has no robot {variable!r}; its variables that are a RobotConfig: "
+            f"{path} has no robot {variable!r}; its variables of type RobotConfig: "
             f"{', '.join(robots) or 'none'}"
         )
     return robot
@@ -217,7 +217,7 @@ def read_folder(folder: Path) -> RobotConfig:
     path = folder / TOML_NAME
     if not path.is_file():
         raise ValueError(
-            f"{folder} is no robot: it has no {TOML_NAME} (model, base, feet, "
+            f"{folder} is not a robot: it has no {TOML_NAME} (model, base, feet, "
             "skin_links, gains)"
         )
     toml = _Toml(path)
@@ -231,7 +231,7 @@ def read_folder(folder: Path) -> RobotConfig:
     for key, value in content.items():
         kind = list if key in _LISTS else dict if key in _TABLES else str
         if not isinstance(value, kind):
-            names = {list: "a list of links", dict: "a table", str: "a text"}
+            names = {list: "a list of links", dict: "a table", str: "a string"}
             raise toml.error(f"{key} must be {names[kind]}, got {value!r}", key)
     model = folder / content["model"]
     if not model.is_file():
@@ -266,7 +266,7 @@ def read_folder(folder: Path) -> RobotConfig:
             if len(matching) != 1:
                 patterns = " and ".join(map(repr, matching)) or "none of its patterns"
                 raise toml.error(
-                    f"gains.{name}: joint {joint!r} must match one pattern, and "
+                    f"gains.{name}: joint {joint!r} must match one pattern, but "
                     f"matches {patterns}",
                     *("gains", name, *matching[1:2]),
                 )
@@ -300,7 +300,7 @@ def _pose(toml: _Toml) -> dict[str, float]:
 def _gains(toml: _Toml) -> dict[str, dict[str, Gain]]:
     """Return the gain sets."""
     if not toml.content["gains"]:
-        raise toml.error("gains must have a set: [gains.NAME]", "gains")
+        raise toml.error("gains must contain a set, [gains.NAME]", "gains")
     sets: dict[str, dict[str, Gain]] = {}
     for name, table in toml.content["gains"].items():
         sets[name] = {}
@@ -382,12 +382,11 @@ def portable(robot: RobotConfig) -> RobotConfig:
             _round_off(geom)
         elif geom.type not in _PRIMITIVES:
             raise ValueError(
-                f"{robot.name}: link {geom.parent.name!r} touches with a shape, "
-                f"{geom.name or 'without a name'}, that is "
-                f"{geom.type.name.removeprefix('mjGEOM_').lower()}, and a robot that "
-                "is kept as data is made of spheres, capsules, boxes and cylinders: "
-                'put some of these in its place, or let it only look (contype="0" '
-                'conaffinity="0")'
+                f"{robot.name}: link {geom.parent.name!r} has a collision shape, "
+                f"{geom.name or 'unnamed'}, of kind "
+                f"{geom.type.name.removeprefix('mjGEOM_').lower()}; a robot stored as "
+                "data may have spheres, capsules, boxes and cylinders: replace it, or "
+                'make it visual only (contype="0" conaffinity="0")'
             )
     _set_bits(spec)
     for elements in (
@@ -406,7 +405,7 @@ def portable(robot: RobotConfig) -> RobotConfig:
         spec.compile()
     except ValueError as error:
         text = " ".join(str(error).split())
-        raise ValueError(f"{robot.name} cannot be kept as data: {text}") from error
+        raise ValueError(f"{robot.name} cannot be stored as data: {text}") from error
     data = replace(robot, model_path=None, model_xml=spec.to_xml())
     # This raises for any other element that cannot be kept.
     _ = data.model

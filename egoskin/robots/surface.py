@@ -141,7 +141,7 @@ class Surface:
         self.robot = robot
         self._patches = [patch for patch in patches if patch.link in links]
         if not self._patches:
-            raise ValueError(f"the links {', '.join(links)} carry no collision shape")
+            raise ValueError(f"the links {', '.join(links)} have no collision shape")
         self._link_index = [robot.links.index(patch.link) for patch in self._patches]
         self._shift, self._turn = default_frames(robot)
         self._side = side
@@ -185,15 +185,15 @@ class Surface:
         weights = weights or {}
         density = np.array([p.area * weights.get(p.link, 1.0) for p in self._patches])
         if not density.any():
-            raise ValueError(f"the weights leave {', '.join(self.links)} bare")
+            raise ValueError(f"the weights place no sensors on {', '.join(self.links)}")
         rng = np.random.default_rng(seed)
         kept: list[tuple[np.ndarray, ...]] = []
         tried, outer = np.zeros((2, len(self._patches)))
         while outer.sum() < n:
             if len(kept) >= _MAX_ROUNDS and not outer.any():
                 raise ValueError(
-                    f"the shapes of {', '.join(self.links)} lie inside others: they "
-                    "have no outer surface"
+                    f"the shapes of {', '.join(self.links)} lie inside other shapes "
+                    "and have no outer surface"
                 )
             counts = rng.multinomial(2 * n, density / density.sum())
             parts = [

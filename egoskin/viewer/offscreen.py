@@ -268,7 +268,9 @@ class Painter:
     ) -> None:
         if min(size) < 16 or size[0] % 2 or size[1] % 2:
             # H.264 stores colour for blocks of 2 x 2 pixels; the text needs some room.
-            raise ValueError(f"size must be two even numbers from 16 on, got {size}")
+            raise ValueError(
+                f"size must be two even numbers of at least 16, got {size}"
+            )
         self._skin, self._objects = skin, tuple(objects)
         self._model = _build_model(robot, objects, size)
         self._data = mujoco.MjData(self._model)
@@ -538,7 +540,9 @@ def _renderer(
     except (ImportError, AttributeError, RuntimeError) as error:
         raise RenderingError(no_gl_text(backend)) from error
     except mujoco.FatalError as error:
-        raise ValueError(f"no picture of {size} pixels here: {error}") from error
+        raise ValueError(
+            f"cannot render {size} pixels on this machine: {error}"
+        ) from error
 
 
 def no_gl_text(backend: str) -> str:

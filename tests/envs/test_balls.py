@@ -1,4 +1,4 @@
-"""What is thrown may have any shape: it hits, misses and lands by that shape."""
+"""Thrown objects of any shape: their hits, misses and landings follow the shape."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ WIDE = ThrowConfig(
     box_height=(0.4, 2.0),
     distance=(1.5, 2.0),
 )
-# Long across the flight of some throws and along that of others.
+# Elongated across the flight direction of some throws, along that of others.
 SHAPES = (
     Sphere(radius=0.15),
     Box(half_extents=(0.05, 0.3, 0.1)),
@@ -31,7 +31,7 @@ SHAPES = (
 
 
 def body_points(base_pose: torch.Tensor, joint_pos: torch.Tensor) -> torch.Tensor:
-    """Points of the surface of robots in the world, ``[B, n, 3]``."""
+    """Return points on the robots' surfaces in the world frame, ``[B, n, 3]``."""
     points = sample_surface(H1_2, H1_2.links, 1500, seed=0)
     position, rotation = LinkKinematics(H1_2.chain, H1_2.links).poses_b(joint_pos)
     local = torch.from_numpy(points.position).float()
@@ -62,19 +62,19 @@ def test_a_thrown_shape_hits_or_misses_as_its_own_signed_distance_says(shape: Sh
         flying &= ~after["done"][:, 0]
 
     gap = torch.full((ROWS,), torch.inf)
-    # At 120 Hz, as physics looks at it.
+    # At 120 Hz, the rate at which the physics checks for contacts.
     for number in range(80):
         centre = start + velocity * number / 120
         near = (centre - points.mean(1)).norm(dim=-1) < 1.2
         x, y, z = (points[near] - centre[near, None]).unbind(-1)
         least = shape.signed_distance(x, y, z).amin(-1)
         gap[near] = torch.minimum(gap[near], least)
-    # A point of the body in the solid is a touch; points are some 3 cm apart.
+    # A body point inside the object is a touch; points are about 3 cm apart.
     assert hit[gap < 0].all()
     assert not hit[gap > 0.04].any()
     assert (gap < 0).sum() > ROWS / 6
     assert (gap > 0.04).sum() > ROWS / 6
-    # What missed has passed: counted as avoided.
+    # A miss that has passed counts as avoided.
     assert counts[0].all()
     assert torch.equal(counts[1].bool(), ~hit)
 

@@ -1,4 +1,4 @@
-"""The engine against the contract said simply: whole rollouts, bit for bit."""
+"""The engine against a simple form of its contract: whole rollouts, bit for bit."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from egoskin.envs.throws import ThrowConfig
 from egoskin.robots.config import H1_2
 from simple_physics import SimplePhysics
 
-# Balls at all sides, early and often.
+# Balls from all sides, early and often.
 OFTEN = ThrowConfig(first_delay=(0.0, 0.6), interval=(0.2, 0.4), distance=(1.5, 2.5))
 RANDOM = RandomizationConfig(
     link_mass=(0.7, 1.4),
@@ -78,7 +78,7 @@ def test_an_engine_of_a_loop_over_single_simulations_gives_the_same_bits(
                 assert torch.equal(one[key], other[key]), (number, key)
         seen |= {key for key in ends if steps[0][key].any()}
         if number == 25:
-            # What one saved the other goes on from.
+            # Each continues from the state that the other saved.
             saved, other = (env.simulation_state() for env in (fast, simple))
             for key, value in saved.items():
                 assert torch.equal(value, other[key]), key

@@ -1,4 +1,4 @@
-"""The task: episodes, contacts, counts and rewards, row by row reproducible."""
+"""The task: episodes, contacts, counts and rewards, reproducible for each row."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ JOINTS = len(H1_2.joints)
 DEFAULT = torch.from_numpy(H1_2.default_joint_pos).float()
 # First balls at different times.
 SOON = replace(AT_ONCE, first_delay=(0.0, 0.5))
-# Balls that fly to a point 50 m up and come back never, or far away.
+# Balls that fly to a point 50 m up: they never come back, or land far away.
 MISS = replace(AT_ONCE, aim="box", box_height=(50.0, 50.0))
 AWAY = (30.0, 0.0, 5.0)
 
 
 def make(num_envs: int, **options) -> DodgeballEnv:
-    """An environment; task options by name, e.g. ``throws``. A ball comes at once."""
+    """Return an environment with a ball at once; task options are keyword arguments."""
     own = {"seed", "row_offset", "num_threads", "hold"}
     options = {"throws": AT_ONCE, **options}
     kwargs = {k: options.pop(k) for k in own & set(options)}
@@ -38,14 +38,14 @@ def make(num_envs: int, **options) -> DodgeballEnv:
 
 
 def wild_actions(rows: int) -> torch.Tensor:
-    """Fixed actions for 150 steps: robots fall, each at its own time."""
+    """Return fixed actions for 150 steps: the robots fall, at different times."""
     generator = torch.Generator().manual_seed(0)
     size = 0.7 * torch.rand(rows, 1, generator=generator)
     return size * torch.randn(150, rows, JOINTS, generator=generator)
 
 
 def advance(env, root: TensorDict, action=None) -> tuple[TensorDict, TensorDict]:
-    """(what the step gave, the root of the next step)."""
+    """Return (output of the step, root of the next step)."""
     if action is None:
         action = torch.zeros(*env.batch_size, JOINTS)
     step, following = env.step_and_maybe_reset(root.set("action", action))
@@ -53,7 +53,7 @@ def advance(env, root: TensorDict, action=None) -> tuple[TensorDict, TensorDict]
 
 
 def run(env, actions: torch.Tensor, root: TensorDict | None = None) -> Any:
-    """Steps and roots under given actions, stacked over time."""
+    """Return steps and roots under given actions, stacked over time."""
     root = env.reset() if root is None else root
     out = []
     for action in actions:
@@ -68,7 +68,7 @@ def assert_same_bits(a: TensorDict, b: TensorDict) -> None:
 
 
 def throw(env: DodgeballEnv, ball: int, position, velocity=(0.0, 0, 0), rows=None):
-    """Put a ball somewhere, in all rows or in some."""
+    """Place a ball, in all rows or in some."""
     rows = torch.arange(env.batch_size[0]) if rows is None else torch.tensor(rows)
     env.physics.throw(
         rows,
@@ -93,12 +93,12 @@ def test_the_environment_keeps_its_specs():
 
 @pytest.fixture(scope="module")
 def whole_run() -> TensorDict:
-    """150 steps of 32 rows in one environment."""
+    """Return 150 steps of 32 rows in one environment."""
     return run(make(32, seed=3, throws=SOON), wild_actions(32))
 
 
 def test_rows_end_at_different_steps(whole_run):
-    # What makes the comparisons below worth something.
+    # Otherwise the comparisons below would be trivial.
     done = whole_run["next", "done"][..., 0].sum(1)
     assert ((done > 0) & (done < 16)).sum() > 10
     assert whole_run["next", "hit"].any()
@@ -129,7 +129,7 @@ def test_another_seed_gives_other_episodes(whole_run):
     assert (
         (other["object_pose"][-1] != same["object_pose"][-1]).flatten(1).any(-1).all()
     )
-    # One of 31 steps is that of the other seed by chance.
+    # By chance one of 31 steps equals that of the other seed.
     waits = other["first_throw_step"] != same["first_throw_step"]
     assert waits.float().mean() > 0.8
 
@@ -156,7 +156,7 @@ def test_a_saved_state_continues_bit_for_bit(target_velocity):
     second = make(32, **options)
     second.load_simulation_state(saved)
     assert_same_bits(run(second, actions[40:90], root.clone()), after)
-    # A worker takes its own rows of the state of all.
+    # A worker takes its own rows from the state of all workers.
     part = make(10, row_offset=7, **options)
     part.load_simulation_state(saved)
     mine = run(part, actions[40:90, 7:17], root[7:17].clone())
@@ -215,7 +215,7 @@ def test_an_episode_starts_standing_at_the_origin_with_a_ball_in_the_air():
 
 
 def waiting_for(env: DodgeballEnv) -> torch.Tensor:
-    """Steps that the draws of episode 0 say to wait for the first ball."""
+    """Return the steps before the first ball, from the draws of episode 0."""
     row = torch.arange(env.batch_size[0])
     return (60 * env.thrower.first_delay(env._seed, row, row * 0)).round().long()
 
@@ -247,7 +247,7 @@ def test_no_ball_is_in_play_before_the_first_is_thrown_at_the_step_drawn():
 
 
 def test_the_throws_are_the_same_whatever_the_delay():
-    # Held robots: what is thrown at does not move.
+    # Robots are held, so the targets do not move.
     throws = replace(MISS, interval=(0.2, 0.4))
     at_once, late = (
         make(16, hold=True, throws=replace(throws, first_delay=delay))
@@ -257,7 +257,7 @@ def test_the_throws_are_the_same_whatever_the_delay():
     delay = waiting_for(late)
     assert delay.unique().numel() > 8
     for row in range(16):
-        # The first action's root is of step 1.
+        # The root of the first action is step 1.
         wait = int(delay[row])
         one, other = first[0][: 100 - wait, row], first[1][wait:, row]
         for key in ("object_pose", "object_lin_vel_w", "object_active"):
@@ -279,7 +279,7 @@ def test_the_age_limit_and_the_counts_begin_with_the_first_throw(chest):
         assert not step["terminated"].any()
     assert age > int(delay.max()) + 30
 
-    # A ball is the first of its episode however late it comes.
+    # The first ball of an episode counts as first, however late it comes.
     env = make(8, hold=True, throws=throws)
     root, delay = env.reset(), waiting_for(env)
     for _ in range(12):
@@ -302,7 +302,7 @@ def test_a_robot_that_falls_before_the_first_throw_starts_again_with_a_wait():
         assert not step["object_active"].any()
         done = step["done"][:, 0]
         assert step["fallen"][done].all()
-        # The end is told with the wait it ended in.
+        # The end is reported with the wait of the episode that ended.
         assert (step["first_throw_step"][~ended] == delay[~ended]).all()
         ended |= done
     assert ended.all()
@@ -358,13 +358,13 @@ def test_a_diverged_row_is_reset_alone(value, tmp_path, monkeypatch):
     assert bad["diverged"][:, 0].tolist() == (~others).tolist()
     assert bad["terminated"][row]
     assert not bad["truncated"][row]
-    # Nothing else is said of it: what it touches then means nothing.
+    # No other event is reported: contacts of a diverged row are meaningless.
     assert not bad["hit"][row] | bad["fallen"][row] | bad["object_hit"][row].any()
     for key in ("balls_arrived", "balls_avoided"):
         assert not bad[key][row].any()
     for key, tensor in got.items(True, True):
         assert tensor.isfinite().all(), key
-    # A new episode, for this row alone, that goes on as any other.
+    # A new episode, for this row only, that continues like any other.
     assert got[0]["root", "episode_step"][row] == 0
     assert not got["next", "diverged"][1:].any()
     assert (env.simulation_state()["episode"] >= ~others).all()
@@ -373,7 +373,7 @@ def test_a_diverged_row_is_reset_alone(value, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("value", [np.nan, 1e12, 500.0])
 def test_the_reward_of_a_diverged_row_is_bounded(value, tmp_path, monkeypatch):
-    # Speeds that physics did not mean would outweigh all other rewards.
+    # Non-physical speeds would outweigh all other rewards.
     monkeypatch.chdir(tmp_path)
     env = make(4)
     root = env.reset()
@@ -388,7 +388,7 @@ def test_the_reward_of_a_diverged_row_is_bounded(value, tmp_path, monkeypatch):
 
 @pytest.fixture(scope="module")
 def chest() -> tuple[np.ndarray, np.ndarray]:
-    """A point of the torso well ahead of it, and its normal, in the base frame."""
+    """Return a point on the front of the torso and its normal, in the base frame."""
     # The torso's frame is the base's while the torso joint is at zero.
     points = sample_surface(H1_2, ["torso_link"], 2000, seed=0)
     ahead = points.position[:, 0] + 0.0
@@ -398,7 +398,7 @@ def chest() -> tuple[np.ndarray, np.ndarray]:
 
 
 def touch(env: DodgeballEnv, root, chest, ball=0) -> None:
-    """Put a ball against the torso of every row, which stand upright."""
+    """Place a ball against the torso in every row; the robots stand upright."""
     point, normal = chest
     x, y, z = point + 0.14 * normal
     w, *_, q = root["base_pose"][:, 3:].double().unbind(-1)
@@ -481,7 +481,7 @@ def test_a_hit_in_the_last_step_terminates(chest):
 def test_self_contact_ends_an_episode_only_if_asked(ends):
     env = make(2, hold=True, throws=MISS, self_contact_ends=ends)
     root = env.reset()
-    # The left arm of row 0 in the trunk, as it is from -0.2 rad on.
+    # The left arm of row 0 is inside the trunk, as it is below -0.2 rad.
     joint_pos = DEFAULT.clone()
     joint_pos[H1_2.joints.index("left_shoulder_roll_joint")] = -0.4
     env.physics.reset(torch.tensor([0]), root["base_pose"][:1], joint_pos[None])
@@ -490,7 +490,7 @@ def test_self_contact_ends_an_episode_only_if_asked(ends):
     assert step["terminated"][:, 0].tolist() == [ends, False]
     for key in ("hit", "fallen", "diverged", "truncated"):
         assert not step[key].any()
-    # The end pays no survival, like any other.
+    # The last step earns no survival reward, as at any other end.
     survival = step["reward_terms"][:, TERMS.index("survival")]
     assert (survival == 0).tolist() == [ends, False]
     assert root["episode_step"][:, 0].tolist() == [0 if ends else 1, 1]
@@ -525,7 +525,7 @@ def test_balls_are_thrown_in_turn_at_the_intervals_drawn():
         # .2 to .5 s at 60 Hz
         assert gaps.min() >= 12
         assert gaps.max() <= 30
-        # The interval is the one drawn with the throw before it.
+        # The interval is the one drawn with the previous throw.
         index = torch.arange(len(gaps))
         same = torch.full_like(index, row)
         drawn = env.thrower.draw(0, same, same * 0, index)
@@ -539,7 +539,7 @@ def test_a_ball_on_the_ground_is_out_of_play_until_thrown_again(chest):
     throw(env, 0, (3.0, 3.0, 0.17), (0.0, 0, -3.0))
     step, root = advance(env, root)
     assert not step["object_active"].any()
-    # Put against the robot it is moved out of reach before it can touch.
+    # Placed against the robot, it is moved out of reach before it can touch.
     touch(env, root, chest)
     step, root = advance(env, root)
     assert not step["hit"].any()
@@ -554,7 +554,7 @@ def test_a_ball_on_the_ground_is_out_of_play_until_thrown_again(chest):
 
 
 def counts(step: TensorDict) -> list[list[float]]:
-    """[[arrived first, later], [avoided first, later]] of row 0."""
+    """Return [[arrived first, later], [avoided first, later]] of row 0."""
     return [step["balls_arrived"][0].tolist(), step["balls_avoided"][0].tolist()]
 
 
@@ -592,11 +592,11 @@ def test_first_and_later_balls_are_counted_once_as_arrived_and_avoided(chest):
     assert counts(step) == [[1, 0], [1, 0]]
     while root["episode_step"] < 6:
         step, root = advance(env, root)
-    # The second ball is in the air. Nearer than a metre it has not passed yet, ...
+    # The second ball is in the air. Within a metre it has not passed yet, ...
     throw(env, 1, (0.0, 0.8, 2.5), (0.0, 3, 0))
     step, root = advance(env, root)
     assert counts(step) == [[1, 0], [1, 0]]
-    # ... nor while it approaches; when it lands it has.
+    # ... nor while it approaches; when it lands, it has.
     throw(env, 1, (0.0, 2.0, 0.5), (0.0, -3, 0))
     step, root = advance(env, root)
     assert counts(step) == [[1, 0], [1, 0]]
@@ -625,7 +625,7 @@ def test_a_hit_by_the_first_ball_is_arrived_and_not_avoided(chest):
 
 
 def test_an_action_is_a_position_target_scaled_by_torque_over_stiffness():
-    # One substep, so that the torque is that of the state the action was chosen in.
+    # One substep, so that the torque belongs to the state the action was chosen in.
     config = PhysicsConfig(substeps=1, control_hz=120)
     env = make(8, physics=config, throws=MISS, action_scale=0.25)
     kp, kd = (torch.from_numpy(g) for g in H1_2.joint_gains(config.gains))
@@ -707,7 +707,7 @@ def test_the_reward_is_the_sum_of_weighted_terms(whole_run):
     torch.testing.assert_close(terms["drift_speed"], config.drift_speed * speed)
     bent = (step["joint_pos"] - DEFAULT).square().mean(-1)
     torch.testing.assert_close(terms["posture"], config.posture * bent)
-    # The change is that from the root's previous action to the action taken.
+    # The change is from the root's previous action to the action taken.
     before = torch.cat(
         (torch.zeros(1, 32, JOINTS), whole_run["root", "previous_action"][:-1])
     )

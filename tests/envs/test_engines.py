@@ -1,4 +1,4 @@
-"""Engines by name, and a loop whose tensors are all on the engine's device."""
+"""Engines by name, and training with all tensors on the engine's device."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from throwing import TASK
 
 
 class OnCpu(MujocoPhysics):
-    """MuJoCo, which knows the CPU alone, where another device is the default."""
+    """MuJoCo, which supports only the CPU, while another device is the default."""
 
 
 def _on_cpu(name: str):
@@ -47,7 +47,7 @@ for _name in ("__init__", "reset", "throw", "vary", "push", "step", "read"):
     ids=["field", "ray", "localization"],
 )
 def test_no_tensor_of_the_loop_is_made_on_a_default_device(config, monkeypatch):
-    # A tensor that was not told its device would be one without numbers.
+    # A tensor created without a device would be on the meta device.
     random = RandomizationConfig(
         link_mass=(0.9, 1.1), delay_steps=(0, 1), push_speed=(0.1, 0.2)
     )

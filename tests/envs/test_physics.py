@@ -1,4 +1,4 @@
-"""The batch against a loop over single MuJoCo simulations."""
+"""Batched simulation against a loop over single MuJoCo simulations."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def make(
     hold: bool = False,
     weightless: bool = False,
 ) -> MujocoPhysics:
-    """Simulations of the standing robot, balls parked."""
+    """Return simulations of the standing robot with parked balls."""
     scene = Scene(
         robot=H1_2,
         objects=BALLS,
@@ -73,7 +73,7 @@ def names(flags: torch.Tensor) -> set[str]:
 
 @pytest.fixture(scope="module")
 def crown() -> np.ndarray:
-    """Highest point of the robot in its default pose, standing at the origin."""
+    """Return the highest point of the robot in its default pose at the origin."""
     model, data = H1_2.model, mujoco.MjData(H1_2.model)
     data.qpos[2] = H1_2.default_base_height
     data.qpos[7:] = H1_2.default_joint_pos
@@ -173,21 +173,21 @@ def test_a_ball_on_the_head_touches_the_head_alone(crown):
 @pytest.mark.parametrize("where", ["first", "second", "neither"])
 def test_a_contact_in_a_single_substep_is_seen(crown, where):
     # The ball crosses half a metre in a substep (60 m/s at 120 Hz), weightless and
-    # sideways above the head: it is near in one state alone.
+    # sideways above the head: it is near in a single state.
     travel = 60 / 120
     start = {"first": 0.0, "second": -travel, "neither": -2 * travel}[where]
     physics = make(1, hold=True, weightless=True)
     throw(physics, 0, np.add(crown, [0, start, 0.14]), (0.0, 60, 0))
     result = step(physics)
     assert result.object_hit[0, 0].item() == (where != "neither")
-    # The state reached belongs to the next step: nothing is missed between the two.
+    # The final state belongs to the next step: no contact is missed between the two.
     result = step(physics)
     assert result.object_hit[0, 0].item() == (where == "neither")
 
 
 @pytest.fixture(scope="module")
 def arms_in_trunk() -> torch.Tensor:
-    """A pose, found at random, in which an arm stands deep in the trunk."""
+    """Return a pose, found at random, in which an arm is deep inside the trunk."""
     model, data = H1_2.model, mujoco.MjData(H1_2.model)
     arms = [i for i, n in enumerate(H1_2.joints) if "shoulder" in n or "elbow" in n]
     low, high = model.jnt_range[1:][arms].T
@@ -238,7 +238,7 @@ def test_an_object_falls_through_the_floor():
 def test_contacts_by_link_are_told_only_if_asked():
     scene = make(1).scene
     bare = MujocoPhysics(replace(scene, link_contacts=False), 1)
-    # Hit by each ball, self, floor, floor by each foot.
+    # Contact with each ball, itself, the floor; floor contact of each foot.
     assert bare.model.nsensor == 2 + 1 + 1 + len(H1_2.feet)
     put(bare)
     assert step(bare).link_contact is None
@@ -284,7 +284,7 @@ def test_torque_of_a_step_includes_the_velocity_target(target_velocity):
     kp, kd = (torch.from_numpy(g) for g in H1_2.joint_gains(config.gains))
     limit = torch.from_numpy(H1_2.torque_limit)
     generator = torch.Generator().manual_seed(0)
-    # The target before the first step is the pose at the start.
+    # The target before the first step is the initial pose.
     last = DEFAULT.expand(4, -1)
     for _ in range(5):
         before = physics.read()
@@ -329,7 +329,7 @@ def test_read_returns_copies_never_views(num_envs):
         assert torch.equal(getattr(first, name), value)
         assert value.dtype == torch.float32
     physics.load_state(raw)
-    # Writing to what was read reaches neither the simulation nor another tensor.
+    # Writing to the tensors read changes neither the simulation nor other tensors.
     for field in fields(first):
         getattr(first, field.name).fill_(7)
     again = physics.read()
@@ -359,7 +359,7 @@ def test_read_gives_the_state_of_mujoco():
 
 
 def test_velocities_are_those_of_the_positions():
-    # Finite differences of a robot in free fall: also says which frame each is in.
+    # Finite differences of a robot in free fall; they also show the frame of each.
     physics = make(1, PhysicsConfig(substeps=1, control_hz=10_000))
     physics._qpos[0, :7] = 0, 0, 3, 0.5, 0.5, -0.5, 0.5
     physics._qvel[0, :6] = 1, 2, 3, 0.4, -0.5, 0.6
@@ -405,7 +405,7 @@ def test_a_reset_row_remembers_nothing():
     pose = fresh.read().base_pose[:1]
     used.reset(torch.tensor([2]), pose, DEFAULT[None])
     assert torch.equal(used.state()[[0, 1, 3]], others)
-    # Of the integration state all is as new: warm start and time included.
+    # The whole integration state is as new, including warm start and time.
     assert torch.equal(used.state()[2], fresh.state()[2])
 
 
@@ -432,7 +432,7 @@ def test_a_diverged_row_is_told_and_finite_and_harms_no_other(
         assert torch.equal(got[[0, 2, 3]], getattr(truth, field.name)[[0, 2, 3]])
     assert torch.equal(result.power[[0, 2, 3]], expected.power[[0, 2, 3]])
     assert result.power.isfinite().all()
-    # Once reset, the row goes on as any other.
+    # After a reset the row continues like any other.
     pose = torch.tensor([[0, 0, H1_2.default_base_height, 1, 0, 0, 0]])
     for one in (reference, physics):
         one.reset(torch.tensor([1]), pose, DEFAULT[None])

@@ -1,4 +1,4 @@
-"""Randomisation for the real world: what is drawn, what it does, what stays exact."""
+"""Domain randomisation: what is drawn, its effects, and what stays exact."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ def make(num_envs: int = 4, **ranges) -> DodgeballEnv:
 
 
 def model_of(env: DodgeballEnv, row: int) -> mujoco.MjModel:
-    """The model that MuJoCo simulates a row with."""
+    """Return the model with which MuJoCo simulates a row."""
     assert isinstance(env.physics, MujocoPhysics)
     return env.physics._batch.get_model(row)
 
 
 def play(env: DodgeballEnv, steps: int, root=None):
-    """Return the states of some steps of a fixed flailing, ``[T]``, and the root."""
+    """Return the states under fixed flailing actions, ``[T]``, and the root."""
     root = env.reset() if root is None else root
     states = []
     for step in range(steps):
@@ -85,7 +85,7 @@ def test_a_row_has_the_robot_that_its_variation_says():
             assert (-low, high) == pytest.approx((limit, limit), rel=1e-6)
             high = model.jnt_actfrcrange[model.joint(joint).id, 1]
             assert high == pytest.approx(limit, rel=1e-6)
-        # What follows from masses does follow.
+        # Quantities derived from the masses change with them.
         mass = model.body_mass[model.body("pelvis").id :][: len(H1_2.links)].sum()
         assert model.body("pelvis").subtreemass == pytest.approx(mass)
     assert own.link_mass.std() > 0.1
@@ -107,7 +107,7 @@ def test_actions_come_late_by_whole_steps():
     plain, _ = play(make(), 12)
     for delay in (1, 2):
         late, _ = play(make(delay_steps=(delay, delay)), 12)
-        # Nothing acts before, and then the first action.
+        # No action takes effect before the delay; then the first one does.
         root = make().reset()
         env = make()
         root = env.reset()
@@ -183,7 +183,7 @@ def test_it_is_a_matter_of_training_a_standard_judges_the_model():
 @pytest.mark.parametrize(
     ("ranges", "told"),
     [
-        ({"gains": (1.2, 0.8)}, "must be"),
+        ({"gains": (1.2, 0.8)}, r"gains must be \(low, high\) with low <= high"),
         ({"link_mass": (0.0, 1.0)}, "at least 0.01"),
         ({"delay_steps": (0, 101)}, "at most 100"),
     ],

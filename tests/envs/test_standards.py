@@ -1,4 +1,4 @@
-"""Versions of the standard throw: frozen, told apart, and version 2 is the default."""
+"""Versions of the standard throw: frozen, recognised, and version 2 is the default."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from egoskin.envs.standards import (
 from egoskin.envs.throws import ThrowConfig
 from egoskin.make import EnvConfig
 
-# Every value, once more: a standard never changes. A better throw is a new version.
+# All values are repeated here: a standard never changes; a better one is a new version.
 SHARED = {
     "radius": 0.15,
     "num_balls": 2,
@@ -75,7 +75,7 @@ def test_the_defaults_are_version_2():
 
 
 def test_a_version_leaves_the_rest_of_a_task_alone():
-    # How the robot is driven and rewarded belongs to no standard.
+    # The robot's control and rewards are not part of any standard.
     own = DodgeballConfig(
         physics=PhysicsConfig(substeps=8),
         reward=RewardConfig(energy=-1.0),

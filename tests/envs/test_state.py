@@ -1,4 +1,4 @@
-"""The table of the state: what it says of the keys is what the code does with them."""
+"""The table of state keys agrees with what the code does with them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SENSORS = (
 
 
 def read_by_transforms(room: str) -> set[str]:
-    """Keys of the table that the transforms of a room read, in some environments."""
+    """Return the table's keys that the transforms of a package read."""
     read = set()
     for sensor in SENSORS:
         config = EnvConfig(task=TASK, sensor=sensor, previous_action=True)

@@ -1,4 +1,4 @@
-"""Thrown balls, flown by MuJoCo, pass through the points they are aimed at."""
+"""Thrown balls, simulated by MuJoCo, pass through the points they are aimed at."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def draw(thrower: Thrower, n: int = N, seed: int = 0):
 
 
 def poses(n: int = N, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
-    """Leaning robots anywhere on the floor: base poses and joint positions."""
+    """Return base poses and joint positions of leaning robots all over the floor."""
     generator = torch.Generator().manual_seed(seed)
     quat = torch.randn(n, 4, generator=generator) * torch.tensor([1, 0.1, 0.1, 1])
     position = 4 * torch.rand(n, 3, generator=generator) - 2
@@ -45,7 +45,7 @@ def poses(n: int = N, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def heading(base_pose: torch.Tensor) -> torch.Tensor:
-    """Angle of the base's x axis over the plane."""
+    """Return the elevation of the base's x axis above the plane."""
     x = base_pose.new_tensor([1.0, 0, 0]).expand(len(base_pose), 3)
     forward = rotate(base_pose[:, 3:], x)
     return torch.atan2(forward[:, 1], forward[:, 0])
@@ -58,7 +58,7 @@ def aim_points(thrower: Thrower, drawn, base_pose, joint_pos) -> torch.Tensor:
 
 
 def fly(release: Release, config: ThrowConfig, steps: int = 240) -> torch.Tensor:
-    """Positions of balls in MuJoCo, the robot out of the way, ``[steps + 1, n, 3]``."""
+    """Return ball positions in MuJoCo, without the robot, ``[steps + 1, n, 3]``."""
     scene = Scene(
         robot=H1_2,
         objects=config.balls[:1],
@@ -81,7 +81,7 @@ def fly(release: Release, config: ThrowConfig, steps: int = 240) -> torch.Tensor
 
 
 def closest(path: torch.Tensor, target: torch.Tensor, velocity: torch.Tensor):
-    """Least distance between balls and points that move steadily, ``[n]``."""
+    """Return the least distance of balls from points at constant velocity, ``[n]``."""
     time = torch.arange(len(path))[:, None, None] * PHYSICS.timestep
     gap = path - (target + velocity * time)
     a, b = gap[:-1], gap[1:]
@@ -104,7 +104,7 @@ def test_the_ball_passes_through_the_point_led_by_the_base(flight, aim, lead):
     velocity = 2 * torch.rand(N, 3, generator=generator) - 1
     target = aim_points(thrower, drawn, base_pose, joint_pos)
     release = thrower.release(drawn, base_pose, velocity, joint_pos)
-    # Only the planar velocity is led: a base that bobs does not go on rising.
+    # Only the planar velocity is led: a bobbing base does not keep rising.
     run = lead * velocity * torch.tensor([1.0, 1, 0])
     assert closest(fly(release, config), target, run).max() < 0.01
 
@@ -146,7 +146,7 @@ def test_the_body_is_aimed_at_without_shins_and_feet_and_the_skin_without_legs()
     )
     assert not any("knee" in name or "ankle" in name for name in body)
     assert any("hip" in name for name in body)
-    # The torso, which bears the head, and the arms: all links that a skin can be on
+    # The torso, which carries the head, and the arms: all links that can have a skin
     # and that have a shape.
     solid = {shape.link for shape in H1_2.primitives}
     assert skin == set(H1_2.skin_links) & solid
@@ -248,7 +248,7 @@ def test_the_first_delay_is_uniform_over_its_range():
 def test_the_first_delay_is_drawn_from_a_stream_of_its_own():
     config = ThrowConfig()
     value = delays(config)
-    # Fixed for good, like the throws: one number of this seed, row and episode.
+    # Fixed, like the throws: one number for each seed, row and episode.
     row = torch.arange(4096)
     u = uniform(0, Stream.FIRST_DELAY, row, row * 0, row * 0, 1)[:, 0]
     assert torch.equal(value, 2 * u)
@@ -259,7 +259,7 @@ def test_the_first_delay_is_drawn_from_a_stream_of_its_own():
     values = [drawn.azimuth, drawn.distance, drawn.height, drawn.speed, drawn.interval]
     for other in (*values, *drawn.target.T):
         assert np.corrcoef(value, other)[0, 1] == pytest.approx(0, abs=5 / 64)
-    # And what is thrown does not depend on it.
+    # The throws do not depend on it.
     at_once = draw(make(ThrowConfig(first_delay=(0.0, 0.0))), 4096)
     for name in ("azimuth", "distance", "height", "speed", "interval", "target"):
         assert torch.equal(getattr(drawn, name), getattr(at_once, name)), name
@@ -296,7 +296,7 @@ def test_a_throw_is_released_where_its_draw_says():
     gap = release.position[:, :2] - base_pose[:, :2]
     torch.testing.assert_close(gap.norm(dim=-1), drawn.distance)
     torch.testing.assert_close(release.position[:, 2], drawn.height)
-    # Where it comes from, seen from the robot's heading.
+    # The direction it comes from, relative to the robot's heading.
     angle = torch.atan2(gap[:, 1], gap[:, 0]) - heading(base_pose)
     angle = torch.rad2deg(torch.atan2(angle.sin(), angle.cos()))
     torch.testing.assert_close(angle, torch.rad2deg(drawn.azimuth), atol=1e-3, rtol=0)
@@ -333,7 +333,7 @@ LEVEL = ThrowConfig(
 
 
 def test_a_vertical_fall_of_the_height_by_hand():
-    # A robot of no velocity, ball 4 m ahead at 4 m/s: 1 s of flight. To a target at
+    # A robot at rest, ball 4 m ahead at 4 m/s: 1 s of flight. To a target at
     # the height of release: vz = g (T + dt) / 2 = 9.81 (1 + 1/120) / 2 = 4.945875.
     config = replace(LEVEL, speed=(4.0, 4.0), azimuth_deg=(0.0, 0.0))
     thrower = make(config)
@@ -412,7 +412,7 @@ def test_every_throw_hits_a_rigid_robot(flight, aim, request, capsys):
         step = step["next"]
         survival += alive / 60
         ended = alive & step["done"][:, 0]
-        # By the first ball, by nothing else, and counted as arrived, not as avoided.
+        # Only by the first ball, which counts as arrived, not as avoided.
         assert step["hit"][ended].all()
         assert not step["fallen"][ended].any()
         assert (step["balls_arrived"][ended] == torch.tensor([1.0, 0])).all()
@@ -430,10 +430,13 @@ def test_every_throw_hits_a_rigid_robot(flight, aim, request, capsys):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"interval": (2.0, 1.0)}, r"interval must be \(low, high\), got \(2.0, 1.0\)"),
-        ({"azimuth_deg": (10.0, -10.0)}, r"azimuth_deg must be \(low, high\)"),
+        (
+            {"interval": (2.0, 1.0)},
+            r"interval must be \(low, high\) with low <= high, got \(2.0, 1.0\)",
+        ),
+        ({"azimuth_deg": (10.0, -10.0)}, r"azimuth_deg must be \(low, high\) with"),
         ({"height": (0.0, 1.0)}, "height must be positive"),
-        ({"first_delay": (2.0, 1.0)}, r"first_delay must be \(low, high\), got"),
+        ({"first_delay": (2.0, 1.0)}, r"first_delay must be \(low, high\) with low <="),
         (
             {"first_delay": (-0.5, 1.0)},
             r"first_delay must not be negative, got \(-0.5, 1.0\)",

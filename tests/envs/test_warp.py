@@ -51,13 +51,13 @@ J = len(DEFAULT)
 
 
 def scene(radius: float = 0.15, **options: Any) -> Scene:
-    """The robot and two balls."""
+    """Return a scene with the robot and two balls."""
     options = {"config": PhysicsConfig(), **options}
     return Scene(robot=H1_2, objects=(Sphere(radius=radius),) * 2, **options)
 
 
 def engines(num_envs: int, **options: Any) -> list[Physics]:
-    """MuJoCo and Warp with the same scene."""
+    """Return MuJoCo and Warp with the same scene."""
     return [engine_of(name)(scene(**options), num_envs) for name in ("mujoco", "warp")]
 
 
@@ -70,7 +70,7 @@ def put(physics: Physics, n: int, height: float = 0.0, noise: float = 0.0) -> No
 
 
 def stepping(step: int) -> torch.Tensor:
-    """Targets of a robot that steps on the spot, ``[J]``."""
+    """Return the targets of a robot that steps on the spot, ``[J]``."""
     swing, target = math.sin(2 * math.pi * 1.2 * step / 60), DEFAULT.clone()
     for i, name in enumerate(H1_2.joints):
         lift = max(swing if name.startswith("left") else -swing, 0.0)
@@ -88,7 +88,7 @@ def largest_gaps(one: PhysicsState, other: PhysicsState) -> dict[str, float]:
 
 
 def check(gaps: dict[str, float], **limits: float) -> None:
-    """Show the gaps, and compare them with their limits."""
+    """Print the gaps and compare them with their limits."""
     print({name: f"{gap:.1e}" for name, gap in gaps.items()})
     assert not {name: gaps[name] for name, x in limits.items() if gaps[name] > x}
 
@@ -150,7 +150,7 @@ def test_for_fifty_steps_a_robot_stands_and_steps_as_with_mujoco(motion):
 
 
 def test_balls_that_hit_or_miss_by_two_centimetres_do_so_here_as_well():
-    # Balls 2 cm smaller that hit, and 2 cm larger that miss, leave no doubt.
+    # Unambiguous: hits with 2 cm smaller balls, and misses with 2 cm larger ones.
     n, steps = 96, 50
     config = EnvConfig().task
     thrower = Thrower(config.throws, H1_2, config.physics.timestep)
@@ -218,7 +218,7 @@ def test_robots_that_differ_do_so_as_with_mujoco():
     for physics in both:
         put(physics, n, noise=0.05)
         physics.vary(torch.arange(n), variation)
-        # A reset leaves it as it is.
+        # A reset keeps the variation.
         put(physics, n, noise=0.05)
     active = torch.zeros(n, 2, dtype=torch.bool)
     for step in range(20):
@@ -228,7 +228,7 @@ def test_robots_that_differ_do_so_as_with_mujoco():
     torch.testing.assert_close(*saturation, rtol=0, atol=0.03)
     gaps = largest_gaps(both[0].read(), both[1].read())
     check(gaps, base_pose=1e-4, joint_pos=1e-3)
-    # It is another robot.
+    # The robot without variation moves differently.
     plain = engine_of("mujoco")(scene(), n)
     put(plain, n, noise=0.05)
     for step in range(20):
@@ -239,7 +239,7 @@ def test_robots_that_differ_do_so_as_with_mujoco():
 def test_a_policy_dodges_as_well_as_with_mujoco():
     throws, policy = 256, load_policy("field_proximity")
     config = standard_task(policy.env_config)
-    # Three seconds are what success is read at.
+    # Success is measured after three seconds.
     task = replace(config.task, episode_length_s=config.task.success_s)
     config = replace(config, task=task)
     failed = []
@@ -250,7 +250,7 @@ def test_a_policy_dodges_as_well_as_with_mujoco():
             policy.skin,
             throw_set=0,
             episodes=throws,
-            # In this process.
+            # Simulates in this process.
             watch=lambda *step: None,
             engine=engine,
         )
@@ -282,7 +282,7 @@ def test_a_loaded_state_continues_bit_for_bit_in_any_number_of_rows(target_veloc
     for physics in (whole, other):
         put(physics, 8)
     flail(whole, 8, 20)
-    # Another past, of which nothing may be left.
+    # Another history, of which nothing may remain.
     flail(other, 8, 3, seed=4)
     saved = whole.state()
     other.load_state(saved)
@@ -326,16 +326,16 @@ def test_contacts_that_do_not_fit_are_told_with_the_cure(monkeypatch):
     note = physics.note()
     assert note is not None
     assert "2 contacts" in note
-    assert "set EGOSKIN_WARP_CONTACTS to more" in note
+    assert "increase EGOSKIN_WARP_CONTACTS" in note
     assert physics.note() is None
     monkeypatch.setenv("EGOSKIN_WARP_CONTACTS", "many")
-    with pytest.raises(ValueError, match="EGOSKIN_WARP_CONTACTS must be a number"):
+    with pytest.raises(ValueError, match="EGOSKIN_WARP_CONTACTS must be a positive"):
         engine_of("warp")(scene(), 2)
 
 
 def test_what_it_cannot_simulate_is_refused_by_name():
     many = Scene(robot=H1_2, objects=(Sphere(),) * 20, config=PhysicsConfig())
-    with pytest.raises(ValueError, match="MuJoCo Warp cannot make the scene: Dense"):
+    with pytest.raises(ValueError, match="MuJoCo Warp cannot load the scene: Dense"):
         engine_of("warp")(many, 1)
 
 
@@ -357,7 +357,7 @@ def test_a_training_is_repeated_and_gone_on_with_bit_for_bit(tmp_path: Path):
     done = call("train", "--resume", tmp_path / "half", "--engine", "mujoco")
     assert done.returncode == 2
     assert "changed: engine" in done.stderr
-    # It plays on the other engine.
+    # It also runs on the other engine.
     done = call("evaluate", tmp_path / "whole", "--episodes", "2")
     assert done.returncode == 0
 
@@ -375,7 +375,7 @@ def test_an_environment_gives_what_its_specs_say():
 
 
 class Reads(TorchDispatchMode):
-    """Counts what makes a device wait for the host: numbers read, and row indices."""
+    """Counts operations that make a device wait for the host: reads and row indices."""
 
     def __init__(self) -> None:
         super().__init__()

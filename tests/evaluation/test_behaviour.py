@@ -1,4 +1,4 @@
-"""What a policy does: every ball told apart, figures by hand, nothing disturbed."""
+"""Behaviour of a policy: each ball separately, values by hand, no side effects."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def make(**task) -> EnvConfig:
 
 @pytest.fixture(scope="module")
 def rigid() -> tuple[Watcher, Episodes, EnvConfig]:
-    """The rigid robot on a throw set of balls that fly beside it."""
+    """Return results of the rigid robot on a throw set of balls that fly past it."""
     config = make(throws=BESIDE)
     watcher = Watcher(config, 0, LAST)
     skin = config.skin.build(H1_2)
@@ -51,7 +51,7 @@ def test_balls_are_those_that_the_environment_counts(rigid):
     assert torch.equal(avoided[:, :1].sum(1), played.avoided[:, 0].long())
     assert torch.equal(avoided[:, 1:].sum(1), played.avoided[:, 1].long())
     assert torch.equal(hit.any(1), played.hit)
-    # Both kinds occur, and an episode is ended by one ball (or two at once).
+    # Both kinds occur, and one ball (or two at once) ends an episode.
     assert 0 < int(hit[:, 0].sum()) < LAST
     assert int(hit[:, 1:].sum()) > 10
     assert int(hit.sum(1).max()) <= 2
@@ -60,7 +60,7 @@ def test_balls_are_those_that_the_environment_counts(rigid):
 def test_groups_of_a_kind_share_out_all_throws(rigid):
     watcher, played, config = rigid
     groups = watcher.groups()
-    # No link is aimed at by throws into a box.
+    # Throws into a box aim at no link.
     assert list(groups) == [
         "number of the ball",
         "direction",
@@ -128,7 +128,7 @@ def test_a_sector_of_throws_is_one_quarter():
         later_hits=None,
         later_balls=0,
     )
-    # Both sides of the body together.
+    # Left and right links are counted together.
     names = [g.name for g in groups["link aimed at"]]
     assert "hip_roll" in names
     assert not any("left" in name or "right" in name for name in names)
@@ -158,7 +158,7 @@ def test_heights_and_speeds_are_split_at_their_bounds():
 
 
 def state(n: int, **values) -> TensorDict:
-    """Robots standing in their default pose, but for some values."""
+    """Return states of robots in their default pose, except for some values."""
     pose = torch.tensor([0.0, 0, H1_2.default_base_height, 1, 0, 0, 0])
     never = torch.zeros(n, 1, dtype=torch.bool)
     return TensorDict(
@@ -215,7 +215,7 @@ def test_waiting_by_hand():
     for step in range(1, 61):
         after = state(
             3,
-            # 3, 4 and 12 m/s over the floor: 5 m/s; what goes up does not count.
+            # (3, 4, 12) m/s is 5 m/s over the floor; the vertical speed does not count.
             base_lin_vel_w=torch.tensor([[3.0, 4, 12], [9, 9, 9], [0, 0, 0]]),
             power=torch.tensor([[float(step)], [999], [7]]),
             first_throw_step=wait,
@@ -236,7 +236,7 @@ def test_nobody_waits_for_a_ball_that_is_thrown_at_the_start(rigid):
 
 
 def test_success_is_counted_from_the_first_throw():
-    # The limit is 180 steps after it: at 20 + 180 it fails, at 20 + 181 no more.
+    # The limit is 180 steps after it: 20 + 180 is a failure, 20 + 181 is not.
     wait = torch.full((3, 1), 20)
     throws = replace(AT_ONCE, first_delay=(0.0, 1.0))
     watcher = Watcher(make(throws=throws), 0, 3)
@@ -264,7 +264,7 @@ def test_balls_after_a_delay_are_those_that_the_environment_counts():
         assert torch.equal(seen[:, 0].long(), counted[:, 0].long())
         assert torch.equal(seen[:, 1:].sum(1), counted[:, 1].long())
     assert int(arrived[:, 1:].sum()) > 10
-    # Held rigid it does not move; it still pays for holding on to its pose or not.
+    # Held rigid, it does not move.
     assert watcher.waiting().base_speed == pytest.approx(0, abs=1e-6)
     assert watcher.waiting().fallen == 0
 
@@ -277,7 +277,7 @@ def test_a_foot_that_rolls_over_its_toes_does_not_slide():
     corners = watcher._feet.corners_w(before)[0].reshape(-1, 3)
     toe = corners[corners[:, 0].argmax()].clone()
     toe[2] = corners[:, 2].min()
-    # Both robots lean on their toes; the second leans farther about the same line.
+    # Both robots lean over their toes, the second one farther about the same line.
     for td, angle in ((before, 1), (after, 2)):
         for _ in range(angle):
             w, y = turn[0], turn[2]

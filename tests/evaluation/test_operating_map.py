@@ -1,4 +1,4 @@
-"""The operating map: each throw is what its place says, and success is what it is."""
+"""The operating map: throws have the properties of their point; success is right."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_the_map_varies_what_it_says_alone_and_two_together():
     assert [n[0] for n in names[:2]] == [speed, tempo]
     assert names[-1] == (speed, tempo)
     assert [len(n) for n in names] == [1, 1, 1, 1, 2]
-    # Within what is trained on and beyond it, on both sides.
+    # Within the training range and beyond it, on both sides.
     for (what,) in maps._MAPS[:2]:
         low, high = what.trained(TASK.throws) or (0, 0)
         inside = [v for v in what.values if low <= v <= high]
@@ -102,7 +102,7 @@ def test_no_ball_is_thrown_again_before_it_has_passed(changes, number):
 
 
 def test_slow_balls_in_a_fast_sequence_all_arrive():
-    # Held rigid and thrown past it: nothing is lost in flight. With two balls each
+    # The robot is rigid and balls fly past: none is lost in flight. With two balls each
     # would be taken away after a second, half of its way.
     throws = ThrowConfig(
         first_delay=(0.0, 0.0),
@@ -167,7 +167,7 @@ def test_an_operating_map_is_the_success_on_each_throw(monkeypatch):
         assert point.success == summarize(played, played, task).success
         avoided = float(played.avoided.sum() / played.arrived.sum())
         assert point.avoided == pytest.approx(avoided)
-    # A robot that does nothing lasts a second with slow balls, and not with fast ones.
+    # A passive robot lasts a second with slow balls, but not with fast ones.
     assert alone.points[0].success.mean > alone.points[1].success.mean
 
 
@@ -216,7 +216,7 @@ def test_a_map_is_drawn_with_its_numbers(suffix, tmp_path):
 
 def test_no_map_is_made_of_an_actor_that_observes_each_ball():
     config = EnvConfig(task=TASK, sensor=SensorConfig(coverage="oracle"))
-    message = "a map takes more balls than the 2 that an oracle"
+    message = "may need more balls than the 2 that an oracle observes"
     with pytest.raises(ValueError, match=message):
         check_map(config)
     with pytest.raises(ValueError, match=message):

@@ -1,4 +1,4 @@
-"""Evaluation: figures by hand, the same throw set for all, intervals."""
+"""Evaluation: values by hand, the same throw set for all policies, intervals."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_figures_of_six_episodes_by_hand():
     )
     result = summarize(played, rigid, DodgeballConfig())
     assert result.success.mean == pytest.approx(2 / 6)
-    # 5 s are 300 steps: only the one that lasts.
+    # 5 s are 300 steps: only the one that lasts is a success.
     assert result.success_5s.mean == pytest.approx(1 / 6)
     shares = (
         result.ended_by_ball,
@@ -89,7 +89,7 @@ def test_figures_of_six_episodes_by_hand():
 
 
 def test_success_is_read_at_the_age_of_the_task():
-    # At 60 Hz 1 s are 60 steps: the ball at 60 comes in time to fail, that at 61 not.
+    # At 60 Hz 1 s is 60 steps: a ball at step 60 is a failure, one at 61 is not.
     played = Episodes(
         steps=torch.tensor([60, 61]),
         hit=flags(1, 1),
@@ -190,7 +190,7 @@ def test_a_throw_set_ends_the_same_in_this_process_and_on_2_workers():
     weights = 0.5 * torch.randn(64, 21)
 
     def policy(td):
-        # Reads the signal, so that sensors take part.
+        # Reads the signal, so that the sensors are used.
         return td.set("action", td["signal"] @ weights - weights.sum(0))
 
     class Module(torch.nn.Module):
@@ -220,7 +220,7 @@ def delayed(delay: tuple[float, float], **throws) -> EnvConfig:
 
 @pytest.mark.parametrize("num_workers", [None, pytest.param(2, marks=pytest.mark.slow)])
 def test_episodes_count_from_the_first_throw_whatever_the_delay(num_workers):
-    # The rigid robot stands where it stands, and meets the same throws.
+    # The rigid robot does not move and gets the same throws.
     which = {"throw_set": 3, "episodes": 32, "hold": True, "num_workers": num_workers}
     at_once, late = (
         play_throws(None, config, skin_of(config), **which)
@@ -244,7 +244,7 @@ def test_an_episode_lasts_its_whole_length_after_the_latest_first_throw():
 
 
 class Still(torch.nn.Module):
-    """The same action at every step."""
+    """A policy that gives the same action at every step."""
 
     def __init__(self, action: torch.Tensor) -> None:
         super().__init__()
@@ -288,7 +288,7 @@ def test_ends_by_self_contact_are_told_apart():
     played = play_throws(Module(), config, skin, throw_set=0, episodes=32)
     assert played.self_contact[:16].all()
     assert not played.self_contact[16:].any()
-    # Every episode has one cause of its end.
+    # Every episode has exactly one cause of its end.
     causes = (played.hit, played.fallen, played.diverged, played.self_contact)
     assert (torch.stack(causes).sum(0) == 1).all()
 

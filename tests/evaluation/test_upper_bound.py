@@ -1,4 +1,4 @@
-"""What the body could still do: a search starts where the policy is, and only adds."""
+"""Upper bound: the search starts at the policy's plan and only improves on it."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SEARCH = SearchConfig(samples=24, iterations=3, stand_s=0.75)
 
 @pytest.fixture(scope="module")
 def policy() -> Policy:
-    # Of the balls of version 1 it leaves the search some to avoid.
+    # It is hit by some balls of version 1, which the search can avoid.
     return load_policy(RUN / "policies/000065536000.safetensors")
 
 
@@ -136,7 +136,7 @@ def test_the_step_of_a_hit_is_not_survived(policy: Policy):
 
 @pytest.mark.slow
 def test_an_age_limit_is_no_fall(policy: Policy, bound: UpperBound):
-    # Every plan crosses it: the balls come into reach from about 0.35 to 1 s on.
+    # Every plan crosses it: the balls come into reach after about 0.35 to 1 s.
     long = task(policy)
     short = replace(long, task=replace(long.task, episode_length_s=1.05))
     which = {"throw_set": 0, "throws": THROWS, "reach": 2.0}

@@ -1,4 +1,4 @@
-"""What a skin sees: by hand on a ball-shaped robot, by MuJoCo on the H1-2."""
+"""Visibility: by hand on a ball-shaped robot, by MuJoCo on the H1-2."""
 
 from __future__ import annotations
 
@@ -42,19 +42,19 @@ RHO = 0.2
 
 @pytest.fixture
 def ball_robot(small_robot):
-    """A ball 3 m above ground, with a foot too small to matter."""
+    """Return a ball 3 m above ground, with a foot of negligible size."""
     return small_robot(f"<geom size='{RHO}'/><geom size='0.01' pos='2 -2 -3'/>")
 
 
 def sensors(*poses, **options) -> Skin:
-    """Sensors on the ball-shaped robot: (position, normal) each."""
+    """Return sensors on the ball-shaped robot, from (position, normal) each."""
     position, normal = (np.array(x, dtype=float) for x in zip(*poses, strict=True))
     links = ("base",) * len(position)
     return Skin(robot="small", links=links, position=position, normal=normal, **options)
 
 
 def traced(body, paths, skin, configs, ranges) -> Trace:
-    """What sensors see of the ball on given paths."""
+    """Return the trace of the sensors for balls on given paths."""
     made = pipelines(body.config, skin, configs, max(ranges))
     return trace(body, paths, skin, made, ranges, BALL)
 
@@ -84,7 +84,7 @@ def test_distances_to_the_body_are_those_of_mujoco():
             if g != geom
         )
         assert ours - 0.15 == pytest.approx(theirs, abs=1e-6)
-    # A bound may stand for what is far, never for what is near.
+    # A bound may replace the distance of far objects, never that of near ones.
     bounded = body.distance(points, within=0.3)
     near = body.distance(points) <= 0.3
     assert near.any()
@@ -110,7 +110,7 @@ def test_throws_fly_and_hit_as_they_do_in_the_simulation():
     body = StandingRobot(H1_2)
     dt = config.physics.timestep
     paths, _ = throw_paths(body, config.throws, rows, seed, dt)
-    # Whatever the heading: height, and distance from the base at the origin.
+    # For any heading: height, and distance from the base at the origin.
     index = round(1 / 3 / THROW_STEP)
     way = paths[:, index] + (1 / 3 - index * THROW_STEP) * (
         (paths[:, index + 1] - paths[:, index]) / THROW_STEP
@@ -127,7 +127,7 @@ def test_throws_fly_and_hit_as_they_do_in_the_simulation():
     seen = traced(body, paths, skin, FIELD, [1.0])
     assert seen.touches.all()
     late = hit_at / config.physics.control_hz - THROW_STEP * seen.contact
-    # The hit is reported at the end of the control step that it falls into.
+    # The hit is reported at the end of the control step in which it happens.
     assert late.min() > -THROW_STEP
     assert late.max() < 1 / config.physics.control_hz + dt
 
@@ -137,7 +137,7 @@ def test_no_part_of_the_body_is_beyond_its_reach(small_robot):
     capsule = StandingRobot(small_robot("<geom type='capsule' size='0.1 0.5'/>"))
     assert capsule.reach == pytest.approx(0.6)
     body = StandingRobot(H1_2)
-    # A ball of next to no size ends on the surface.
+    # A ball of almost no size ends on the surface.
     points = surface_paths(body, Sphere(radius=1e-6), 0.1, 0)[0][:, -1].numpy()
     assert np.linalg.norm(points - body.origin, axis=-1).max() < body.reach
 
@@ -217,7 +217,7 @@ def test_share_of_directions_and_of_surface_is_that_of_the_cap(ball_robot, max_r
         assert share(0.06) - 0.01 < by_then < share(0.05) + 0.01
     # 1000 random points: standard deviation 1.6 %.
     assert cell["surface_blind"] == pytest.approx(1 - share(last), abs=0.05)
-    # The middle of what it does not see lies opposite.
+    # The centre of the unseen region is opposite.
     cone = cell["widest_blind_cone_deg"]
     azimuth, elevation = np.radians(cone["azimuth"]), np.radians(cone["elevation"])
     assert unit_vectors(azimuth, elevation) @ -outward > math.cos(math.radians(5))
@@ -258,7 +258,7 @@ def test_a_skin_that_sees_nothing_has_figures_of_nothing(ball_robot):
 
 
 def test_throws_that_miss_have_no_warning(ball_robot):
-    # Over its head.
+    # Above its head.
     over = ThrowConfig(
         flight="straight", aim="box", box_height=(6.0, 6.0), height=(6.0, 6.0)
     )
@@ -288,7 +288,7 @@ def test_points_behind_other_parts_are_not_reached(small_robot):
 
 
 def hand_made(num_sensors, contact) -> Trace:
-    """Traces whose gap is the number of steps left, over 100."""
+    """Return traces whose gap is the number of steps left divided by 100."""
     num_sensors, contact = torch.tensor(num_sensors), torch.tensor(contact)
     steps = torch.arange(num_sensors.shape[-1])
     gap = (contact[:, None] - steps) / 100
@@ -337,7 +337,7 @@ def body() -> StandingRobot:
 
 @pytest.fixture(scope="module")
 def paths(body) -> torch.Tensor:
-    """The flights of 24 throws, every fourth step."""
+    """Return the flights of 24 throws, every fourth step."""
     return throw_paths(body, ThrowConfig(), 24, 0, 1 / 120)[0][:, ::4]
 
 
@@ -383,7 +383,7 @@ def test_sensors_of_their_own_kind_and_range_keep_them(body, paths, skin):
     rays = traced(body, paths, even, RAY, [1.0]).num_sensors[0]
     fields = traced(body, paths, odd, FIELD, [2.0]).num_sensors[0]
     assert torch.equal(got, rays + fields)
-    # Rays are asked for, and there is none.
+    # Rays are requested, but there are none.
     own = replace(odd, coverage=(Field(),) * 32)
     alone = traced(body, paths, own, RAY, [2.0]).num_sensors[0]
     assert torch.equal(alone, fields)
@@ -410,7 +410,10 @@ def test_nothing_is_seen_after_the_contact(thrown):
     [
         ({"ranges": [1.0, -1.0]}, "must be positive and finite"),
         ({"ranges": [math.inf]}, "must be positive and finite"),
-        ({"ranges": [0.5, 1.0, 0.5]}, "a range is given twice"),
+        (
+            {"ranges": [0.5, 1.0, 0.5]},
+            r"ranges must be distinct, got \[0.5, 1.0, 0.5\]",
+        ),
         ({"ranges": []}, "at least one coverage and one range"),
         ({"sensors": {}}, "at least one coverage and one range"),
         ({"num_throws": 0}, "num_throws must be at least 1"),
@@ -477,6 +480,6 @@ def test_bad_input_to_the_command_is_one_clear_message(
     done = call("visibility", *args)
     assert done.returncode == 2
     assert message in done.stderr
-    # Told before the analysis, not after it.
+    # Reported before the analysis, not after it.
     assert not done.stdout
     assert not list(tmp_path.iterdir())

@@ -23,7 +23,7 @@ ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 
 
 def bodies_below(model: mujoco.MjModel, base: str) -> list[int]:
-    """The base and all bodies that hang on it, in MuJoCo's order."""
+    """Return the base and all bodies below it, in MuJoCo's order."""
     found = [model.body(base).id]
     for body in range(1, model.nbody):
         if model.body_parentid[body] in found and body not in found:
@@ -39,7 +39,7 @@ def joints_below(model: mujoco.MjModel, base: str) -> list[int]:
 def mujoco_poses(
     model: mujoco.MjModel, base: str, joint_pos: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Poses of the bodies relative to the base, which is put somewhere."""
+    """Return the poses of the bodies relative to the base, itself at any pose."""
     data, base_id = mujoco.MjData(model), model.body(base).id
     bodies = bodies_below(model, base)
     address = model.jnt_qposadr[joints_below(model, base)]
@@ -62,7 +62,7 @@ def assert_poses_agree(
     expected: tuple[np.ndarray, np.ndarray],
     atol: float,
 ) -> None:
-    """Ours and pytorch-kinematics' poses are the expected ones."""
+    """Check that our poses and those of pytorch-kinematics are the expected ones."""
     position, rotation = LinkKinematics(chain, links).poses_b(joint_pos)
     np.testing.assert_allclose(position, expected[0], 0, atol)
     np.testing.assert_allclose(rotation, expected[1], 0, atol)
@@ -205,7 +205,7 @@ def test_made_names_differ_from_those_that_the_model_gives():
     joint_pos = torch.tensor([[0.3, 1.1, -0.4, 0.8, 0.2]], dtype=torch.float64)
     expected = mujoco_poses(model, "b", joint_pos.numpy())
     assert_poses_agree(chain, links, joint_pos, expected, 1e-12)
-    # yy, worked out: half a metre from y, turned by 1.1.
+    # Expected pose of yy: half a metre from y, turned by 1.1.
     position, _ = LinkKinematics(chain, ["yy"]).poses_b(joint_pos)
     yy = [0.5 * np.cos(1.1), 1 + 0.5 * np.sin(1.1), 0]
     np.testing.assert_allclose(position[0, 0], yy, atol=1e-12)
@@ -225,7 +225,7 @@ def test_a_row_of_bodies_too_long_to_follow_is_refused():
     for _ in range(1000):
         body = body.add_body()
         body.add_geom(size=[0.1, 0, 0])
-    with pytest.raises(ValueError, match="too many bodies hang on each other"):
+    with pytest.raises(ValueError, match="are nested too deeply"):
         build_chain(spec.compile(), "world")
 
 
@@ -239,7 +239,7 @@ def test_joint_limits_are_those_of_the_model():
 @pytest.mark.parametrize("kind", ["ball", "free"])
 def test_joints_that_no_chain_has_are_refused_by_name(kind):
     body = f"<body name='x'><geom size='.1'/><joint name='bad' type='{kind}'/></body>"
-    # MuJoCo itself takes a free joint only in a child of the world.
+    # MuJoCo itself allows a free joint only in a child of the world.
     model = mujoco.MjModel.from_xml_string(
         f"<mujoco><worldbody>{body}</worldbody></mujoco>"
     )
@@ -286,7 +286,7 @@ def urdf(extra: str = "") -> str:
 def test_a_urdf_chain_agrees_with_mujoco_and_takes_a_mimic_as_its_own_joint():
     chain = pk.build_chain_from_urdf(urdf())
     assert chain.get_joint_parameter_names() == ["j1", "j2", "j4", "j5"]
-    # MuJoCo would else merge l0 into the world and l3 into l2.
+    # Otherwise MuJoCo would merge l0 into the world and l3 into l2.
     static = "<mujoco><compiler fusestatic='false'/></mujoco>"
     model = mujoco.MjModel.from_xml_string(urdf(static))
     joint_pos = torch.from_numpy(np.random.default_rng(0).uniform(-2, 2, (30, 4)))

@@ -1,4 +1,4 @@
-"""The shell's measure on meshes made from the shell itself, without reference data."""
+"""The fit of the shell, on meshes made from the shell itself instead of real data."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def primitive_mesh(kind: int, size: np.ndarray):
 
 
 def write_meshes(directory: Path, grow: float = 0.0) -> Path:
-    """The directory, with every link's primitives as one STL, grown outwards [m]."""
+    """Write an STL of each link's primitives, grown outwards [m]; return the folder."""
     model = H1_2.model
     for link in H1_2.links:
         # Links without a shape still need a file: a speck inside their neighbours.
@@ -80,7 +80,7 @@ def test_distance_on_own_surface_shrinks_with_more_samples(own_meshes):
 
 def test_offset_of_20_mm_is_measured_as_20_mm(tmp_path):
     for fit in measure(write_meshes(tmp_path, grow=0.02)):
-        # Edges, ends and spacing add to the offset; seams between shapes take away.
+        # Edges, ends and spacing add to the offset; seams between shapes reduce it.
         # The grown chest ends above the height that parts torso and head: a loose
         # bound for those two.
         slack = 0.003 if "arm" in fit.region else 0.010

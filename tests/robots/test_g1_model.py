@@ -1,4 +1,4 @@
-"""The G1's model: figures typed from Unitree's description, shapes, contacts, skin."""
+"""The G1's model: values copied from Unitree's description, shapes, contacts, skin."""
 
 from __future__ import annotations
 

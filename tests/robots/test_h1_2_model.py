@@ -1,4 +1,4 @@
-"""The H1-2's model file: figures typed from Unitree's description, shapes, contacts."""
+"""The H1-2's model file: values copied from Unitree's description, shapes, contacts."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def test_every_link_has_a_shape_but_those_inside_their_neighbours(model):
 
 def test_balls_and_floor_meet_every_shape(model):
     assert np.all(model.geom_conaffinity & 3 == 3)
-    # The robot's own shapes announce neither, so the two bits are the world's alone.
+    # The robot's own shapes have neither bit in contype: the world alone has both.
     assert not np.any(model.geom_contype & 3)
 
 
@@ -183,7 +183,7 @@ def test_nothing_touches_with_joint_noise_of_a_tenth(model):
 @pytest.mark.parametrize(
     ("pose", "first", "second"),
     [
-        # Both hands before the chest, upper arms turned in: found by search.
+        # Both hands in front of the chest, upper arms turned in: found by search.
         (
             {
                 "shoulder_pitch": -0.95,

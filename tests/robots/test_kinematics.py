@@ -24,7 +24,7 @@ from egoskin.robots.kinematics import (
 from egoskin.rounding import sincos
 
 DTYPES = [torch.float32, torch.float64]
-# pytorch-kinematics holds the robot's constants in float32, whatever the joints are.
+# pytorch-kinematics stores the robot's constants in float32 for any joint dtype.
 TOLERANCE = 1e-6
 
 
@@ -34,7 +34,7 @@ def every_link() -> LinkKinematics:
 
 
 def mujoco_poses(joint_pos: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and rotations of all links, with the base at the world's origin."""
+    """Return positions and rotations of all links, the base at the world's origin."""
     model, data = H1_2.model, mujoco.MjData(H1_2.model)
     position, rotation = [], []
     for row in joint_pos.double().numpy():
@@ -87,7 +87,7 @@ URDF = """<robot name="r"><link name="base"/><link name="a"/><link name="b"/>
             'child link="a"',
             "two links of the chain have the name 'a'",
         ),
-        ("0 1 0", "0 0 0", "axis of joint 'second' must have a direction"),
+        ("0 1 0", "0 0 0", "axis of joint 'second' must not be zero"),
     ],
 )
 def test_a_chain_that_does_not_say_what_is_meant_is_refused(old, new, expected):

@@ -1,4 +1,4 @@
-"""Robots of one's own: from a folder or a file, kept as data, safe to load."""
+"""Your own robots: from a folder or a file, stored as data, safe to load."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_a_variable_of_a_python_file_is_a_robot(tmp_path):
     assert robot.joint_gains("one")[0].tolist() == [50] * 6
     with pytest.raises(ValueError, match="RobotConfig: ROBOT"):
         find_robot(f"{tmp_path}/mine.py:NOBODY")
-    with pytest.raises(ValueError, match="which robot"):
+    with pytest.raises(ValueError, match=r"lacks the name .*mine\.py:ROBOT"):
         find_robot(f"{tmp_path}/mine.py")
 
 
@@ -172,7 +172,7 @@ def test_balls_and_floor_meet_a_robot_that_was_not_made_for_them(pip):
     both = pip.model.geom_conaffinity & 3
     assert np.all(both == 3)
     assert not np.any(pip.model.geom_contype & 3)
-    # Its own shapes meet as before: MuJoCo's default is that all do.
+    # Its own shapes collide as before: by MuJoCo's default all of them do.
     assert np.all(pip.model.geom_contype & pip.model.geom_conaffinity)
 
 
@@ -197,7 +197,7 @@ def test_shapes_that_only_look_are_dropped_and_their_masses_stay(tmp_path):
         np.testing.assert_allclose(getattr(after.model, name)[1:], own, atol=1e-5)
     assert "mesh" not in (after.model_xml or "mesh")
     touching = text.replace('contype="0" conaffinity="0"', "")
-    with pytest.raises(ValueError, match=r"link .trunk. touches with a shape.* mesh"):
+    with pytest.raises(ValueError, match=r"link .trunk. has a collision shape.* mesh"):
         portable(read_folder(write_robot(tmp_path, model=touching)))
 
 
@@ -211,7 +211,7 @@ def test_the_base_of_a_urdf_floats(tmp_path):
     robot.check_floating_base()
     assert robot.torque_limit.tolist() == [30]
     assert robot.joint_range.T.tolist() == [[-0.5, 0.6]]
-    # A flat cylinder is a box: a sole, not a ball.
+    # A flat cylinder becomes a box: a sole, not a ball.
     assert [s.kind for s in robot.primitives] == ["box", "box"]
 
 
@@ -233,9 +233,9 @@ def test_names_of_the_package_stay_names():
 
 
 def test_a_robot_has_one_model():
-    with pytest.raises(ValueError, match="one of the two"):
+    with pytest.raises(ValueError, match="exactly one of model_path and model_xml"):
         RobotConfig(name="r", base="b", skin_links=())
-    with pytest.raises(ValueError, match="one of the two"):
+    with pytest.raises(ValueError, match="exactly one of model_path and model_xml"):
         dataclasses.replace(H1_2, model_xml="<mujoco/>")
 
 
@@ -293,7 +293,7 @@ HOSTILE = {
 
 @pytest.mark.parametrize("what", [*HOSTILE, "a path", "a script", "an entity", "deep"])
 def test_a_hostile_policy_reads_no_file_and_runs_nothing(what, trained, tmp_path):
-    # Valid in its place: it would load if it were read.
+    # A valid model: it would load if it were read.
     secret = tmp_path / "secret.xml"
     secret.write_text(MODEL)
     script = tmp_path / "evil.py"
@@ -317,14 +317,14 @@ def test_a_hostile_policy_reads_no_file_and_runs_nothing(what, trained, tmp_path
     save_tensors(file, tensors, {"policy": header["policy"]})
     opened = []
     watch_opens(opened, tmp_path)
-    with pytest.raises(ValueError, match=r"its model|is kept in a file|no robot"):
+    with pytest.raises(ValueError, match=r"its model|refers to a file|no robot"):
         egoskin.load_policy(file)
     assert [name for name in opened if name != str(file)] == []
     assert not (tmp_path / "ran").exists()
 
 
 def watch_opens(names: list[str], folder: Path) -> None:
-    """Note what Python opens in a folder from now on."""
+    """Record what Python opens in a folder from now on."""
     import sys
 
     def note(event: str, args: tuple) -> None:

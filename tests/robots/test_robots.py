@@ -1,4 +1,4 @@
-"""Robots of any kind wear sensors; the task takes those that stand on their own."""
+"""Any robot can carry sensors; the task needs one with a floating base."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ TABLE = (
 
 @pytest.fixture
 def make_arm(tmp_path: Path) -> Callable[..., RobotConfig]:
-    """Function of (base, MJCF before the arm): a fixed arm."""
+    """Return a function of (base, MJCF before the arm) that makes a fixed arm."""
 
     def make(base: str, before: str = "") -> RobotConfig:
         path = tmp_path / "arm.xml"
@@ -82,7 +82,7 @@ def any_robot(request, make_arm) -> RobotConfig:
 
 
 def posed(robot: RobotConfig, joint_pos: np.ndarray):
-    """MuJoCo's data with the joints so, and its view of the base."""
+    """Return MuJoCo's data at these joint positions, and its base."""
     data = mujoco.MjData(robot.model)
     # A free joint or the table's hinge comes first.
     data.qpos[robot.model.nq - len(joint_pos) :] = joint_pos
@@ -90,7 +90,7 @@ def posed(robot: RobotConfig, joint_pos: np.ndarray):
     return data, data.body(robot.base)
 
 
-# --- what is the robot's --------------------------------------------------------
+# --- what belongs to the robot --------------------------------------------------
 
 
 def test_joints_are_those_of_the_chain(any_robot):
@@ -122,7 +122,7 @@ def test_the_default_pose_is_that_of_mujoco(any_robot):
     data, base = posed(any_robot, any_robot.default_joint_pos)
     turn = base.xmat.reshape(3, 3).T
     position, rotation = default_frames(any_robot)
-    # What is not the robot's comes first.
+    # Other bodies come first.
     links = slice(-len(any_robot.links), None)
     expected = (data.xpos[links] - base.xpos) @ turn.T
     np.testing.assert_allclose(position, expected, 0, 5e-6)
@@ -155,7 +155,7 @@ def test_other_collision_shapes_are_refused_with_the_remedy(small_robot, kind):
         "<geom size='.1'/><body name='b'>"
         f"<geom name='odd' type='{kind}' size='.1 .1 .1'/></body>"
     )
-    text = rf"link 'b' .* geom 'odd', of kind {kind}, .* meshes=\{{'b': \[...\]\}}"
+    text = rf"link 'b' .* geom 'odd', of kind {kind}; .* meshes=\{{'b': \[...\]\}}"
     with pytest.raises(ValueError, match=text):
         place_sensors(robot, 5)
     with pytest.raises(ValueError, match=text):
@@ -174,7 +174,7 @@ def test_names_may_look_like_patterns(small_robot):
     assert set(place_sensors(robot, 30, links=links).links) == set(links)
 
 
-# --- robots of files ------------------------------------------------------------
+# --- robots from files ----------------------------------------------------------
 
 URDF = """<?xml version="1.0"?><!-- <mujoco> -->
 <robot name="crane"><link name="foot"/>
@@ -228,14 +228,14 @@ def test_an_mjcf_is_a_robot_whatever_stands_in_its_world(tmp_path):
         (
             "r.xml",
             "<mujoco><bod/></mujoco>",
-            "r.xml is no robot that MuJoCo can read: ",
+            "MuJoCo cannot load .*r.xml as a robot: ",
         ),
-        ("r.urdf", "", "r.urdf is no robot"),
+        ("r.urdf", "", "cannot load .*r.urdf as a robot"),
         ("r.csv", "Index,X", r"must be an MJCF \(.xml\) or a URDF"),
         (
             "r.xml",
             '<mujoco><asset><mesh name="m" file="m.stl"/></asset></mujoco>',
-            "r.xml is no robot .*m.stl",
+            "cannot load .*r.xml as a robot: .*m.stl",
         ),
     ],
 )
@@ -268,7 +268,7 @@ def test_sensors_lie_on_the_surface_of_any_robot(any_robot, method):
             distance_to(shape, position[None])[0]
             for shape in any_robot.primitives_on([link])
         ]
-        # Six decimals of a position.
+        # Positions are rounded to six decimals.
         assert min(own) == pytest.approx(0, abs=2e-6)
 
 

@@ -13,7 +13,7 @@ from egoskin.robots.surface import area, distance_to, sample_surface
 
 
 def by_link(points) -> list[tuple[str, np.ndarray, np.ndarray]]:
-    """(link, positions, normals) of each link that has points."""
+    """Return (link, positions, normals) of each link that has points."""
     return [
         (
             H1_2.links[i],
@@ -31,7 +31,7 @@ def points():
 
 @pytest.fixture(scope="module")
 def default_frames() -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Rotation and position of each link in the default pose, by MuJoCo."""
+    """Return rotation and position of each link in the default pose, by MuJoCo."""
     model, data = H1_2.model, mujoco.MjData(H1_2.model)
     data.qpos[7:] = H1_2.default_joint_pos
     mujoco.mj_kinematics(model, data)
@@ -87,7 +87,7 @@ def test_samples_lie_inside_no_shape_of_the_default_pose(points, default_frames)
         world = position @ turn.T + shift
         for shape in H1_2.primitives:
             turn, shift = default_frames[shape.link]
-            # Float32 offsets of the chain: a micrometre beyond the library's own.
+            # The chain's offsets are float32: a micrometre of additional error.
             assert distance_to(shape, (world - shift) @ turn).min() > -3e-6
 
 
@@ -109,7 +109,7 @@ def test_normals_are_unit_and_point_outwards(points):
                 ],
                 -1,
             ) / (2 * step)
-            # On the edge of a box there is none: leave out what lies within the step.
+            # There is none on the edge of a box: skip points within the step.
             smooth = np.abs(np.linalg.norm(gradient, axis=-1) - 1) < 1e-3
             assert smooth.mean() > 0.99
             np.testing.assert_allclose(gradient[smooth], along[smooth], atol=1e-3)
@@ -119,7 +119,7 @@ N = 20_000
 
 
 def share_error(share: float) -> float:
-    """Five standard errors of a share among N points."""
+    """Return five standard errors of a share among N points."""
     return 5 * (share * (1 - share) / N) ** 0.5
 
 
@@ -199,7 +199,7 @@ def test_what_another_shape_covers_gets_no_points(small_robot):
 
 def test_links_share_points_by_exposed_area(points):
     # Independent count: points of every primitive in proportion to its whole area,
-    # less those in other primitives, is what a different seed must reproduce.
+    # minus those in other primitives, which a different seed must reproduce.
     other = sample_surface(H1_2, H1_2.links, N, seed=99)
     for i in range(len(H1_2.links)):
         share = (other.link == i).mean()
@@ -227,8 +227,8 @@ def test_impossible_requests_are_refused(small_robot):
         sample_surface(H1_2, ["torso_link"], 0, seed=0)
     with pytest.raises(ValueError, match="h1_2 has no link 'torso'; its links are"):
         sample_surface(H1_2, ["pelvis", "torso"], 10, seed=0)
-    with pytest.raises(ValueError, match="carry no collision shape"):
+    with pytest.raises(ValueError, match="have no collision shape"):
         sample_surface(H1_2, ["left_wrist_yaw_link"], 10, seed=0)
     hidden = small_robot("<geom size='1'/><body name='in'><geom size='.5'/></body>")
-    with pytest.raises(ValueError, match="in lie inside others"):
+    with pytest.raises(ValueError, match="in lie inside other shapes"):
         sample_surface(hidden, ["in"], 10, seed=0)

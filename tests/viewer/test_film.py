@@ -1,4 +1,4 @@
-"""Films of made-up frames: text, moments, sheets, files. No OpenGL is needed."""
+"""Films of synthetic frames: text, moments, sheets, files; OpenGL is not needed."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def frame(
 
 
 def approach(n: int, closest: int) -> list[Frame]:
-    """A ball that comes nearest at one frame; brightness tells the frames apart."""
+    """Return frames with the ball closest in one; each has its own brightness."""
     return [
         frame(i / 10, 0.1 * (1 + abs(i - closest)), value=40 + 10 * (i % 20))
         for i in range(n)
@@ -76,7 +76,7 @@ def test_text_tells_the_time_and_what_there_is_besides():
     # Beside the middle of the picture.
     assert (picture[:30] != 100).any()
     assert (picture[45:] == 100).all()
-    # A blind robot and an empty sky leave only the time.
+    # A blind robot without a ball in flight leaves only the time.
     bare = annotate(frame(gap=math.inf, num_sensors=0))
     assert (bare[:, 40:] == 100).all()
     assert (bare != 100).any()
@@ -98,26 +98,26 @@ def test_a_sheet_is_a_grid_filled_up_with_white():
     sheet = contact_sheet(approach(5, closest=2), count=5, columns=3, size=(80, 60))
     assert sheet.shape == (120, 240, 3)
     assert (sheet[60:, 160:] == 255).all()
-    # The frames in order: each is brighter than the one before.
+    # The frames are in order: each is brighter than the previous one.
     cells = [sheet[50, 40 + 80 * i, 0] for i in range(3)]
     cells += [sheet[110, 40 + 80 * i, 0] for i in range(2)]
     assert cells == sorted(set(cells))
 
 
-# imageio_ffmpeg closes no pipe of an ffmpeg that has ended by itself.
+# imageio_ffmpeg does not close the pipe of an ffmpeg process that ended by itself.
 @pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
 @pytest.mark.parametrize("name", ["film.gif", "film.mp4"])
 def test_a_film_holds_the_frames_and_the_last_one_stands(name: str, tmp_path: Path):
     path = tmp_path / name
     save_film(path, approach(5, closest=2), fps=10)
-    # 5 frames of 100 ms and a second of the last.
+    # 5 frames of 100 ms, and one second of the last one.
     _, seconds = imageio_ffmpeg.count_frames_and_secs(path)
     assert seconds == pytest.approx(1.5, abs=0.05)
     assert list(tmp_path.iterdir()) == [path]
     reader = imageio_ffmpeg.read_frames(path)
     width, height = next(reader)["size"]
     assert (width, height) == (160, 90)
-    # Below the text each is brighter than the one before.
+    # Below the text each is brighter than the previous one.
     last = [np.frombuffer(each, np.uint8)[-1] for each in reader][:5]
     assert last == sorted(set(last))
 

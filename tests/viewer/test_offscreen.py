@@ -1,4 +1,4 @@
-"""Pictures of episodes: what must show, what must not, and where they come from."""
+"""Pictures of episodes: what is drawn, what is not, and which states are drawn."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def painter(robot: RobotConfig, skin: Skin) -> Iterator[Painter]:
 
 @pytest.fixture
 def standing(robot: RobotConfig) -> TensorDict:
-    """The robot in its default pose, facing +x; no ball, nothing detected."""
+    """Return the robot in its default pose, facing +x; no ball, nothing detected."""
     return TensorDict(
         base_pose=torch.tensor([0, 0, robot.default_base_height, 1, 0, 0, 0]).float(),
         joint_pos=torch.from_numpy(robot.default_joint_pos).float(),
@@ -62,7 +62,7 @@ def standing(robot: RobotConfig) -> TensorDict:
 
 
 def place_ball(state: TensorDict, x: float, y: float, z: float) -> TensorDict:
-    """The same state with the first ball in play at a place [m]."""
+    """Return the same state with the first ball in play at a position [m]."""
     state = state.clone()
     state["object_active"][0] = True
     state["object_pose"][0, :3] = torch.tensor([x, y, z])
@@ -74,13 +74,13 @@ def channels(frame: Frame) -> Iterator[np.ndarray]:
 
 
 def count_blue(frame: Frame) -> int:
-    """Pixels of a field sensor's line."""
+    """Return the number of pixels of field sensors' lines."""
     red, _, blue = channels(frame)
     return int((blue - red > 70).sum())
 
 
 def count_orange(frame: Frame) -> int:
-    """Pixels of a ball."""
+    """Return the number of pixels of balls."""
     red, _, blue = channels(frame)
     return int((red - blue > 60).sum())
 
@@ -115,7 +115,7 @@ def test_a_line_leads_from_a_sensor_that_detects_to_the_ball(
 
 
 def test_a_sensor_that_detects_is_lit(painter: Painter, standing: TensorDict):
-    # No ball in play: no line, the sensors alone change.
+    # No ball in play: no line; only the sensors change.
     lit = np.ones(64, dtype=bool)
     dim, bright = (
         painter.draw(standing, time=0.0),
@@ -141,7 +141,7 @@ def test_the_camera_follows_the_base(painter: Painter, standing: TensorDict):
     lost = painter.draw(standing, time=0.0)
     for time in (10.0, 20.0):
         found = painter.draw(moved, time=time)
-    # Floor tiles are 1 m: after whole tiles the picture is the same but for haze.
+    # Floor tiles are 1 m: after whole tiles the picture is the same, except for haze.
     difference = np.abs(found.image.astype(int) - lost.image).mean()
     assert difference < 3
 
@@ -149,7 +149,7 @@ def test_the_camera_follows_the_base(painter: Painter, standing: TensorDict):
 def test_the_closest_point_lies_on_the_surface():
     ball, pose = Sphere(radius=0.15), np.array([1.0, 0, 0, 1, 0, 0, 0])
     points = np.array([[0.0, 0, 0], [1, 2, 0], [1.05, 0, 0]])
-    # 1 - 0.15; 0 + 0.15; a point inside is its own.
+    # 1 - 0.15; 0 + 0.15; a point inside maps to itself.
     expected = [[0.85, 0, 0], [1, 0.15, 0], [1.05, 0, 0]]
     assert closest_point(ball, pose, points) == pytest.approx(np.array(expected))
 
@@ -266,5 +266,5 @@ def test_numbers_out_of_range_are_refused(
 
 @pytest.mark.parametrize("size", [(161, 90), (160, 8)])
 def test_a_size_that_is_no_film_is_refused(skin: Skin, size: tuple[int, int]):
-    with pytest.raises(ValueError, match="two even numbers"):
+    with pytest.raises(ValueError, match="two even numbers of at least 16"):
         painter_of(EnvConfig(), skin, size=size)

@@ -1,4 +1,4 @@
-"""The page in a real browser: what is drawn moves, what is pressed has an effect."""
+"""The page in a real browser: the scene moves, and the controls have an effect."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium here"),
 ]
-# Drawn without a graphics card, a picture may take seconds.
+# Without a graphics card a picture may take seconds.
 _WAIT = 90.0
 SIZE = (800, 600)
 
@@ -57,7 +57,7 @@ class Visit:
         self.tab.get_by_role("button", name=name, exact=True).click()
 
     def canvas(self) -> np.ndarray:
-        """Return what is drawn left of the panel, ``[H, W, 3]``."""
+        """Return the picture left of the panel, ``[H, W, 3]``."""
         clip = {"x": 0, "y": 200, "width": 440, "height": 400}
         picture = self.tab.screenshot(clip=clip, timeout=1000 * _WAIT)
         return np.asarray(Image.open(io.BytesIO(picture)).convert("RGB")).astype(int)
@@ -81,7 +81,7 @@ def wait_for(what: Callable[[], object]) -> None:
 
 
 def is_drawn(picture: np.ndarray) -> bool:
-    """Whether there is a robot: dark joints and light shells before a grey floor."""
+    """Return whether a robot shows: dark joints, light shells, grey floor behind."""
     level = picture.sum(-1) / 3
     return (level < 90).mean() > 0.002 and np.ptp(level) > 120
 
@@ -96,7 +96,7 @@ def test_the_robot_is_drawn_and_what_is_drawn_moves_with_it(page: Page, visit: V
     time.sleep(3)
     still = visit.canvas()
     assert not differs(still, visit.canvas())
-    # Somewhere else, as nobody's policy has it.
+    # At a position that no policy chooses.
     page._ask(lambda: page.sessions[0].frame.qpos.__setitem__(2, 1.4))
     page._ask(lambda: page._draw([page.sessions[0].frame]))
     wait_for(lambda: differs(still, visit.canvas()))
@@ -111,7 +111,7 @@ def test_a_throw_is_seen_by_the_sensors(page: Page, visit: Visit):
     wait_for(lambda: page.sessions[0].frame.reading.max(initial=0) > 0.3)
     visit.press("Pause")
     wait_for(lambda: page.is_paused)
-    # The moment of the strongest reading, and the same if nothing were sensed.
+    # The step of the strongest reading, and the same step if nothing were sensed.
     (seen,) = max(page._memory, key=lambda frames: frames[0].reading.max())
     numb = dataclasses.replace(
         seen, reading=0 * seen.reading, line=np.full_like(seen.line, np.nan)
@@ -182,9 +182,9 @@ def test_other_visitors_and_lost_connections_disturb_nobody(page: Page, visit: V
     steps = page.steps
     wait_for(lambda: page.steps > steps + 5)
     page.server._websock_server.disconnect_all_clients()
-    # The browser finds the way back by itself.
+    # The browser reconnects by itself.
     wait_for(lambda: len(page.server.get_clients()) == 1)
     steps = page.steps
     wait_for(lambda: page.steps > steps + 5)
-    # What it says of the connection that was cut.
+    # Its messages about the connection that was cut.
     visit.faults[:] = [text for text in visit.faults if "WebSocket" not in text]

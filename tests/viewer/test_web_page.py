@@ -1,4 +1,4 @@
-"""The page without a browser: what is asked of it, errors, visitors who come and go."""
+"""The page without a browser: requests, errors, visitors who come and go."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def shared() -> Iterator[Page]:
 
 @pytest.fixture
 def page(shared: Page) -> Page:
-    """One page for all, as if it had just been opened, without balls by themselves."""
+    """Return the shared page, as if just opened, without automatic balls."""
     shared.panel.tempo.value = 0
     shared.is_paused = False
     shared.mask_all(False)
@@ -84,7 +84,7 @@ def test_a_click_on_the_floor_throws_from_there(page: Page):
 
 
 def test_a_click_on_the_robot_throws_at_it(page: Page):
-    # At the chest, between sensors or not: it is the body that is hit here.
+    # At the chest, between sensors or not: the click hits the body here.
     page.sessions[0].mask(set())
     page.click(np.array([4.0, 0.0, 0.55]), np.array([-1.0, 0.0, 0.0]))
     page.click(np.array([4.0, 0.05, 0.7]), np.array([-1.0, 0.0, 0.0]))
@@ -215,9 +215,9 @@ def test_a_newer_policy_of_a_run_is_taken_up(trained, tmp_path):
         os.utime(checkpoint, ns=(0, checkpoint.stat().st_mtime_ns + 10**9))
         page._follow()
         assert page.sessions[0].policy is not old
-        # In the midst of the episode.
+        # In the middle of the episode.
         assert page.sessions[0].frame.step == 5
-        assert "taken up" in page._notes[0]
+        assert "loaded at" in page._notes[0]
     finally:
         page.close()
 
@@ -229,7 +229,7 @@ def test_two_robots_meet_the_same_throws():
         page.throw_from(None)
         page.play()
         one, other = (session.frame for session in page.sessions)
-        # Until they move apart they are the same robot.
+        # Until they move differently the two robots are the same.
         np.testing.assert_allclose(one.balls[0], other.balls[0], atol=0.02)
         page._draw([one, other])
         assert len(page._status()) >= 4
@@ -294,7 +294,7 @@ def test_it_computes_while_somebody_watches_and_not_otherwise():
 
 
 def test_a_port_that_is_taken_is_an_error(page: Page):
-    assert "is taken" in fail("view", "--port", page.server.get_port())
+    assert "is already in use" in fail("view", "--port", page.server.get_port())
 
 
 @pytest.mark.parametrize(
@@ -324,5 +324,5 @@ def test_all_robots_are_seen_beside_the_panel(page: Page, width: int, height: in
         scale = height / 2 / np.tan(camera.fov / 2) / (way @ forward)
         x, y = width / 2 + scale * (way @ right), height / 2 - scale * (way @ up)
         assert 0 < y < height
-        # On a narrow screen the panel is folded together.
+        # On a narrow screen the panel is collapsed.
         assert 0 < x < (width - 340 if width > 600 else width)

@@ -1,4 +1,4 @@
-"""A robot that is played with: throws on demand, masks, other sensors, errors."""
+"""An interactive session: throws on request, masks, other sensors, errors."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from egoskin.viewer.web.session import Session, Throw
 
 @pytest.fixture(scope="module")
 def session() -> Session:
-    """One robot for all; who needs it begins anew."""
+    """Return a shared session; tests that need a new episode reset it."""
     return Session("field_proximity")
 
 
@@ -40,7 +40,7 @@ def test_a_ball_comes_with_the_speed_from_the_height_and_side_asked_for(
     assert first.active.tolist() == [True, False]
     start = first.balls[0]
     assert start[2] == pytest.approx(1.5)
-    # From the left of where it looks: half the heading is the angle of (w, z).
+    # From the left of its heading: half the heading is the angle of (w, z).
     heading = 2 * math.atan2(before[6], before[3])
     offset = start[:2] - first.qpos[:2]
     bearing = math.atan2(offset[1], offset[0]) - heading
@@ -58,7 +58,7 @@ def test_a_ball_is_thrown_at_the_point_nearest_to_a_place(session: Session):
     session.body.place(session.frame.qpos)
     hand = session.body.data.body("left_wrist_roll_link").xpos.copy()
     target = session.target_near(hand)
-    # The robot is let stand: the ball goes straight to its hand.
+    # The robot only stands: the ball flies straight to its hand.
     session.throw(
         Throw(speed=8.0, height=1.2, azimuth=0.0, distance=3.0, target=target)
     )
@@ -92,7 +92,7 @@ def test_masked_sensors_read_nothing_and_others_as_before(session: Session):
         session.reset()
         session.mask(masked)
         session.throw(Throw(speed=6.0, azimuth=0.0, distance=3.0, target=0.5))
-        # Before anything is seen the robot moves alike.
+        # Before anything is detected the robots move alike.
         for _ in range(60):
             frame = session.step()
             if frame.reading.any():
@@ -119,7 +119,7 @@ def test_a_ray_meets_the_sensor_that_is_in_its_way(session: Session):
     for i in (3, 17, 40):
         origin = points[i] + 2 * normals[i]
         assert session.sensor_at(origin, -normals[i], 1e-6) == i
-        # From behind it is hidden by the body.
+        # From behind, the body hides it.
         assert session.sensor_at(points[i] - 2 * normals[i], normals[i], 1e-6) != i
 
 
@@ -152,7 +152,7 @@ def test_only_sensors_that_the_policy_can_read_are_taken(session: Session):
     own = session.policy.env_config.sensor
     import dataclasses
 
-    with pytest.raises(ValueError, match="reads 64 numbers"):
+    with pytest.raises(ValueError, match="reads 64 numbers from its skin, but"):
         session.configure(dataclasses.replace(own, signal="localization"))
     assert session.config.sensor == sensor
     session.configure(own)
@@ -201,7 +201,7 @@ def test_other_policies_are_played_too(name: str):
 
 
 def test_what_the_task_draws_for_others_is_as_it_was(session: Session):
-    """A thrower of a session changes nothing of other environments."""
+    """The thrower of a session changes nothing in other environments."""
     policy = load_policy("field_proximity")
     thrown = []
     for _ in range(2):

@@ -42,7 +42,7 @@ def test_a_joint_moves_the_links_below_it_alone(page: SkinPage):
 
 def test_directions_are_shown_and_their_share_is_told(page: SkinPage):
     clearance = np.full((36, 72), np.nan)
-    # Above the base by half of all: half of these seen.
+    # Half of all directions are above the base, and half of these are seen.
     clearance[18:, :36], clearance[18:, 36:] = 0.0, 0.5
     page.show(clearance, 1.0)
     assert page._result.content.startswith("**50.0%**")

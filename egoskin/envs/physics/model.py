@@ -90,7 +90,7 @@ def build_scene(scene: Scene) -> mujoco.MjModel:
         return spec.compile()
     except (ValueError, mujoco.FatalError) as error:
         text = " ".join(str(error).split())
-        raise ValueError(f"MuJoCo cannot make the scene: {text}") from error
+        raise ValueError(f"MuJoCo cannot compile the scene: {text}") from error
 
 
 def _add_contact_sensors(spec: mujoco.MjSpec, scene: Scene) -> None:

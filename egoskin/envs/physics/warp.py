@@ -92,7 +92,7 @@ class WarpPhysics(Physics):
             except (NotImplementedError, ValueError) as error:
                 text = " ".join(str(error).split())
                 raise ValueError(
-                    f"MuJoCo Warp cannot make the scene: {text}"
+                    f"MuJoCo Warp cannot load the scene: {text}"
                 ) from error
         self._qpos, self._qvel = wp.to_torch(data.qpos), wp.to_torch(data.qvel)
         self._ctrl = wp.to_torch(data.ctrl)
@@ -121,7 +121,7 @@ class WarpPhysics(Physics):
         """
         text = os.environ.get(SETTING, str(_CONTACTS))
         if not (text.isdecimal() and int(text)):
-            raise ValueError(f"{SETTING} must be a number of contacts, got {text!r}")
+            raise ValueError(f"{SETTING} must be a positive integer, got {text!r}")
         return int(text)
 
     def _put_model(self, **options: object) -> mjw.Model:
@@ -223,9 +223,9 @@ class WarpPhysics(Physics):
         if not overflowed:
             return None
         return (
-            f"more than {self.num_contacts()} contacts of a robot did not fit into "
-            f"MuJoCo Warp's buffers, and the rows count as diverged: set {SETTING} to "
-            "more"
+            "contacts did not fit into MuJoCo Warp's buffers "
+            f"({self.num_contacts()} contacts per robot); affected rows count as "
+            f"diverged: increase {SETTING}"
         )
 
     def reset(self, rows: Tensor, base_pose: Tensor, joint_pos: Tensor) -> None:

@@ -441,7 +441,7 @@ class Page:
         self._panel_shown, self._steps_shown = now, self.steps
         wanted = self.hz / self.panel.slowdown.value
         is_slow = 0 < done < 0.9 * wanted * passed - 1
-        self._speed = f"Slow: {done / passed:.0f} of {wanted:.0f} steps a second."
+        self._speed = f"Slow: {done / passed:.0f} of {wanted:.0f} steps per second."
         if not is_slow:
             self._speed = ""
         frames = list(self._memory)
@@ -494,7 +494,7 @@ class Page:
                 self._versions[i] = version
                 session.follow(load_policy(session.source), load_critic(session.source))
                 clock = time.strftime("%H:%M:%S")
-                self._notes[i] = f"Newest of the run, taken up at {clock}."
+                self._notes[i] = f"Latest policy of the run, loaded at {clock}."
 
     def save(self, client: viser.ClientHandle | None) -> None:
         """Send a visitor the `recording` as a file."""

@@ -35,10 +35,10 @@ _FROM_ZERO = {
     "min": {"soft": 0.0, "pad": 0.0, "mode": 1},
     "max": {"soft": 1.0, "pad": 0.1, "mode": 1},
 }
-_MASK_HELP = "Click a sensor on the robot to mask it, click again to bring it back."
+_MASK_HELP = "Click a sensor on the robot to mask it, click again to unmask it."
 _HELP = (
-    "**Click** the robot: a ball flies at that place from your side. "
-    "**Click** the floor: a ball comes from there."
+    "**Click** the robot: a ball is thrown at that point from your viewpoint. "
+    "**Click** the floor: a ball is thrown from there."
 )
 
 
@@ -116,10 +116,10 @@ class Panel:
         self.speed = gui.add_slider("Speed [m/s]", *SPEEDS, 0.5, 6.0)
         self.height = gui.add_slider("Height [m]", *HEIGHTS, 0.1, 2.5)
         self.tempo = gui.add_slider(
-            "Balls a minute", 0, 60, 1, 15, hint="Thrown by themselves; 0: none"
+            "Balls per minute", 0, 60, 1, 15, hint="Thrown automatically; 0: none"
         )
         gui.add_divider()
-        self.slowdown = gui.add_slider("Times slower", 1, 20, 1, 1)
+        self.slowdown = gui.add_slider("Slowdown", 1, 20, 1, 1)
         actions = {
             "Pause": wishes.pause,
             "Step": wishes.step,
@@ -130,7 +130,7 @@ class Panel:
         last = gui.add_button_group(
             "Last 5 s",
             ["Replay", "Save"],
-            hint="Save: as a page that plays them without a server",
+            hint="Save: an HTML page that plays them without a server",
         )
 
         def again(event: viser.GuiEvent) -> None:
@@ -184,11 +184,11 @@ class Panel:
                 height=150 if len(sessions) == 1 else 130,
             )
 
-        gui.add_markdown("**Strongest reading**, 1: touching; last five seconds [s]")
+        gui.add_markdown("**Strongest reading** (1: touching), last five seconds")
         self._nearest = plot("time [s]", seconds, share)
-        self._value_title = gui.add_markdown("**Value of the state**, by the critic")
+        self._value_title = gui.add_markdown("**Value of the state**, from the critic")
         self._value = plot("time [s]", seconds, uplot.Scale(auto=True))
-        gui.add_markdown("**Untouched** [s], episode by episode")
+        gui.add_markdown("**Untouched** [s], by episode")
         self._survival = plot("episode", episodes, upward, whole)
 
     def _add_policies(self, sessions: Sequence[Session], names: Sequence[str]) -> None:
@@ -276,10 +276,10 @@ class Panel:
         self._range.value = min(max(sensor.range, 0.1), 5.0)
         size = session.pipeline.signal_size
         self._readable.content = (
-            f"The policy reads {size} numbers from its skin, and was trained with "
-            f"{own.label()}. What is offered here gives as many, so it can be read; "
-            "that it is understood is another matter. The number of sensors and their "
-            "places cannot change."
+            f"The policy reads {size} numbers from its skin and was trained with "
+            f"{own.label()}. All options here give as many numbers, but the policy may "
+            "not act well on them. The number and positions of the sensors cannot "
+            "change."
         )
         self.show_masked(len(session.masked), len(session.skin))
 
@@ -326,10 +326,10 @@ class Panel:
         self._nearest.data = (time, *strongest)
         self._value.visible = any(has_critic.values())
         lacking = [name for name, has in has_critic.items() if not has]
-        title = "**Value of the state**, by the critic"
+        title = "**Value of the state**, from the critic"
         if lacking:
             names = ", ".join(lacking)
-            title += f": not of {names}. A policy file holds no critic, a run does."
+            title += f": none for {names}. Policy files contain no critic, runs do."
         self._value_title.content = title
         if self._value.visible:
             self._value.data = (time, *value)

@@ -25,7 +25,7 @@ def open_server(port: int) -> viser.ViserServer:
             probe.bind(("127.0.0.1", port))
         except OSError as error:
             raise OSError(
-                f"port {port} of 127.0.0.1 is taken: choose another --port"
+                f"port {port} of 127.0.0.1 is already in use: choose another --port"
             ) from error
     with redirect_stdout(StringIO()):
         return viser.ViserServer(host="127.0.0.1", port=port, verbose=False)

@@ -221,7 +221,7 @@ class Session:
         pipeline, expected = config.pipeline(skin), own.pipeline(skin).signal_size
         if pipeline.signal_size != expected or config.actor_keys != own.actor_keys:
             raise ValueError(
-                f"the policy reads {expected} numbers of its skin, and these sensors "
+                f"the policy reads {expected} numbers from its skin, but these sensors "
                 f"give {pipeline.signal_size}"
             )
         return config, pipeline
@@ -257,8 +257,8 @@ class Session:
         root = self.policy(self._root)
         if not root["action"].isfinite().all():
             raise ValueError(
-                "the policy's action is not finite: its weights, or what it was given, "
-                "are not those of training"
+                "the policy's action is not finite: its weights or its observations "
+                "differ from those of training"
             )
         after = self.env.step(root)["next"]
         self.frame = self._look(after, ending_of(after[0]))

@@ -34,9 +34,9 @@ _POINT_SIZE, _ANY_TURN = 0.013, math.pi
 _LATE, _EARLY, _NEVER = np.array([88, 60, 140]), np.array([70, 205, 120]), (200, 30, 40)
 _MOST_IN_FOLDER = 12
 _LEGEND = (
-    "Each point is a direction from which a ball comes straight at the base: "
-    "**green** seen at the sensors' full range, **violet** only when it is near, "
-    "**red** never. Directions through the floor are left out."
+    "Each point is a direction from which a ball flies straight at the base: "
+    "**green** seen at the sensors' full range, **violet** only nearby, "
+    "**red** never. Directions through the floor are omitted."
 )
 
 

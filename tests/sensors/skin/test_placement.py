@@ -324,7 +324,7 @@ def test_darts_are_thrown_in_lots_until_there_are_enough(small_robot, monkeypatc
         ({"density": {"head": 2.0}}, "density: 'head' matches none of torso_link"),
         ({"density": {"torso*": 1.0, "*_link": 2.0}}, "must match exactly one"),
         ({"density": {"torso*": -1.0}}, "'torso.*' must be finite and not negative"),
-        ({"density": {"*": 0.0}}, "the weights leave .* bare"),
+        ({"density": {"*": 0.0}}, "the weights place no sensors on torso_link"),
         (
             {"method": "poisson_disk", "num_sensors": None, "spacing": 1e-3},
             "take at least 0.004",
