@@ -98,7 +98,7 @@ def test_a_detected_zero_is_a_sight():
     ("arguments", "text"),
     [
         ((0,), "length must be at least 1, got 0"),
-        ((2, ["a", "b"], ["c"]), "one out key for each in key"),
+        ((2, ["a", "b"], ["c"]), "need one out key per in key"),
     ],
 )
 def test_what_makes_no_history_is_refused(arguments, text):

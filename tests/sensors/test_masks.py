@@ -283,7 +283,7 @@ def test_a_policy_whose_sensors_are_masked_does_what_one_does_without_sensors():
         (
             {"coverage": "oracle"},
             ("torso_link",),
-            "an oracle has no sensors on links: mask all",
+            "an oracle has no sensors on links: its mask",
         ),
     ],
 )

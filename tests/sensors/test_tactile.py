@@ -103,7 +103,7 @@ def test_a_threshold_that_is_none_is_refused(threshold):
 
 @pytest.mark.parametrize("prices", [{}, {"*": float("nan")}, {"*": float("inf")}])
 def test_prices_that_are_none_are_refused(prices):
-    with pytest.raises(ValueError, match="prices must be finite and at least one"):
+    with pytest.raises(ValueError, match="prices must be finite and not empty"):
         ContactPenalty(LINKS, prices)
 
 

@@ -459,7 +459,7 @@ def test_names_of_keys_follow_the_reading():
         (lambda: Latency(seconds=INF), "Latency.seconds must not be infinite, got inf"),
         (
             lambda: replace(RangeLimits(), below="none"),
-            "below must be nothing or minimum, got 'none'",
+            "below must be 'nothing' or 'minimum', got 'none'",
         ),
         (lambda: RangeLimits(minimum=2, maximum=1), "0 <= minimum < maximum, got 2"),
         (

@@ -266,7 +266,7 @@ def check_stays_plain(source: Path, caplog, *expected: str) -> None:
     assert load_library(source) is None
     lines = [line for line in logged(caplog) if not line.startswith("compiling")]
     assert len(lines) == 1
-    for text in ("one.cpp stays uncompiled", *expected):
+    for text in ("one.cpp is not compiled", *expected):
         assert text in lines[0]
     assert "\n" not in lines[0]
 
@@ -274,7 +274,7 @@ def check_stays_plain(source: Path, caplog, *expected: str) -> None:
 @needs_compiler
 def test_a_library_is_compiled_once_for_this_user_alone(source, cache, caplog):
     assert is_one(load_anew(source))
-    assert logged(caplog) == ["compiling one.cpp: some seconds, once on a machine"]
+    assert logged(caplog) == ["compiling one.cpp: a few seconds, once per machine"]
     (file,) = cache.iterdir()
     assert stat.S_IMODE(cache.stat().st_mode) == 0o700
     before = file.stat()
@@ -305,7 +305,7 @@ def test_a_damaged_library_is_compiled_again(source, cache, caplog, damage):
     file.write_bytes(changed[damage])
     caplog.clear()
     assert is_one(load_anew(source))
-    assert logged(caplog) == ["compiling one.cpp: some seconds, once on a machine"]
+    assert logged(caplog) == ["compiling one.cpp: a few seconds, once per machine"]
     assert [path.read_bytes() for path in cache.iterdir()] == [content]
 
 
@@ -319,7 +319,7 @@ def test_what_belongs_to_another_user_is_not_loaded(source, cache, caplog):
     assert file.stat().st_uid == 0
     os.chown(cache, 12345, -1)
     caplog.clear()
-    check_stays_plain(source, caplog, f"{cache} is no folder of this user")
+    check_stays_plain(source, caplog, f"{cache} is not a folder of this user")
 
 
 @needs_compiler
@@ -327,7 +327,7 @@ def test_a_link_to_a_folder_is_no_cache(source, cache, caplog, tmp_path):
     cache.parent.mkdir()
     (tmp_path / "other").mkdir()
     cache.symlink_to(tmp_path / "other")
-    check_stays_plain(source, caplog, f"{cache} is no folder of this user")
+    check_stays_plain(source, caplog, f"{cache} is not a folder of this user")
     assert not list((tmp_path / "other").iterdir())
 
 
@@ -390,7 +390,7 @@ def test_without_a_compiler_sensors_measure_the_same(
     args, state = (skin, H1_2.chain, BALLS[:1], 1.0), random_state(20, objects=1)
     plain, asked = (FieldSensor(*args, compile=c) for c in (False, True))
     (line,) = logged(caplog)
-    assert "no C++ compiler was found: install g++" in line
+    assert "no C++ compiler found: install g++" in line
     copied = copy.deepcopy(asked)
     compilation._loaded.cache_clear()
     for sensor in (asked, copied):

@@ -317,7 +317,7 @@ def test_darts_are_thrown_in_lots_until_there_are_enough(small_robot, monkeypatc
         ({"links": []}, "at least one link to cover"),
         ({"method": "grid"}, "method must be .* got 'grid'"),
         ({"num_sensors": None}, "num_sensors=None needs a spacing"),
-        ({"spacing": 0.1}, "goes with method='poisson_disk'"),
+        ({"spacing": 0.1}, "needs method='poisson_disk'"),
         ({"method": "poisson_disk", "spacing": 0.0}, "spacing must be positive"),
         ({"method": "poisson_disk", "spacing": 0.2}, r"only \d+ sensors fit"),
         ({"stand_off": -0.01}, "stand_off must be finite and not negative"),
@@ -327,7 +327,7 @@ def test_darts_are_thrown_in_lots_until_there_are_enough(small_robot, monkeypatc
         ({"density": {"*": 0.0}}, "the weights leave .* bare"),
         (
             {"method": "poisson_disk", "num_sensors": None, "spacing": 1e-3},
-            "take at least 0.004",
+            "use at least 0.004",
         ),
     ],
 )
