@@ -205,7 +205,7 @@ def test_what_needs_a_tracker_is_refused_in_one_line(name, tmp_path):
         policy = make_policy(EnvConfig(sensor=SensorConfig(coverage="oracle")))
     else:
         policy = egoskin.load_policy(name)
-    with pytest.raises(ValueError, match=r"reads where balls are, which needs a track"):
+    with pytest.raises(ValueError, match=r"reads positions of balls, which needs a tr"):
         deploy(policy, tmp_path)
 
 

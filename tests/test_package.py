@@ -77,7 +77,7 @@ def test_an_environment_has_the_skin_of_its_configuration_by_default():
 
 def test_the_state_for_sparse_sources_has_no_history():
     config = egoskin.EnvConfig(history=2)
-    with pytest.raises(ValueError, match="history 2 needs signals: leave sparse off"):
+    with pytest.raises(ValueError, match="history 2 needs signals: turn sparse off"):
         egoskin.make_worker_env(config, num_envs=1, seed=0, sparse=True)
 
 

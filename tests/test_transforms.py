@@ -176,7 +176,7 @@ def test_results_that_are_not_one_for_each_key_are_refused(method, given):
             return result if given == "bare" else (result, result)
 
     got = "tuple of 2" if given == "two" else r"(Tensor|UnboundedContinuous)$"
-    expected = rf"Doubled\.{method} must return a tuple, .* \['y'\], got {got}"
+    expected = rf"Doubled\.{method} must return a tuple with .* \['y'\], got {got}"
     asked = {
         "compute": (Doubled(), TensorDict({"x": torch.ones(1, 3)}, [1])),
         "out_specs": (

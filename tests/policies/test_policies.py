@@ -240,7 +240,7 @@ def test_a_header_that_describes_no_policy_is_refused(field, value, tmp_path):
     tensors, header = load_tensors(ASSETS / "field_proximity.safetensors")
     header["policy"][field] = value
     save_tensors(tmp_path / "odd.safetensors", tensors, header)
-    with pytest.raises(ValueError, match=r"odd.* holds no policy"):
+    with pytest.raises(ValueError, match=r"odd.* is not a policy"):
         egoskin.load_policy(tmp_path / "odd.safetensors")
 
 
@@ -248,7 +248,7 @@ def test_a_header_without_a_policy_is_refused(tmp_path):
     tensors, _ = load_tensors(ASSETS / "field_proximity.safetensors")
     for header in ({}, {"policy": 5}, {"policy": None}):
         save_tensors(tmp_path / "odd.safetensors", tensors, header)
-        with pytest.raises(ValueError, match=r"odd.* holds no policy"):
+        with pytest.raises(ValueError, match=r"odd.* is not a policy"):
             egoskin.load_policy(tmp_path / "odd.safetensors")
 
 
@@ -275,11 +275,11 @@ def save_changed(path: Path, changes: dict[str, Any]) -> None:
         ("norms.observation.var", 1e300, "'norms.observation.var' is not finite"),
         ("norms.observation.var", -1.0, "'norms.observation.var' is negative"),
         ("head.log_std", float("nan"), "'head.log_std' is not finite"),
-        ("head.log_std", 1e3, "actions need not be finite"),
+        ("head.log_std", 1e3, "actions may not be finite"),
         # Finite by themselves, not in use.
-        ("head.body.inputs.0.weight", 3e38, "actions need not be finite"),
-        ("head.body.inputs.1.weight", -3e38, "actions need not be finite"),
-        ("head.body.tail.1.weight", 3e38, "actions need not be finite"),
+        ("head.body.inputs.0.weight", 3e38, "actions may not be finite"),
+        ("head.body.inputs.1.weight", -3e38, "actions may not be finite"),
+        ("head.body.tail.1.weight", 3e38, "actions may not be finite"),
         ("head.body.tail.3.bias", float("inf"), "'head.body.tail.3.bias' is not fini"),
         ("head.body.tail.3.weight", torch.float64, "got .21, 32. of float64"),
         ("norms.signal.mean", torch.float32, "expected .1. of float64, got .1. of"),

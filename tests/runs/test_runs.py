@@ -110,7 +110,7 @@ def test_a_run_of_another_version_is_not_gone_on_with(config: TrainConfig):
     content, _ = read_sealed(file)
     del content["env"]["task"]["throws"]["lead"]
     file.write_bytes(sealed_json(content))
-    message = r"config\.json lacks env\.task\.throws\.lead: another version made it"
+    message = r"config\.json lacks env\.task\.throws\.lead: another version wrote it"
     with pytest.raises(ValueError, match=message):
         parse_config(args)
 
@@ -132,7 +132,7 @@ def test_a_standard_sets_throws_and_ends(args, version):
 
 def test_a_standard_that_sets_nothing_is_refused():
     # Only the command line can tell what is a default and what was given.
-    with pytest.raises(ValueError, match=r"is of standard 2: .*training_task\('1'"):
+    with pytest.raises(ValueError, match=r"has standard 2: .*training_task\('1'"):
         TrainConfig(standard="1")
     task = training_task("1", DodgeballConfig())
     assert TrainConfig(standard="1", env=EnvConfig(task=task)).env.standard == "1"
@@ -206,7 +206,8 @@ def test_a_film_that_cannot_be_made_is_told_of(tmp_path, capfd):
     with FilmMaker(tmp_path) as maker:
         maker.start(tmp_path / "config.json")
     (line,) = capfd.readouterr().err.splitlines()
-    assert line.startswith("note: no film ")
+    assert line.startswith("note: film ")
+    assert ".mp4 failed: " in line
     assert "config.json" in line
 
 
@@ -382,9 +383,9 @@ def test_a_folder_renamed_while_it_trains_ends_with_one_clear_error(
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("optimizer/0/exp_avg", torch.zeros(3), "the optimiser is one of other"),
-        ("optimizer/1/step", torch.zeros(1), "the optimiser is one of other"),
-        ("optimizer/1/exp_avg_sq", None, "the optimiser is one of other"),
+        ("optimizer/0/exp_avg", torch.zeros(3), "optimiser state belongs to other"),
+        ("optimizer/1/step", torch.zeros(1), "optimiser state belongs to other"),
+        ("optimizer/1/exp_avg_sq", None, "optimiser state belongs to other"),
         ("agent/head.log_std", torch.zeros(21, 1), r"expected \[21\] of float32, got"),
         (
             "agent/head.log_std",

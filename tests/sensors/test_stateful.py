@@ -295,7 +295,7 @@ def test_stored_steps_give_what_the_environment_gave(build, marked_by):
 @every_transform
 def test_stored_data_must_say_where_episodes_start(build):
     data = make(build, 5).rollout(3)
-    with pytest.raises(KeyError, match="where do episodes start"):
+    with pytest.raises(KeyError, match="unknown starts of episodes"):
         build()(data.select(*build().in_keys))
     with pytest.raises(ValueError, match="last batch dimension is time"):
         build()(data[0, 0])

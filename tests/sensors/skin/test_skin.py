@@ -246,7 +246,7 @@ def skin_content(*sensors: object) -> dict:
                 ({"coverage": ["ray"]}, "'coverage' must be one of field, ray"),
                 ({"grid": 5}, r"'grid' must be like \[8, 8\], got 5"),
                 ({"grid": [8.5, 8]}, "grid must be two positive integers"),
-                ({"fov_deg": 10**400}, "fov_deg must be a number of 64 bits"),
+                ({"fov_deg": 10**400}, "fov_deg must fit into 64 bits"),
                 ({"fov_deg": "63"}, "'fov_deg' must be like 63.0, got '63'"),
                 ({"measure": 1.5}, "'measure' must be like \"beam\", got 1.5"),
                 ({"sub_beams": 3}, "'sub_beams' was removed; only 1 .* got 3"),
