@@ -1,4 +1,4 @@
-"""A run as a library user starts it: threads, kept policies, the recorded commit."""
+"""Runs started through the library: threads, saved policies, recorded commit."""
 
 from __future__ import annotations
 
@@ -124,14 +124,14 @@ def test_a_standard_sets_throws_and_ends(args, version):
     config = parse_config([*args, "--seed", "3", "--sensor.range", "1"])
     assert config.env.standard == version
     assert config.env.task == training_task(version, DodgeballConfig())
-    # Nothing else.
+    # Nothing else changes.
     env = replace(config.env, task=DodgeballConfig())
     assert env == EnvConfig(sensor=SensorConfig(range=1.0))
     assert config.seed == 3
 
 
 def test_a_standard_that_sets_nothing_is_refused():
-    # Only the command line can tell what is a default and what was given.
+    # Only the command line can distinguish defaults from given values.
     with pytest.raises(ValueError, match=r"has standard 2: .*training_task\('1'"):
         TrainConfig(standard="1")
     task = training_task("1", DodgeballConfig())
@@ -146,7 +146,7 @@ def test_a_throw_or_an_end_beside_a_standard_makes_it_custom():
     end = parse_config(["--task.success-s", "2", "--standard", "paper"]).env
     assert end.standard == "custom"
     assert end.task.throws.first_delay == (0.0, 0.0)
-    # What belongs to no standard does not.
+    # Options outside the standard do not.
     drive = ["--standard", "1", "--task.action-scale", "0.2"]
     assert parse_config(drive).env.standard == "1"
 
@@ -172,7 +172,7 @@ def test_a_policy_says_what_standard_it_was_trained_on(config: TrainConfig):
     assert load_tensors(file)[1]["policy"]["standard"] == "paper"
     assert egoskin.load_policy(file).env_config.standard == "paper"
     assert Run.open(run.path).config.env.standard == "paper"
-    # A resume has it already.
+    # On resume, it is known already.
     for version in ("paper", "2"):
         with pytest.raises(ValueError, match="--standard cannot be changed on resume"):
             parse_config(["--resume", str(run.path), "--standard", version])
@@ -212,7 +212,7 @@ def test_a_film_that_cannot_be_made_is_told_of(tmp_path, capfd):
 
 
 def test_metrics_go_to_weights_and_biases(config: TrainConfig, monkeypatch):
-    """By what the package would be given; a resume goes on with the same run there."""
+    """Checks the calls to wandb; a resume continues the same wandb run."""
     given = {}
 
     class Recorded:
@@ -245,7 +245,7 @@ def test_metrics_go_to_weights_and_biases(config: TrainConfig, monkeypatch):
 
 
 def test_a_commit_is_recorded_only_of_a_repository_that_holds_the_source(tmp_path):
-    # An installed copy in an ignored folder of somebody's own repository.
+    # An installed copy in an ignored folder of a user's repository.
     source = tmp_path / "site" / "run.py"
     source.parent.mkdir()
     source.write_text("")
@@ -264,7 +264,7 @@ def test_a_commit_is_recorded_only_of_a_repository_that_holds_the_source(tmp_pat
     assert git_state(source)["changed"]
 
 
-# --- folders that somebody else prepared --------------------------------------------
+# --- folders prepared by another user -----------------------------------------------
 
 
 def test_nothing_is_written_through_a_link(config: TrainConfig, tmp_path: Path):
@@ -273,7 +273,7 @@ def test_nothing_is_written_through_a_link(config: TrainConfig, tmp_path: Path):
         train(trainer)
     victim = tmp_path / "victim"
     victim.write_text("mine")
-    # Which process will write is easily foreseen.
+    # The id of the writing process is predictable.
     partial = f".checkpoint.safetensors.{os.getpid()}.partial"
     for name in (partial, "metrics.csv", "versions.json"):
         (run.path / name).unlink(missing_ok=True)
@@ -327,7 +327,7 @@ def test_a_metrics_file_turned_into_a_link_while_it_trains_is_not_followed(
 
 @contextmanager
 def full_disk() -> Iterator[None]:
-    """Let no file grow beyond some bytes."""
+    """Limit the size of all files to some bytes."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (16, before[1]))
     try:

@@ -1,4 +1,4 @@
-"""What fields and rays share: marked readings for bad input, none for what is away."""
+"""Fields and rays: bad input gives marked readings, inactive objects none."""
 
 from __future__ import annotations
 

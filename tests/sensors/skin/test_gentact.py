@@ -1,4 +1,4 @@
-"""GenTact's exports: every dialect, what is refused and where, and the way back."""
+"""GenTact exports: all dialects, errors with their places, and export."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ ARM = "/root/bot/left_elbow_link/visuals"
 
 @pytest.fixture
 def load(tmp_path: Path) -> Callable[..., Skin]:
-    """Function of (a file's content, options): the skin, for the H1-2."""
+    """Function that returns the H1-2 skin of a file's content and options."""
 
     def read(content: str | bytes, name: str = "export", **options) -> Skin:
         path = tmp_path / name
@@ -83,7 +83,7 @@ def test_every_dialect_gives_the_same_skin(header, load):
     assert skin.robot == "h1_2"
     assert skin.links == ("torso_link",) * 2
     np.testing.assert_allclose(skin.position, [FRONT, BACK], atol=1e-15)
-    # Those of a file without normals come from the torso's box.
+    # Without normals in the file, those of the torso's box are used.
     np.testing.assert_allclose(skin.normal, [[1, 0, 0], [-1, 0, 0]], atol=1e-9)
     np.testing.assert_array_equal(skin.radius, [0.004, np.nan])
     assert skin.provenance["dialect"] == header
@@ -93,7 +93,7 @@ def test_every_dialect_gives_the_same_skin(header, load):
 
 
 def test_a_print_export_has_clips_names_and_blanks_between_its_sensors(load):
-    # Fewer cells than columns, too; a radius is in metres where positions are not.
+    # Also fewer cells than columns; radii are in metres, positions are not.
     skin = load(
         f"{PRINT}\n,,,,,,,,\nvisuals.002\n"
         f"CLIP,1,2,3,,,,0.1,{TORSO}\n"
@@ -121,7 +121,7 @@ def test_an_old_print_export_needs_its_unit(load):
 
 
 def test_a_print_export_with_headings_has_its_radii_in_metres(load):
-    # The exporter that writes them scales the positions alone.
+    # This exporter scales only the positions.
     row = f"1,93,20,200,0.016,{TORSO}"
     content = f"{PLAIN}\n,,,,,\nvisuals.002,,,,,\nCLIP,1,2,3,0.1,{TORSO}\n{row}\n"
     skin = load(content, scale=1e-3)
@@ -132,7 +132,7 @@ def test_a_print_export_with_headings_has_its_radii_in_metres(load):
 @pytest.mark.parametrize(
     ("header", "row", "options"),
     [
-        # Radii in the other unit than taken: 16 um, 16 m.
+        # Radii in another unit than assumed: 16 um, 16 m.
         (PLAIN, "CLIP,,,,,\n1,93,20,200,0.016,", {"scale": 1e-3}),
         (PRINT, "1,93,20,200,,,,16,", {}),
     ],
@@ -186,7 +186,7 @@ def test_the_oldest_table_has_neither_radius_nor_normal(load):
 def test_a_table_without_parents_takes_the_users(load):
     content = "Index,X,Y,Z,NormX,NormY,NormZ\n0,0,0,0,1,0,0\n1,0,0,0,1,0,0"
     assert load(content, parent="pelvis").links == ("pelvis", "pelvis")
-    # Said once, not for each row.
+    # Reported once, not for each row.
     with pytest.raises(ValueError, match="export:1: the file does not name") as error:
         load(content)
     assert str(error.value).count("does not name") == 1
@@ -200,7 +200,7 @@ def test_units_in_the_header_count(load):
     assert load(content, scale=1e-3).radius == pytest.approx(0.004)
     with pytest.raises(ValueError, match=r"header gives .* 0\.001 m, but scale is 1"):
         load(content, scale=1.0)
-    # The radius goes with the positions; 100 mm, too, is GenTact's word for none.
+    # The radius has the unit of the positions; 100 mm also means no radius.
     content = content.replace("Radius [cm]", "Radius").replace(",0.4,", ",4,")
     assert load(content).radius == pytest.approx(0.004)
     assert np.isnan(load(content.replace(",4,", ",100,")).radius).all()
@@ -250,7 +250,7 @@ def test_all_bad_rows_are_told_at_once_or_left_out(skip, load):
         with pytest.raises(ValueError, match="10 sensors cannot be read") as error:
             load(content)
         listed = str(error.value).splitlines()
-        # What to do is said once for all rows.
+        # The remedy is given once for all rows.
         assert str(error.value).count("the links of h1_2 are") == 1
     for line in bad:
         assert sum(f"export:{line}: " in text for text in listed) == 1
@@ -413,7 +413,7 @@ def test_a_part_that_may_be_a_sibling_is_refused(load):
     rows = [row.format(0, "/bot/torso_link"), row.format(1, "/bot/torso_link/collar")]
     with pytest.raises(ValueError, match=r"export:3: 'collar' of .* may be a part of"):
         load(current(*rows))
-    # Names that Isaac Sim gives what is below a link are no siblings.
+    # Names that Isaac Sim gives to parts of a link are not siblings.
     rows[1] = rows[1].replace("collar", "visuals")
     assert load(current(*rows)).links == ("torso_link",) * 2
     rows[1] = rows[1].replace("visuals", "collar")
@@ -443,7 +443,7 @@ def test_below_a_link_there_may_only_be_its_shapes(below, kept, load):
         ValueError, match=r"a link that h1_2 lacks; .* link_map"
     ) as error:
         load(content)
-    # As the error says it.
+    # As the error suggests.
     part = re.search(r"--link-map (.*)=", str(error.value))
     assert part is not None
     assert load(content, link_map={part[1]: "pelvis"}).links == ("pelvis",)
@@ -547,7 +547,7 @@ def test_missing_normals_are_mujocos_direction_from_the_nearest_shape(
             gap = mujoco.mj_geomDistance(model, data, geom, probe_id, 9.0, fromto)
             if gap < best:
                 best, way = gap, fromto[3:] - fromto[:3]
-                # Inside, and within a hair of it, witness points say little.
+                # Inside and very close to the surface, witness points are unreliable.
                 far = np.linalg.norm(way) if gap > 1e-3 else np.nan
                 expected[i] = way / far
     outside = np.isfinite(expected).all(-1)
@@ -598,7 +598,7 @@ def sensor_tag(number: int, normal, origin: str, kind: str = "self_cap_sensor") 
 
 
 def xacro(*sensors: str, dermis: str = UPRIGHT, radius: str = "0.0") -> str:
-    """As GenTact writes it: a newline first, properties yet to be replaced."""
+    """As written by GenTact: a leading newline, properties not yet substituted."""
     return f"""
 <?xml version="1.0"?>
 <robot xmlns:xacro="http://ros.org/wiki/xacro">
@@ -614,7 +614,7 @@ def xacro(*sensors: str, dermis: str = UPRIGHT, radius: str = "0.0") -> str:
 
 
 def urdf(*joints: str) -> str:
-    """The H1-2 down to its left arm, in so far as it matters, with sensors."""
+    """The relevant part of the H1-2 down to its left arm, with sensors."""
     names = [f"left_elbow_sensor_{i}" for i in range(len(joints))]
     fixed = "".join(
         f'<joint name="{name}_joint" type="fixed"><parent link="left_elbow_skin"/>'
@@ -697,13 +697,13 @@ def test_a_sensor_tag_left_open_is_read_as_if_closed(load):
     tags = [sensor_tag(i, (0, 0, 1), 'xyz="0.1 0 0" rpy="0 0 0"') for i in (0, 1)]
     closed = xacro("\n".join(tags))
     left_open = closed.replace("><origin", "\n  <origin")
-    # The dermis is no sensor: it was closed.
+    # The dermis is not a sensor, and its element was closed.
     left_open = left_open.replace('mesh_file}"\n', 'mesh_file}">\n')
     options = {"parent": "left_elbow_link"}
     same, skin = load(closed, **options), load(left_open, **options)
     np.testing.assert_array_equal(skin.position, same.position)
     np.testing.assert_array_equal(skin.normal, same.normal)
-    # Lines are still those of the file.
+    # Line numbers still refer to the file.
     wrong = left_open.replace('normal_x="0.0"', 'normal_x="x"')
     line = 1 + wrong[: wrong.index("<xacro:self_cap_sensor rob")].count("\n")
     with pytest.raises(ValueError, match=f":{line}: normal_x must be a finite number"):
@@ -717,7 +717,7 @@ def test_gentacts_own_frames_have_no_roll(load):
     assert skin.roll_deg == 0.0
     expected = [[0, 0, 1], [1, 0, 0], [0, 1, 0]]
     np.testing.assert_allclose(skin.rotation()[0], expected, atol=1e-9)
-    # Without rpy the normal is all there is.
+    # Without rpy, only the normal is known.
     flat = sensor_tag(0, (1, 0, 0), 'xyz="0.1 0 0" rpy="0 0 0"')
     same = load(xacro(flat), parent="left_elbow_link")
     np.testing.assert_allclose(same.rotation(), skin.rotation(), atol=1e-9)
@@ -903,7 +903,7 @@ def test_a_normal_beside_another_frame_is_refused(load):
         load(urdf(joint))
 
 
-# --- the way back -----------------------------------------------------------------
+# --- export -----------------------------------------------------------------------
 
 NUMBERS = st.floats(-1, 1)
 UNIT = (

@@ -88,7 +88,7 @@ def test_a_misplaced_skin_is_off_by_the_deviations_given():
     moved = skin.misplaced(0.002, 3.0, seed=1)
     assert (moved.position - skin.position).std() == pytest.approx(0.002, rel=0.03)
     turn = moved.rotation() @ skin.rotation().transpose(0, 2, 1)
-    # The turn as a vector, from the antisymmetric part: sin(angle) k.
+    # Rotation vector from the antisymmetric part: sin(angle) k.
     vector = np.stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], -1) - np.stack(
         [turn[:, 1, 2], turn[:, 2, 0], turn[:, 0, 1]], -1
     )
