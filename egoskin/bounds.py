@@ -36,7 +36,7 @@ class Interval:
         if isinstance(value, int):
             # Not converted: an int of 400 digits does not fit into a float.
             if not -(2**63) <= value < 2**63:
-                return "be a number of 64 bits"
+                return "fit into 64 bits"
         elif math.isnan(value) or (math.isinf(value) and self.le != value):
             return "be a finite number"
         if self.gt is not None and not value > self.gt:

@@ -54,7 +54,7 @@ class Controller:
         self.metadata: dict[str, Any] = json.loads(text)
         data, self._sensor = self.metadata, (sensor := self.metadata["sensor"])
         if "oracle" in sensor.values() or "localization" in sensor.values():
-            raise ValueError(f"{path} reads where balls are, which needs a tracker")
+            raise ValueError(f"{path} reads positions of balls, which needs a tracker")
         self._default = np.array(data["default_joint_pos"])
         self._scale = np.array(data["action_scale"])
         self._range = np.repeat(np.array(data["range"], dtype=float), data["readings"])

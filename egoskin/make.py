@@ -148,11 +148,11 @@ def make_worker_env(
     """
     if sparse and config.history > 1:
         raise ValueError(
-            f"sparse gives the present state alone, history {config.history} needs "
-            "signals: leave sparse off"
+            f"sparse covers only the current state, history {config.history} needs "
+            "signals: turn sparse off"
         )
     if sparse and mask and not masks_all(mask):
-        raise ValueError("sparse sources know no mask of some links: leave sparse off")
+        raise ValueError("sparse sources cannot mask only some links: turn sparse off")
     sensors, robot = config.pipeline(skin), config.robot_config
     env = DodgeballEnv(
         robot,
@@ -300,7 +300,7 @@ def check_fits(
     # The state before and after a step, in the workers and in shared memory.
     agents = num_envs * (_SIMULATION + 4 * row)
     check_memory({f"the agents {options}": agents, **(others or {})})
-    exchanged = f"what passes between the processes {options}"
+    exchanged = f"data sent between the processes {options}"
     check_shared_memory(2 * num_envs * row + _SHARED_EXTRA, exchanged)
 
 
@@ -350,7 +350,7 @@ def device_of(name: str) -> torch.device:
         device.type != "cpu"
         and not (device.type == "cuda" and (device.index or 0) < len(valid) - 1)
     ):
-        raise ValueError(f"no device {name!r} here; available: {', '.join(valid)}")
+        raise ValueError(f"no device {name!r}; available: {', '.join(valid)}")
     return device
 
 

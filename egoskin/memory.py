@@ -49,7 +49,7 @@ def check_memory(needs: Mapping[str, int]) -> None:
     if needed > there:
         largest = max(needs, key=lambda name: needs[name])
         raise ValueError(
-            f"this needs at least {_size(needed)} of memory, and there are "
+            f"this needs at least {_size(needed)} of memory, but there are "
             f"{_size(there)}; most of it is for {largest}"
         )
 
@@ -70,8 +70,8 @@ def check_shared_memory(needed: int, what: str) -> None:
     free = status.f_bavail * status.f_frsize
     if needed > free:
         raise ValueError(
-            f"{_SHARED} has {_size(free)} of shared memory left, and {_size(needed)} "
-            f"are needed for {what}; in a container, give it more (docker: --shm-size)"
+            f"{_SHARED} has {_size(free)} of shared memory left, but {_size(needed)} "
+            f"are needed for {what}; in a container, increase it (docker: --shm-size)"
         )
 
 

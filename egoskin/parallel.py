@@ -65,7 +65,7 @@ T = TypeVar("T")
 _UNGUARDED = 97
 _GUARD = (
     "error: workers import the script that starts them, and this one would start them "
-    'again: put what it does into a function, called under `if __name__ == "__main__":`'
+    'again: put its code into a function, called under `if __name__ == "__main__":`'
 )
 # Exit priority at which multiprocessing removes its folder; lower runs later.
 _REMOVES_FOLDER = -100
@@ -418,7 +418,7 @@ class WorkerPool(ParallelEnv):
                     self._fail(worker, self._death(worker))
             time.sleep(_POLL)
         self._end()
-        raise WorkerError("the channel to a worker broke; all were ended")
+        raise WorkerError("the connection to a worker broke; all were ended")
 
     def _death(self, worker: int) -> str:
         if worker in self._hung:

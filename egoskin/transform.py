@@ -79,8 +79,8 @@ class _KeyedTransform(Transform):
         name = type(results).__name__
         got = f"{name} of {len(results)}" if isinstance(results, Sequence) else name
         raise TypeError(
-            f"{type(self).__name__}.{method} must return a tuple, one for each of "
-            f"{self.out_keys}, got {got}"
+            f"{type(self).__name__}.{method} must return a tuple with one entry for "
+            f"each of {self.out_keys}, got {got}"
         )
 
     def _rows_to_reset(
@@ -333,7 +333,7 @@ def _starts(tensordict: TensorDictBase) -> Tensor:
         return tensordict["is_init"].reshape(-1, time)
     if ("next", "done") not in keys:
         raise KeyError(
-            "where do episodes start? The tensordict holds neither 'is_init' nor "
+            "unknown starts of episodes: the tensordict has neither 'is_init' nor "
             "('next', 'done')"
         )
     done = tensordict["next", "done"].reshape(-1, time)

@@ -1,4 +1,4 @@
-"""A real browser without a display, as a visitor of the page; and its picture.
+"""A headless browser that visits the page, and takes a picture of it.
 
 python tests/browser.py docs/view.jpg
 """
@@ -69,7 +69,7 @@ def main(path: str, width: int = 1440) -> None:
         tab.goto(page.address)
         tab.wait_for_selector("canvas")
         tab.wait_for_timeout(15_000)
-        # What the browser says of drawing without a graphics card.
+        # The browser's warning about drawing without a graphics card.
         for notice in tab.locator(".mantine-Notification-closeButton").all():
             notice.click()
         tab.wait_for_timeout(2000)

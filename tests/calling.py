@@ -1,4 +1,4 @@
-"""Commands as a user calls them, in this process: importing takes most of a call."""
+"""Run commands in this process, because importing takes most of a call."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def call(name: str, *args: object) -> subprocess.CompletedProcess[str]:
         errors.write(status)
         status = 1
     assert isinstance(status, int)
-    # tyro draws boxes: take the lines together.
+    # tyro draws boxes: join the lines.
     told = errors.getvalue().replace("│", " ")
     return subprocess.CompletedProcess([name, *texts], status, out.getvalue(), told)
 
@@ -58,7 +58,7 @@ def _run(name: str, args: list[str]) -> None:
 
 
 def succeed(name: str, *args: object) -> str:
-    """Return what a command prints that must succeed."""
+    """Return the output of a command, which must succeed."""
     done = call(name, *args)
     assert done.returncode == 0, done.stderr
     return done.stdout

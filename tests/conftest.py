@@ -1,4 +1,4 @@
-"""What several test files share: the robot, random states, small robots."""
+"""Fixtures shared by several test files: the robot, random states, small robots."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from egoskin.robots.config import H1_2, RobotConfig
 from egoskin.sensors import Skin, place_sensors
 from egoskin.sensors.kernels import compilation
 
-# The same examples in every run: a test turns red with the change that broke it.
+# The same examples in every run: a test fails with the change that broke it.
 settings.register_profile(
     "egoskin", deadline=None, derandomize=True, max_examples=50, database=None
 )
@@ -35,7 +35,7 @@ settings.load_profile("egoskin")
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# Compiling takes longer than all the rest, and changes no result: only the tests of it
+# Compiling takes longer than all the rest and changes no result: only its own tests
 # compile.
 os.environ[compilation.SETTING] = "0"
 
@@ -69,7 +69,7 @@ def random_state(
 ) -> Callable[..., TensorDict]:
     """Function of (n, seed, dtype, objects): raw states like the environment's.
 
-    The base is anywhere within 2 m, turned anyhow; objects are within about 2 m of it.
+    The base is within 2 m, at a random orientation; objects within about 2 m of it.
     """
 
     def draw(
@@ -105,7 +105,7 @@ def random_state(
 
 @pytest.fixture(scope="session")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished run of four rollouts, to be read; who changes it copies it."""
+    """A finished run of four rollouts; tests that change it must copy it."""
     folder = tmp_path_factory.mktemp("runs") / "trained"
     succeed("train", *SMALL, "--run-dir", folder, "--total-frames", 4 * BATCH)
     return folder

@@ -1,4 +1,4 @@
-"""Policies that nobody trained, for tests of what every policy can do."""
+"""Untrained policies, for tests that apply to every policy."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from egoskin.policies.policy import Policy, PolicySpec, sparse_sources
 def make_agent(
     config: EnvConfig, network: NetworkConfig, seed: int = 0
 ) -> tuple[Agent, PolicySpec]:
-    """Return an agent for an environment, its weights and statistics at random."""
+    """Return an agent for an environment, with random weights and statistics."""
     skin = config.skin.build(config.robot_config)
     env = make_worker_env(config, skin, num_envs=1, seed=0)
     sources = sparse_sources(config, skin)
@@ -35,5 +35,5 @@ def make_agent(
 def make_policy(
     config: EnvConfig, network: NetworkConfig | None = None, seed: int = 0
 ) -> Policy:
-    """Return a policy for an environment, its weights and statistics at random."""
+    """Return a policy for an environment, with random weights and statistics."""
     return Policy(*make_agent(config, network or NetworkConfig(), seed))

@@ -1,4 +1,4 @@
-"""A small robot in a folder of its own, as a user brings one."""
+"""A small robot in its own folder, as provided by a user."""
 
 from __future__ import annotations
 

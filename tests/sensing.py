@@ -1,4 +1,4 @@
-"""What the tests of sensors share: shapes, measuring, turned objects, equal bits."""
+"""Helpers for the sensor tests: shapes, measuring, rotations, bit equality."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def placed_by_mujoco(model, data, skin, state):
 
 
 def turned(state, seed: int):
-    """The state with its objects turned anyhow."""
+    """The state with its objects at random orientations."""
     rng = np.random.default_rng(seed)
     quat = torch.from_numpy(rng.normal(size=(*state["object_active"].shape, 4)))
     quat = torch.nn.functional.normalize(quat, dim=-1)
@@ -67,7 +67,7 @@ def assert_same_bits(one, other) -> None:
 
 
 def assert_same_bits_in_any_batch(sensor, state) -> None:
-    """A row reads the same whichever rows are computed with it."""
+    """Assert that a row's readings do not depend on the other rows."""
     whole = measure(sensor, state)
     for size in (1, 5, 27, 32):
         for start in (0, 3, 69):

@@ -1,4 +1,4 @@
-"""The physics contract once more, as simply as it can be said: a loop over `MjData`."""
+"""A simple reference implementation of the physics contract: a loop over `MjData`."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ WHOLE = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
 class SimplePhysics(Physics):
-    """One `MjData` a row, stepped in turn and inspected contact by contact."""
+    """One `MjData` per row, stepped in turn and inspected contact by contact."""
 
     def __init__(
         self,

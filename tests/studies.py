@@ -1,4 +1,4 @@
-"""Finished runs of a study that nobody has trained: what a report is made of."""
+"""Finished runs of a study with invented results, as input of a report."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _BEST = {"localization": 66, "proximity": 64, "binary": 60}
 
 
 def expected(run: PlannedRun) -> float:
-    """Success [%] of a run in a world where the paper is right in part."""
+    """Success [%] of a run if the paper is partly right."""
     sensor = run.config.env.sensor
     if not sensor.uses_skin:
         return 3.0
@@ -36,11 +36,11 @@ def expected(run: PlannedRun) -> float:
 
 
 def as_format_1(path: Path) -> None:
-    """Make a manifest or a configuration what one of format 1 would have been."""
+    """Convert a manifest or a configuration to format 1."""
     content, _ = read_sealed(path)
     base = content.get("base", content)
     throws = base["env"]["task"]["throws"]
-    # Then first_delay and another aim did not exist, and these options did.
+    # In format 1, first_delay and another aim did not exist, and these options did.
     throws.pop("first_delay")
     throws.pop("aim")
     base["compile_kernels"] = True

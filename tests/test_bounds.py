@@ -56,8 +56,8 @@ def test_what_lies_within_is_taken(values: Any):
         ({"reach": math.nan}, "reach must be a finite number, got nan"),
         ({"reach": -math.inf}, "reach must be a finite number, got -inf"),
         ({"free": math.inf}, "free must be a finite number, got inf"),
-        ({"whole": 10**400}, "whole must be a number of 64 bits, got 1000"),
-        ({"free": 10**400}, "free must be a number of 64 bits, got 1000"),
+        ({"whole": 10**400}, "whole must fit into 64 bits, got 1000"),
+        ({"free": 10**400}, "free must fit into 64 bits, got 1000"),
     ],
 )
 def test_what_lies_outside_is_named(values: Any, message: str):

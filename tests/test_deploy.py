@@ -1,4 +1,4 @@
-"""A policy without PyTorch: the targets of our environment, and its watchdogs."""
+"""Policies without PyTorch: same targets as the environment, and watchdogs."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from egoskin.policies.policy import Policy
 from egoskin.sensors.config import SensorConfig
 from making import make_policy
 
-# A ball that comes slowly, and near.
+# A slow ball that comes near.
 TASK = DodgeballConfig(
     throws=ThrowConfig(
         first_delay=(0.0, 0.0), height=(1.0, 1.2), distance=(1.5, 1.6), speed=(2.0, 2.1)
@@ -58,14 +58,14 @@ def deploy(policy: Policy, folder: Path, **kwargs: Any) -> Controller:
 @pytest.mark.parametrize("kind", KINDS)
 def test_from_raw_states_and_distances_come_our_environments_targets(kind, tmp_path):
     policy = make_policy(KINDS[kind])
-    # Whatever it asks for, for the comparison.
+    # Unlimited, for the comparison.
     free = {"margin": np.inf, "max_change": np.inf}
     controller = deploy(policy, tmp_path, **free)
     env = make_worker_env(
         policy.env_config, policy.skin, num_envs=1, seed=1, keep_raw=True
     )
     with torch.no_grad():
-        # The robot falls, so it is turned in every way.
+        # The robot falls, so all orientations occur.
         rollout = env.rollout(40, policy)[0]
     scale = np.array(controller.metadata["action_scale"])
     default = np.array(controller.metadata["default_joint_pos"])
@@ -98,7 +98,7 @@ def controller(tmp_path_factory) -> Controller:
 
 @pytest.fixture
 def state(controller) -> dict[str, Any]:
-    """A robot that stands in its default pose, nothing in sight."""
+    """A robot in its default pose, with nothing in range."""
     controller.reset()
     return {
         "base_quat": np.array([1.0, 0, 0, 0]),
@@ -131,7 +131,7 @@ def test_a_watchdog_stops_it_for_good(controller, state, change, why):
     target = controller.step(**{**state, **change})
     assert controller.stopped == why
     np.testing.assert_array_equal(target, last)
-    # A sensor that comes back starts nothing.
+    # A sensor that recovers does not end the stop.
     moved = {**state, "distance": np.full(64, 0.3)}
     np.testing.assert_array_equal(controller.step(**moved), last)
     assert controller.stopped == why
@@ -171,7 +171,7 @@ def test_of_grids_of_beams_the_closest_count_where_a_policy_reads_those(tmp_path
 
 def test_targets_stay_within_limits_of_place_and_change(tmp_path):
     policy = make_policy(EnvConfig())
-    # A policy gone wild.
+    # A policy with extreme actions.
     for weight in policy.head.body.tail[-1].parameters():
         weight.data *= 1e3
     controller = deploy(policy, tmp_path, margin=0.5, max_change=0.2)
@@ -205,7 +205,7 @@ def test_what_needs_a_tracker_is_refused_in_one_line(name, tmp_path):
         policy = make_policy(EnvConfig(sensor=SensorConfig(coverage="oracle")))
     else:
         policy = egoskin.load_policy(name)
-    with pytest.raises(ValueError, match=r"reads where balls are, which needs a track"):
+    with pytest.raises(ValueError, match=r"reads positions of balls, which needs a tr"):
         deploy(policy, tmp_path)
 
 

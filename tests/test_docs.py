@@ -1,4 +1,4 @@
-"""The documents: their code runs as it is given, their tables are the code's."""
+"""Documentation: its code runs as printed, its tables match the code."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def test_cleanrl_is_told_of_many_robots_what_it_wants():
     np.testing.assert_allclose(episode["r"][over], returns[over])
     np.testing.assert_array_equal(episode["l"][over], lengths[over])
     assert np.abs(seen).max() <= 10
-    # Scaled by what was seen of all robots until then.
+    # Scaled by the statistics of all robots until then.
     rows = np.concatenate(told)
     scaled = (told[-1] - rows.mean(0)) / np.sqrt(rows.var(0) + 1e-8)
     np.testing.assert_allclose(seen[-1], np.clip(scaled, -10, 10), atol=0.02)
@@ -131,7 +131,7 @@ def test_cleanrl_is_told_of_many_robots_what_it_wants():
 
 # --- Tutorials --------------------------------------------------------------------
 
-# What a tutorial is made of: files (```json name), programs, commands with answers.
+# Parts of a tutorial: files (```json name), programs, commands with output.
 BLOCK = re.compile(r"^```(\w+)(?: (\S+))?\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 # A command after "$ ", and what it prints.
 COMMAND = re.compile(r"^\$ (.*)\n((?:(?!\$ ).*\n)*)", re.MULTILINE)
@@ -145,13 +145,13 @@ TUTORIALS = [
 
 
 def agree(expected: str, found: str) -> bool:
-    """Whether a text is the expected one, in which ... stands for any."""
+    """Whether a text matches the expected one, in which ... matches anything."""
     options = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
     return doctest.OutputChecker().check_output(expected, found, options)
 
 
 def said_by(code: str) -> str:
-    """What a program prints: comments behind print(...), or below in lines alone."""
+    """Expected output of a program: comments after print(...) or on lines below."""
     return "".join(
         f"{text}\n"
         for text in re.findall(r"(?:print\(.*  |^)# (.*)", code, re.MULTILINE)
@@ -199,7 +199,7 @@ def numbers(text: str) -> list[float]:
 
 
 def code(text: str) -> list[str]:
-    """Return what stands in back quotes."""
+    """Return the texts in back quotes."""
     return re.findall("`(.*?)`", text)
 
 
@@ -351,7 +351,7 @@ def test_the_site_is_built_without_warnings_and_read_offline(tmp_path):
     subprocess.run([*command, str(DOCS), str(tmp_path)], check=True)
     built = list(tmp_path.rglob("*.html"))
     assert len(built) > len(PAGES)
-    # What a browser would fetch by itself: links are followed by people.
+    # Resources that a browser fetches by itself; links are not fetched.
     fetched = re.compile(r"<(?:script|img|link|iframe)[^>]+?=\"(?:https?:)?//[^\"]+")
     for path in built:
         assert not fetched.search(path.read_text()), path

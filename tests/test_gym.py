@@ -1,4 +1,4 @@
-"""The Gymnasium forms: Gymnasium's own checks, and the same bits as our environment."""
+"""The Gymnasium environments: Gymnasium's checks, bit-identical to our environment."""
 
 from __future__ import annotations
 
@@ -147,7 +147,7 @@ def test_many_robots_give_the_bits_of_our_environment():
 
 
 def kinds(value: Any) -> Any:
-    """What an info is made of."""
+    """Items of an info."""
     if isinstance(value, dict):
         return {key: kinds(x) for key, x in value.items()}
     return (type(value), value.dtype, value.shape)
@@ -224,7 +224,7 @@ def test_a_robot_that_is_drawn_moves_as_one_that_is_not():
         for picture in pictures:
             assert picture.dtype == np.uint8
             assert picture.std() > 10
-        # The same state is the same picture, another is another.
+        # Equal states give equal pictures, different states different ones.
         moved, same, anew = (
             (pictures[i] != pictures[j]).mean() for i, j in ((0, 1), (1, 2), (2, 3))
         )

@@ -1,4 +1,4 @@
-"""Data goes one way: who imports whom, read from the sources."""
+"""Layering: allowed imports between packages, checked in the sources."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ MODULES = {
     for path in PACKAGE.rglob("*.py")
 }
 
-# Small tools that many rooms share; the last ones import those before them.
+# Small modules that many packages share; the last ones import those before them.
 TOOLS = [
     "hints",
     "bounds",
@@ -26,7 +26,7 @@ TOOLS = [
     "parallel",
     "shapes",
 ]
-# What each room may import besides the tools: one way, so no two import each other.
+# Allowed imports of each package besides the tools; no two import each other.
 ROOMS = {
     "storage": set(),
     "robots": {"storage"},
@@ -133,6 +133,6 @@ def test_only_the_room_of_the_engines_names_one():
     engines = {f"egoskin.{m}" for m in MODULES if m.startswith("envs.physics.")}
     shared = ("contract", "model", "__init__")
     engines -= {f"egoskin.envs.physics.{name}" for name in shared}
-    # What measures an engine knows which.
+    # Benchmarks may name engines.
     naming = {m for m in MODULES if engines & imports(m) and ".bench." not in m}
     assert naming == {"envs.physics.__init__"}

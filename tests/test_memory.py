@@ -1,4 +1,4 @@
-"""Whether what is planned fits the machine's memory."""
+"""Checks of required against available memory."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_shared_memory_that_is_not_there_is_refused():
 def test_a_training_that_does_not_fit_leaves_no_folder(
     config, largest, tmp_path, monkeypatch
 ):
-    # Of a machine of 8 GB.
+    # A machine with 8 GB.
     monkeypatch.setattr("egoskin.memory.machine_memory", lambda: 8 * 10**9)
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ValueError, match=f"needs at least .*{largest}"):

@@ -1,4 +1,4 @@
-"""What people meet first: the names of the package, its help, README's examples."""
+"""The package's public names, its help and the examples of the README."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_an_environment_has_the_skin_of_its_configuration_by_default():
 
 def test_the_state_for_sparse_sources_has_no_history():
     config = egoskin.EnvConfig(history=2)
-    with pytest.raises(ValueError, match="history 2 needs signals: leave sparse off"):
+    with pytest.raises(ValueError, match="history 2 needs signals: turn sparse off"):
         egoskin.make_worker_env(config, num_envs=1, seed=0, sparse=True)
 
 
@@ -120,12 +120,12 @@ def test_the_readmes_examples_run_as_given(number, tmp_path, monkeypatch, capfd)
     script.write_text(examples()[number])
     monkeypatch.chdir(tmp_path)
     if "__main__" in examples()[number]:
-        # Its workers are processes, which read it as well.
+        # Its worker processes read it as well.
         command = [sys.executable, "-W", "error::UserWarning", script]
         subprocess.run(command, check=True)
     else:
         runpy.run_path(str(script), run_name="__main__")
-    # What the comments say comes out.
+    # The output is that of the comments.
     said = re.findall(r"print\(.*# (.*)", examples()[number])
     assert said
     assert list(dict.fromkeys(capfd.readouterr().out.splitlines())) == said

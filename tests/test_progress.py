@@ -1,4 +1,4 @@
-"""The progress line: read on a terminal, in a file, or by nobody."""
+"""The progress line: on a terminal, in a file, or with a closed output."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Known answers of the generator, and that a draw depends on its name alone."""
+"""Known answers of the generator; a draw depends only on its key."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_a_number_is_the_upper_24_bits_of_its_word():
 def test_row_episode_counter_and_block_are_the_words_of_the_counter(
     seed, row, episode, counter, stream
 ):
-    # Fixed for good: a throw set or a start must not change with a version.
+    # Never changes: a throw set or a start must not depend on the version.
     got = draw([row], seed=seed, stream=stream, episode=episode, counter=counter)
     words = [
         philox(torch.tensor([row, episode, counter, b]), (seed, stream)) for b in (0, 1)

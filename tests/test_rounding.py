@@ -1,4 +1,4 @@
-"""Numbers that round right."""
+"""Correct rounding."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Shapes against MuJoCo's distances and rays, by hand, and with marked readings."""
+"""Shapes compared with MuJoCo's distances and rays and values by hand; bad input."""
 
 from __future__ import annotations
 
@@ -346,7 +346,7 @@ def test_origins_broadcast_against_directions(shape):
         assert torch.equal(a, b)
 
 
-# --- what holds for all of it ---------------------------------------------------
+# --- common properties ----------------------------------------------------------
 
 
 class IeeeSquareRoot(TorchFunctionMode):
@@ -402,7 +402,7 @@ def test_nan_is_passed_on(shape, dtype, coordinate):
 @pytest.mark.filterwarnings("ignore:`torch.jit.script_method` is deprecated")
 @every_shape
 def test_compiled_code_gives_the_same_bits(shape):
-    # No multiple of any vector's length: the rest is computed one by one.
+    # Not a multiple of any vector length: the rest is computed one by one.
     p, d = draw_beams(1003, torch.float32)
     p[0, 7::50] = math.nan
     d[2, 8::50] = math.nan

@@ -101,7 +101,7 @@ def test_hits_are_the_readings_of_the_grid(random_state, ray, on_gpu, monkeypatc
         # As there: PyTorch takes the least of a beam's readings.
         monkeypatch.setattr("egoskin.sensors.ray._nearest_numpy", _nearest)
     state = random_state(300, seed=1, objects=3)
-    # Two objects on one another, and a row of NaN.
+    # Two coincident objects, and a row of NaN.
     state["object_pose"][:50, 1] = state["object_pose"][:50, 0]
     state["joint_pos"][7, 3] = float("nan")
     objects = (Sphere(radius=0.25), Sphere(radius=0.2), Sphere(radius=0.1))
@@ -217,7 +217,7 @@ def test_an_agent_collects_the_same_from_hits_as_from_the_grid(normalize):
     rows, matrix = rollout["inputs", "signal"], dense["inputs", "signal"]
     assert isinstance(rows, SparseRows)
     assert len(rows.value) > 100
-    # Actions differ to rounding, and so does what follows of them.
+    # Actions differ by rounding, and so do their consequences.
     same = (rows.dense().reshape_as(matrix) - matrix).abs() < 1e-3
     assert same.float().mean() > 0.999
     for key in ("loc", "state_value", "next_state_value"):

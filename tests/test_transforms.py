@@ -1,4 +1,4 @@
-"""What every transform promises: offline, in an environment, around workers."""
+"""Contract of all transforms: offline, in an environment, around workers."""
 
 from __future__ import annotations
 
@@ -159,7 +159,7 @@ def test_a_missing_key_is_named(build, full_state):
 @pytest.mark.parametrize("method", ["compute", "out_specs"])
 def test_results_that_are_not_one_for_each_key_are_refused(method, given):
     class Doubled(RowTransform):
-        """As one writes one's first transform: what is alone needs no tuple."""
+        """A typical first transform: a single result without a tuple."""
 
         def __init__(self) -> None:
             super().__init__(in_keys=["x"], out_keys=["y"])
@@ -176,7 +176,7 @@ def test_results_that_are_not_one_for_each_key_are_refused(method, given):
             return result if given == "bare" else (result, result)
 
     got = "tuple of 2" if given == "two" else r"(Tensor|UnboundedContinuous)$"
-    expected = rf"Doubled\.{method} must return a tuple, .* \['y'\], got {got}"
+    expected = rf"Doubled\.{method} must return a tuple with .* \['y'\], got {got}"
     asked = {
         "compute": (Doubled(), TensorDict({"x": torch.ones(1, 3)}, [1])),
         "out_specs": (
@@ -357,7 +357,7 @@ def test_an_approach_is_where_the_ball_will_be(gravity):
 
     expected = torch.stack((0.3 / (0.3 + times[nearest, 0]), dy, -dx, dz))
     torch.testing.assert_close(approach(velocity), expected, atol=1e-3, rtol=0)
-    # One that flies away is nearest now.
+    # A ball that flies away is nearest now.
     expected = torch.tensor([1.0, 0.5, -3.0, 1.0]).double()
     torch.testing.assert_close(approach(-velocity), expected)
 
@@ -417,14 +417,14 @@ SENSORS = {
 
 
 def actions(steps: int, rows: int) -> torch.Tensor:
-    """Fixed wild actions: robots fall soon, and not all at once."""
+    """Fixed extreme actions: robots fall soon, at different times."""
     generator = torch.Generator().manual_seed(0)
     size = 0.7 * torch.rand(rows, 1, generator=generator)
     return (size * torch.randn(100, rows, JOINTS, generator=generator))[:steps]
 
 
 def run(env, steps: int) -> list[TensorDict]:
-    """What an environment gives under fixed actions, flat over its rows."""
+    """Outputs of an environment under fixed actions, flat over its rows."""
     out, root = [], env.reset()
     for action in actions(steps, root.numel()):
         root["action"] = action.reshape(*root.batch_size, JOINTS)
@@ -541,7 +541,7 @@ OBSERVED = ("observation", "privileged_observation", "signal")
 def test_transforms_around_workers_give_what_they_give_inside(
     inside_run, parallel, options
 ):
-    # The workers' imports are paid for once.
+    # The workers import only once.
     multiprocessing.set_forkserver_preload(["egoskin.make"])
     env = outside(EnvConfig(task=TASK), parallel, **options)
     try:
@@ -566,7 +566,7 @@ def test_a_static_seed_reaches_the_environments_of_all_workers(inside_run):
     env.close()
 
 
-# --- what the actor may know ----------------------------------------------------
+# --- inputs of the actor --------------------------------------------------------
 
 
 def test_the_actor_reads_its_observation_and_the_signal_alone():
@@ -592,7 +592,7 @@ ACTORS = {
 
 @pytest.mark.parametrize("sensor", ACTORS.values(), ids=ACTORS)
 def test_nothing_tells_the_actor_when_the_first_ball_comes(sensor):
-    """Before it, all that the actor reads is the same whatever the delay."""
+    """Before the throw, the actor's inputs do not depend on the delay."""
     found = []
     for delay in ((0.5, 0.8), (1.5, 2.0), (30.0, 40.0)):
         throws = replace(TASK.throws, first_delay=delay)

@@ -1,4 +1,4 @@
-"""The package as others get it: the wheel, installed, in a folder without the source.
+"""The installed wheel, in a folder without the source.
 
 Dependencies are those of this interpreter; the package is the wheel alone.
 """
@@ -39,7 +39,7 @@ BATCH = 256
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory) -> Path:
-    """The wheel, built of a copy: setuptools writes beside what it builds."""
+    """The wheel, built from a copy: setuptools writes into the source folder."""
     folder = tmp_path_factory.mktemp("wheel")
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, folder)
@@ -57,13 +57,13 @@ def pip(*args: object) -> None:
 
 
 def surroundings(**more: str) -> dict[str, str]:
-    """Return the environment of a user, to whom no source and no test is known."""
+    """Return the environment of a user, without paths to the source or the tests."""
     unset = ("PYTHONPATH", "MUJOCO_GL", "PYOPENGL_PLATFORM", SETTING)
     return {k: v for k, v in os.environ.items() if k not in unset} | more
 
 
 class Installed:
-    """The wheel in an environment of its own, called from a folder.
+    """The wheel in its own environment, called from a folder.
 
     Args:
         python: Its interpreter.
@@ -77,7 +77,7 @@ class Installed:
         self.env = surroundings(XDG_CACHE_HOME=str(cache))
 
     def run(self, *command: object, status: int = 0) -> str:
-        """Return what a command of the environment prints; on failure, its errors."""
+        """Return the output of a command of the environment; on failure, its errors."""
         name, *args = map(str, command)
         done = subprocess.run(
             [self.python.with_name(name), *args],
@@ -91,7 +91,7 @@ class Installed:
         return done.stderr if status else done.stdout
 
     def __call__(self, *args: object) -> str:
-        """Return what `egoskin` prints."""
+        """Return the output of `egoskin`."""
         return self.run("egoskin", *args)
 
     def read(self, name: str) -> dict:
@@ -356,7 +356,7 @@ def test_it_trains_and_draws_a_robot_of_ones_own(egoskin: Installed):
         *("train", *SMALL, "--robot", "pip", "--skin.num-sensors", "4"),
         *("--total-frames", BATCH, "--run-dir", "runs/pip"),
     )
-    # Its policy needs the folder no more.
+    # Its policy no longer needs the folder.
     shutil.rmtree(egoskin.folder / "pip")
     assert "runs/pip: 256 frames" in egoskin("evaluate", "runs/pip", "--episodes", "4")
 

@@ -1,4 +1,4 @@
-"""The worker pool: same results, sleeping parent, faults told with their cause."""
+"""The worker pool: same results, sleeping parent, faults reported with causes."""
 
 from __future__ import annotations
 
@@ -280,7 +280,7 @@ print("closed")
         os.killpg(parent.pid, signal.SIGSTOP)
         time.sleep(4)
         os.killpg(parent.pid, signal.SIGCONT)
-        # A parent that is stopped alone leaves its workers without a command.
+        # If only the parent is stopped, its workers get no command.
         assert parent.stdout.readline() == "step\n"
         os.kill(parent.pid, signal.SIGSTOP)
         time.sleep(2)
@@ -370,7 +370,7 @@ def test_ctrl_c_while_the_server_imports_is_one_line():
         # It waits for the server to fork the first worker.
         time.sleep(0.5)
         os.killpg(script.pid, signal.SIGINT)
-        # All that it started has ended when nobody can write there any more.
+        # When nothing can write there any more, all started processes have ended.
         assert script.stderr.read() == "stopped\n"
     assert script.returncode == 130
 
@@ -445,7 +445,7 @@ def build_badly(parent: int, fault: str, skin) -> TransformedEnv:
 def test_a_worker_that_fails_while_it_starts_is_reported(
     skin, fault, message, monkeypatch
 ):
-    # The good one starts in time.
+    # The other one starts in time.
     monkeypatch.setattr(workers, "HANG_LIMIT", 5.0)
     good = partial(make_worker_env, EnvConfig(), skin, num_envs=4, seed=0)
     pool = WorkerPool([good, partial(build_badly, os.getpid(), fault, skin)])
@@ -484,7 +484,7 @@ def test_a_worker_that_dies_between_commands_is_reported(skin):
     processes = list(pool._workers)
     os.kill(processes[0].pid, signal.SIGKILL)
     time.sleep(0.5)
-    # Closing says nothing: whoever closes does not wait for it.
+    # Closing raises nothing, as nobody waits for a result.
     pool.close()
     assert not any(process.is_alive() for process in processes)
 

@@ -1,4 +1,4 @@
-"""A visitor of a page without a browser: one that only looks, and counts."""
+"""A client of a page without a browser, which only receives and counts."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _CAMERA = {
 
 
 class Visitor:
-    """Somebody who has the page open.
+    """A client that has the page open.
 
     Args:
         port: Port of the page.
@@ -56,5 +56,5 @@ class Visitor:
         self._reader.join(5)
 
     def vanish(self) -> None:
-        """Be cut off, without a word."""
+        """Drop the connection without closing it."""
         self._socket.socket.close()

@@ -51,7 +51,7 @@ class NetworkConfig:
                 f"{self.init_std} and std_bounds ({low}, {high})"
             )
         if not self.hidden:
-            raise ValueError("hidden must be one size at least, got none")
+            raise ValueError("hidden needs at least one layer size, got none")
 
 
 class KeyedMLP(nn.Module):

@@ -94,8 +94,8 @@ class PPOConfig:
         low, high = _LR_BOUNDS
         if self.desired_kl is not None and not low <= self.learning_rate <= high:
             raise ValueError(
-                f"a learning_rate that is adapted (desired_kl) must be between {low:g} "
-                f"and {high:g}, got {self.learning_rate}"
+                f"with desired_kl, learning_rate must be between {low:g} and {high:g}, "
+                f"got {self.learning_rate}"
             )
 
     def noise_correlation_at(self, frames: int) -> float:
@@ -217,8 +217,8 @@ class PPO:
         # Before the first step the state is empty.
         if found and found != expected:
             raise ValueError(
-                "the state of the optimiser is one of other networks, or of an older "
-                "egoskin"
+                "the optimiser state belongs to other networks or to an older version "
+                "of egoskin"
             )
         for name, value in tensors.items():
             index, key = name.split("/")

@@ -115,7 +115,7 @@ class PolicySpec:
         for claim in claims:
             if not 0 < claim <= held:
                 raise ValueError(
-                    f"{what} is damaged: its header claims a size of {claim}, and it "
+                    f"{what} is damaged: its header claims a size of {claim}, but it "
                     f"holds {held} numbers"
                 )
         with torch.device("meta"):
@@ -142,26 +142,26 @@ class PolicySpec:
             ValueError: If the header is not valid.
         """
         if not isinstance(header, Mapping):
-            raise ValueError(f"{what} holds no policy: it must be an object")
+            raise ValueError(f"{what} is not a policy: it must be an object")
         missing = [f.name for f in dataclasses.fields(cls) if f.name not in header]
         if missing:
-            raise ValueError(f"{what} holds no policy: {missing[0]!r} is missing")
+            raise ValueError(f"{what} is not a policy: {missing[0]!r} is missing")
         sizes = header["sizes"]
         numbers = sizes.values() if isinstance(sizes, dict) else [None]
         numbers = [*numbers, header["num_actions"], header["frames"]]
         if not all(isinstance(number, int) for number in numbers):
             raise ValueError(
-                f"{what} holds no policy: sizes, num_actions and frames must be numbers"
+                f"{what} is not a policy: sizes, num_actions and frames must be numbers"
             )
         if header["engine"] not in get_args(Engine):
-            raise ValueError(f"{what} holds no policy: no engine {header['engine']!r}")
+            raise ValueError(f"{what} is not a policy: no engine {header['engine']!r}")
         env = from_plain(EnvConfig, header["env"], what)
         if lacking := set(env.critic_keys) - sizes.keys():
-            raise ValueError(f"{what} holds no policy: no size of {min(lacking)!r}")
+            raise ValueError(f"{what} is not a policy: no size for {min(lacking)!r}")
         try:
             skin = Skin.from_dict(header["skin"])
         except ValueError as error:
-            raise ValueError(f"{what} holds no policy: {error}") from error
+            raise ValueError(f"{what} is not a policy: {error}") from error
         return cls(
             env=env,
             skin=skin,
@@ -215,7 +215,7 @@ def check_like(
     """Raise ValueError if a tensor is unknown or has another shape or type."""
     for name, value in tensors.items():
         if name not in own:
-            raise ValueError(f"{what}: tensor {name!r} is none that is known here")
+            raise ValueError(f"{what}: unknown tensor {name!r}")
         if (own[name].shape, own[name].dtype) != (value.shape, value.dtype):
             raise ValueError(
                 f"{what}: tensor {name!r} does not fit: expected {_kind(own[name])}, "
@@ -269,7 +269,7 @@ def check_finite(agent: Agent, what: str) -> None:
     scale = agent.head.log_std.exp()
     if not (body(*largest).isfinite().all() and scale.isfinite().all()):
         raise ValueError(
-            f"{what} is damaged: with weights as large as its own, actions need not be "
+            f"{what} is damaged: its weights are so large that actions may not be "
             "finite"
         )
 
@@ -426,13 +426,13 @@ def policy_file(path: str | Path) -> Path:
         names = shipped_policies()
         if str(path) not in names:
             raise ValueError(
-                f"no policy {path}: neither a file, nor a folder, nor one that comes "
-                f"with the package ({', '.join(names)})"
+                f"no policy {path}: not a file, a folder or one that comes with "
+                f"the package ({', '.join(names)})"
             )
         path = _SHIPPED / f"{path}.safetensors"
     if path.is_dir():
         if not (path / CHECKPOINT_NAME).is_file():
-            raise ValueError(f"{path} is no run folder: it has no {CHECKPOINT_NAME}")
+            raise ValueError(f"{path} is not a run folder: it has no {CHECKPOINT_NAME}")
         path = path / CHECKPOINT_NAME
     return path
 

@@ -87,8 +87,8 @@ class TrainConfig:
             CUSTOM,
         ):
             raise ValueError(
-                f"standard={self.standard} is for the command line, and the task is of "
-                f"standard {self.env.standard}: build one with egoskin.envs.standards."
+                f"standard={self.standard} is for the command line, but the task has "
+                f"standard {self.env.standard}: build it with egoskin.envs.standards."
                 f"training_task({self.standard!r}, DodgeballConfig())"
             )
         frames = self.num_envs * self.ppo.rollout_steps
@@ -165,7 +165,7 @@ def parse_config(args: list[str]) -> TrainConfig:
     if given.standard is not None:
         raise ValueError("--standard cannot be changed on resume")
     if given.config is not None:
-        raise ValueError("--resume goes on with a run, --config repeats one: not both")
+        raise ValueError("--resume continues a run, --config repeats one: use one")
     path = Path(given.resume)
     stored = load_config(path)
     # Fields missing in the file were filled with the current defaults.
@@ -173,7 +173,7 @@ def parse_config(args: list[str]) -> TrainConfig:
     absent = changed_fields(read_config(file)[0], before)
     if lacking := [name for name in absent if name not in MACHINE_FIELDS]:
         raise ValueError(
-            f"{file} lacks {', '.join(lacking)}: another version made it. Go on with "
+            f"{file} lacks {', '.join(lacking)}: another version wrote it. Resume with "
             "that version (its commit is in versions.json)"
         )
     config = tyro.cli(TrainConfig, args=args, default=stored)
@@ -186,7 +186,7 @@ def parse_config(args: list[str]) -> TrainConfig:
         may = sorted(free - set(CALL_FIELDS))
         raise ValueError(
             f"a resumed run keeps its configuration; changed: {names}. Only "
-            f"{', '.join(map(_option, may))} may be"
+            f"{', '.join(map(_option, may))} may change"
         )
     if config.total_frames < stored.total_frames:
         raise ValueError(
@@ -207,7 +207,7 @@ def _default_of(given: argparse.Namespace) -> TrainConfig:
     """
     if given.config is not None:
         if given.standard is not None:
-            raise ValueError("--config brings its own throws: leave out --standard")
+            raise ValueError("--config has its own throws: leave out --standard")
         path = Path(given.config)
         if not path.is_file():
             raise ValueError(f"no file {path}: --config takes the config.json of a run")
@@ -234,7 +234,7 @@ def load_config(path: Path, *, quiet: bool = False) -> TrainConfig:
     """
     file = path / "config.json"
     if not file.is_file():
-        raise ValueError(f"{path} is no run folder: it has no config.json")
+        raise ValueError(f"{path} is not a run folder: it has no config.json")
     return from_plain(TrainConfig, read_config(file, quiet=quiet)[0], str(file))
 
 

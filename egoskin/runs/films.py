@@ -70,5 +70,5 @@ class FilmMaker:
         _, errors = self._process.communicate()
         if self._process.returncode > 0:
             last = errors.strip().splitlines()[-1:]
-            print(f"note: no film {self._film}: {' '.join(last)}", file=sys.stderr)
+            print(f"note: film {self._film} failed: {' '.join(last)}", file=sys.stderr)
         self._process = None

@@ -125,8 +125,8 @@ class Run:
         if path.exists() and (not path.is_dir() or any(path.iterdir())):
             go_on = (path / "config.json").is_file()
             raise ValueError(
-                f"{path} exists already; choose another --run-dir"
-                + f", or go on with it by --resume {path}" * go_on
+                f"{path} already exists; choose another --run-dir"
+                + f", or continue it with --resume {path}" * go_on
             )
         (path / "policies").mkdir(parents=True)
         run = cls(path, config)
@@ -168,7 +168,7 @@ class Run:
         if written not in (None, self._skin_hash):
             raise ValueError(
                 f"{self.skin_path} is damaged or was edited: it is not the skin that "
-                "the run was started with; put it back as it was"
+                "the run was started with; restore the original"
             )
         return skin
 
@@ -184,13 +184,13 @@ class Run:
         if SKIN_HASH in changed:
             raise ValueError(
                 f"{self.skin_path} is not the skin that {self.checkpoint_path} was "
-                "trained with: put that back"
+                "trained with: restore that file"
             )
         if changed:
             names = ", ".join(name.removeprefix("env.") for name in changed)
             raise ValueError(
                 f"{self.path / 'config.json'} is not what {self.checkpoint_path} was "
-                f"trained with: put that back (changed: {names})"
+                f"trained with: restore that file (changed: {names})"
             )
 
     def starts(self) -> list[dict[str, Any]]:
@@ -215,7 +215,7 @@ class Run:
             # Starts after the latest checkpoint are only in the file.
             starts = self.starts() or self._starts
             if starts[: len(self._starts)] != self._starts:
-                raise ValueError(f"{self._versions_path} is that of another run")
+                raise ValueError(f"{self._versions_path} belongs to another run")
             self._starts = starts
         except ValueError as error:
             self._put_aside(self._versions_path, str(error))
@@ -238,7 +238,7 @@ class Run:
         names = (f"{path.stem}-damaged-{i}{path.suffix}" for i in itertools.count(1))
         free = next(n for n in map(path.with_name, names) if not os.path.lexists(n))
         path.rename(free)
-        print(f"note: {why}; it is now {free.name}", file=sys.stderr)
+        print(f"note: {why}; renamed to {free.name}", file=sys.stderr)
 
     @property
     def skin_path(self) -> Path:
@@ -302,10 +302,10 @@ class Run:
         """Return advice on how to continue after a stop or a failure."""
         if not (self.path / "config.json").is_file():
             return (
-                f"{self.path} is gone: start a new run or, if it was only renamed, "
+                f"{self.path} no longer exists: start a new run or, if it was renamed, "
                 "--resume it by its new name"
             )
-        return f"go on with: egoskin train --resume {self.path}"
+        return f"continue with: egoskin train --resume {self.path}"
 
     def save_checkpoint(
         self, tensors: Mapping[str, Tensor], header: Mapping[str, Any]
@@ -389,7 +389,7 @@ class Run:
         Args:
             metrics: Values by name; "frames" is the x axis.
         """
-        assert self._events is not None, "start_metrics first"
+        assert self._events is not None, "call start_metrics first"
         first, line = not self._metrics, io.StringIO()
         columns = metrics if first else next(csv.reader(self._metrics.splitlines()))
         writer = csv.DictWriter(line, list(columns))
@@ -425,8 +425,8 @@ def _check_repeats(config: TrainConfig, skin: Skin) -> None:
     now = json.loads(json.dumps(skin.to_dict(), default=str))
     if before not in (None, content_hash(now)):
         raise ValueError(
-            f"the skin is not that of {config.config}: its file was changed, or it is "
-            "placed otherwise here; give that run's own by --skin.path "
+            f"the skin differs from that of {config.config}: its file was changed, or "
+            "sensors are placed differently here; use that run's skin: --skin.path "
             f"{config.config.parent / 'skin.json'}"
         )
 
@@ -475,7 +475,7 @@ def _text(characters: Tensor, what: str) -> str:
     try:
         return characters.numpy().tobytes().decode()
     except UnicodeDecodeError as error:
-        raise ValueError(f"{what} is damaged: its metrics are no text") from error
+        raise ValueError(f"{what} is damaged: its metrics are not text") from error
 
 
 def _whole_rows(path: Path, frames: int) -> str:

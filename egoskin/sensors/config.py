@@ -50,8 +50,8 @@ class SkinConfig:
         for name in ("num_sensors", "seed", "placement"):
             if getattr(self, name) != getattr(SkinConfig, name):
                 raise ValueError(
-                    f"skin.{name} has no effect beside skin.path: the sensors are "
-                    f"those of the file {self.path}"
+                    f"skin.{name} has no effect with skin.path: the sensors come "
+                    f"from the file {self.path}"
                 )
         skin = Skin.load(self.path)
         # Robots of one manufacturer can have the same link names.
@@ -115,7 +115,7 @@ class SensorConfig:
             if name != self.coverage and getattr(self, name) != default:
                 raise ValueError(
                     f"{name} options need coverage={name}, not {self.coverage} (types "
-                    "of a skin file have options of their own)"
+                    "in a skin file have their own options)"
                 )
         if self.corruption != "none" and self.signal == "localization":
             raise ValueError(

@@ -414,26 +414,27 @@ class ProximitySensor(RowTransform):
                 )
             if len(tensor) != len(active):
                 raise ValueError(
-                    f"{key!r} has {len(tensor)} rows, {self.in_keys[3]!r} {len(active)}"
+                    f"{key!r} has {len(tensor)} rows, but {self.in_keys[3]!r} has "
+                    f"{len(active)}"
                 )
         for key, tensor in zip(self.in_keys[2:], inputs[2:], strict=True):
             if tensor.shape[1] != len(self.objects):
                 raise ValueError(
-                    f"the sensor was made for {len(self.objects)} objects, {key!r} "
-                    f"holds {tensor.shape[1]}"
+                    f"the sensor was made for {len(self.objects)} objects, but "
+                    f"{key!r} holds {tensor.shape[1]}"
                 )
         types = [x.dtype for x in numbers]
         if len({*types}) > 1 or not types[0].is_floating_point:
             raise ValueError(
-                f"{', '.join(map(repr, self.in_keys[:3]))} must be of one floating "
-                f"type, got {', '.join(map(str, types))}"
+                f"{', '.join(map(repr, self.in_keys[:3]))} must have the same "
+                f"floating-point type, got {', '.join(map(str, types))}"
             )
         if active.dtype != torch.bool:
             raise ValueError(f"{self.in_keys[3]!r} must be bool, got {active.dtype}")
         for i in (0, 2):
             if inputs[i].shape[-1] != 7:
                 raise ValueError(
-                    f"{self.in_keys[i]!r} must hold 7 numbers a pose (position, "
+                    f"{self.in_keys[i]!r} must hold 7 numbers per pose (position, "
                     f"quaternion w x y z), got {inputs[i].shape[-1]}"
                 )
 
@@ -504,11 +505,11 @@ def checked(
         skin = skin.resolved(coverage, np.nan if max_range is None else max_range)
     if np.isnan(skin.range).any():
         index = int(np.isnan(skin.range).argmax())
-        raise ValueError(f"sensor {index} has no range of its own: give max_range")
+        raise ValueError(f"sensor {index} has no range: give max_range")
     for index, own in enumerate(skin.coverage):
         if not isinstance(own, kind):
             raise ValueError(
                 f"sensor {index} is a {type(own).__name__}, not a {kind.__name__}; "
-                "give this transform the others alone (Skin.select)"
+                "pass only sensors of that kind (Skin.select)"
             )
     return skin, list(skin.coverage)

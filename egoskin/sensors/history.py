@@ -37,7 +37,7 @@ class History(StatefulTransform):
             raise ValueError(f"length must be at least 1, got {length}")
         if len(in_keys) != len(out_keys):
             raise ValueError(
-                f"one out key for each in key, got {list(in_keys)} and {list(out_keys)}"
+                f"need one out key per in key, got {list(in_keys)} and {list(out_keys)}"
             )
         super().__init__(in_keys, out_keys, state_keys=out_keys)
         self.length = length

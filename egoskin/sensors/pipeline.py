@@ -117,7 +117,9 @@ class SensorPipeline:
         if masks_all(mask):
             return
         if not self.groups:
-            raise ValueError("an oracle has no sensors on links: mask all of it")
+            raise ValueError(
+                "an oracle has no sensors on links: its mask must be 'all'"
+            )
         links = sorted(set(self.skin.links))
         for name in mask:
             if name not in links:

@@ -49,8 +49,8 @@ def _check_links(tactile: Tensor, links: Tensor, key: NestedKey) -> None:
     """Raise ValueError unless there is one contact for each link."""
     if tactile.shape[-1] != len(links):
         raise ValueError(
-            f"{key!r} holds {tactile.shape[-1]} contacts a row, the transform was "
-            f"made for {len(links)} links"
+            f"{key!r} holds {tactile.shape[-1]} contacts per row, but the transform "
+            f"was made for {len(links)} links"
         )
 
 
@@ -121,7 +121,7 @@ class ContactPenalty(Transform):
     ) -> None:
         super().__init__(in_keys=list(in_keys), out_keys=list(out_keys))
         if not prices or not all(map(math.isfinite, prices.values())):
-            raise ValueError(f"prices must be finite and at least one, got {prices}")
+            raise ValueError(f"prices must be finite and not empty, got {prices}")
         parts = [price * _matching(links, [p]) for p, price in prices.items()]
         self.register_buffer("_prices", torch.stack(parts).sum(0))
 

@@ -91,7 +91,7 @@ def test_signals_weigh_as_much_however_many_they_are(size: int):
     sizes = {**SIZES, "signal": size}
     agent = Agent(sizes, ACTOR, CRITIC, 3, NetworkConfig())
     generator = torch.Generator().manual_seed(0)
-    # One sensor in twenty sees something; sensors differ.
+    # One sensor in twenty detects something; sensors differ.
     seen = torch.rand(2_000, size, generator=generator) < 0.05
     near = torch.linspace(0.2, 0.8, size).expand_as(seen)
     batch = TensorDict({"signal": torch.where(seen, near, 1.0)}, [2_000])
@@ -99,7 +99,7 @@ def test_signals_weigh_as_much_however_many_they_are(size: int):
     signal = agent.encode(batch)["inputs", "signal"]
     variance = (signal - signal.mean()).square().mean() * size
     assert variance == pytest.approx(SignalNorm.WEIGHT, rel=0.05)
-    # What differs still does.
+    # Differences are preserved.
     assert len(signal.unique()) == size + 1
 
 

@@ -1,4 +1,4 @@
-"""PPO: bootstrapping by hand, what a rollout holds, that the update improves."""
+"""PPO: bootstrapping by hand, contents of a rollout, improvement by updates."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ def test_a_timeout_bootstraps_from_its_terminal_observation():
     assert rollout["terminated"][:, 1, 0].tolist() == [False, False, True, False]
     assert root["observation"].tolist() == [[0.0], [1.0]]
     assert len(infos) == 4
-    # Nothing but the values of the next states is kept.
+    # Only the values of the next states are kept.
     assert "next" not in rollout.keys()
 
 

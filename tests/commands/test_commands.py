@@ -363,8 +363,8 @@ BAD_SKIN = """{"format": "egoskin-skin-1", "robot": "h1_2", "sensors": [
         (["--device", "gpu"], "available: cpu"),
         (["--skin.path", "skin.json"], "did you mean 'torso_link'"),
         (["--skin.path", "nothing.json"], "nothing.json"),
-        (["--run-dir", "full"], "exists already"),
-        (["--resume", "full"], "no run folder"),
+        (["--run-dir", "full"], "already exists"),
+        (["--resume", "full"], "is not a run folder"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )

@@ -1,4 +1,4 @@
-"""Exported policies against PyTorch, and what they say of the robot against MuJoCo."""
+"""Exported policies compared with PyTorch, and their robot data with MuJoCo."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def test_a_policy_of_any_kind_that_was_trained_acts_as_in_pytorch(kind, tmp_path
     policy = egoskin.load_policy(tmp_path / "run")
     assert policy.policy_spec.frames == 8 * BATCH
     assert_alike(policy)
-    # And on what it meets, with balls in sight.
+    # Also on observations of episodes, with balls in range.
     env = make_worker_env(policy.env_config, policy.skin, num_envs=8, seed=1)
     with torch.no_grad():
         rollout = env.rollout(120, policy, break_when_any_done=False)

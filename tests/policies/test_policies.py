@@ -37,7 +37,7 @@ def test_all_files_of_the_folder_are_policies_known_by_name():
 @pytest.mark.parametrize("name", shipped_policies())
 def test_a_shipped_policy_acts_in_the_environment_it_was_trained_in(name, capsys):
     policy = egoskin.load_policy(name)
-    # It has a seal, so there is nothing to be said of it.
+    # It has a seal, so there is no note about it.
     assert capsys.readouterr().err == ""
     assert policy.policy_spec.frames > 0
     env = egoskin.make_worker_env(policy.env_config, policy.skin, num_envs=2, seed=0)
@@ -49,7 +49,7 @@ def test_a_shipped_policy_acts_in_the_environment_it_was_trained_in(name, capsys
     assert (ASSETS / f"{name}.safetensors").stat().st_size < 200_000
 
 
-# --- in other people's TorchRL ----------------------------------------------------
+# --- in TorchRL code of others ----------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def policy() -> Policy:
 
 
 def given(*batch: int, seed: int = 0) -> TensorDict:
-    """What that policy reads, at random."""
+    """Random inputs of the policy."""
     generator = torch.Generator().manual_seed(seed)
     return TensorDict(
         {
@@ -121,7 +121,7 @@ def test_copies_of_a_policy_act_alike_and_are_its_own(policy, tmp_path):
         assert torch.equal(other(given(4))["action"], action), name
         assert other.env_config == policy.env_config, name
         assert other.skin.to_dict() == policy.skin.to_dict(), name
-        # Nothing in it that it does not use, such as a critic at random.
+        # It contains nothing unused, such as an untrained critic.
         assert other.state_dict().keys() == policy.state_dict().keys(), name
         for key, value in policy.state_dict().items():
             assert torch.equal(value, other.state_dict()[key]), (name, key)
@@ -143,7 +143,7 @@ def test_a_policy_works_under_vmap_and_with_other_parameters(policy):
     parameters = {k: torch.zeros_like(v) for k, v in policy.state_dict().items()}
     idle = torch.func.functional_call(policy, parameters, (given(5),))["action"]
     assert torch.equal(idle, torch.zeros(5, 21))
-    # Gradients go to what it reads, not to what it is.
+    # Gradients reach its inputs, not its parameters.
     td = given(5)
     td["signal"].requires_grad_()
     policy(td)["action"].sum().backward()
@@ -171,7 +171,7 @@ FORMS = {
 
 @pytest.fixture(params=FORMS)
 def form(request) -> Iterator[tuple[Policy, TransformedEnv]]:
-    """A policy of that form, untrained, and its environment."""
+    """An untrained policy of this form, and its environment."""
     config = egoskin.EnvConfig(**FORMS[request.param])
     skin = config.skin.build(config.robot_config)
     env = egoskin.make_worker_env(config, skin, num_envs=3, seed=0)
@@ -240,7 +240,7 @@ def test_a_header_that_describes_no_policy_is_refused(field, value, tmp_path):
     tensors, header = load_tensors(ASSETS / "field_proximity.safetensors")
     header["policy"][field] = value
     save_tensors(tmp_path / "odd.safetensors", tensors, header)
-    with pytest.raises(ValueError, match=r"odd.* holds no policy"):
+    with pytest.raises(ValueError, match=r"odd.* is not a policy"):
         egoskin.load_policy(tmp_path / "odd.safetensors")
 
 
@@ -248,7 +248,7 @@ def test_a_header_without_a_policy_is_refused(tmp_path):
     tensors, _ = load_tensors(ASSETS / "field_proximity.safetensors")
     for header in ({}, {"policy": 5}, {"policy": None}):
         save_tensors(tmp_path / "odd.safetensors", tensors, header)
-        with pytest.raises(ValueError, match=r"odd.* holds no policy"):
+        with pytest.raises(ValueError, match=r"odd.* is not a policy"):
             egoskin.load_policy(tmp_path / "odd.safetensors")
 
 
@@ -275,11 +275,11 @@ def save_changed(path: Path, changes: dict[str, Any]) -> None:
         ("norms.observation.var", 1e300, "'norms.observation.var' is not finite"),
         ("norms.observation.var", -1.0, "'norms.observation.var' is negative"),
         ("head.log_std", float("nan"), "'head.log_std' is not finite"),
-        ("head.log_std", 1e3, "actions need not be finite"),
-        # Finite by themselves, not in use.
-        ("head.body.inputs.0.weight", 3e38, "actions need not be finite"),
-        ("head.body.inputs.1.weight", -3e38, "actions need not be finite"),
-        ("head.body.tail.1.weight", 3e38, "actions need not be finite"),
+        ("head.log_std", 1e3, "actions may not be finite"),
+        # Finite as stored, but not when used.
+        ("head.body.inputs.0.weight", 3e38, "actions may not be finite"),
+        ("head.body.inputs.1.weight", -3e38, "actions may not be finite"),
+        ("head.body.tail.1.weight", 3e38, "actions may not be finite"),
         ("head.body.tail.3.bias", float("inf"), "'head.body.tail.3.bias' is not fini"),
         ("head.body.tail.3.weight", torch.float64, "got .21, 32. of float64"),
         ("norms.signal.mean", torch.float32, "expected .1. of float64, got .1. of"),

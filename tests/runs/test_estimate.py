@@ -1,4 +1,4 @@
-"""How long a training is said to take."""
+"""Estimated duration of a training."""
 
 from __future__ import annotations
 

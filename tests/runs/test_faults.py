@@ -1,4 +1,4 @@
-"""Faults done to a training for real: what is kept, what is said, what is left over."""
+"""Real faults of a training: saved state, messages and leftovers."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from egoskin.sensors.kernels import compilation
 from egoskin.storage.formats import read_sealed, sealed_json
 from egoskin.storage.tensor_file import load_tensors, save_tensors
 
-# Rollouts of the run that tests go on with.
+# Rollouts of the run that tests resume.
 DONE = 4
 
 TRAIN = (sys.executable, "-m", "egoskin", "train")
@@ -44,7 +44,7 @@ pytestmark = pytest.mark.skipif(
 
 
 class Training:
-    """A training in a process group and temporary folder of its own."""
+    """A training in its own process group and temporary folder."""
 
     def __init__(self, temporary: Path, *args: str | Path, **options) -> None:
         self.temporary = temporary
@@ -99,7 +99,7 @@ class Training:
         return self.output.read()
 
     def check_nothing_is_left(self) -> None:
-        # A server that still imports notices nothing else, however long that takes.
+        # A server that is still importing reacts to nothing else.
         deadline = time.monotonic() + 60
         while self.processes() or self._files():
             assert time.monotonic() < deadline, (self.processes(), self._files())
@@ -125,7 +125,7 @@ def temporary() -> Iterator[Path]:
 
 @pytest.fixture
 def start(temporary: Path) -> Iterator[Callable[..., Training]]:
-    """Starts trainings that end with the test."""
+    """Function that starts trainings, which end with the test."""
     started = []
 
     def begin(*args: str | Path, **options) -> Training:
@@ -142,7 +142,7 @@ def start(temporary: Path) -> Iterator[Callable[..., Training]]:
 
 @pytest.fixture
 def run(trained: Path, tmp_path: Path) -> Path:
-    """A finished run of four rollouts, to go on with."""
+    """A finished run of four rollouts, to resume."""
     return Path(shutil.copytree(trained, tmp_path / "run"))
 
 
@@ -155,7 +155,7 @@ def rows(run: Path) -> list[dict[str, str]]:
 
 
 def check_equal(one: dict[str, torch.Tensor], two: dict[str, torch.Tensor]) -> None:
-    """Assert that two checkpoints hold the same, but for the times in their logs."""
+    """Assert that two checkpoints are equal except for the times in their logs."""
     assert one.keys() == two.keys()
     for key in one.keys() - {"log/metrics"}:
         assert torch.equal(one[key], two[key]), key
@@ -198,14 +198,14 @@ def test_a_trainer_killed_while_it_writes_a_checkpoint_goes_on(start, tmp_path):
     training.note_shared_memory()
     assert len(training.workers()) == 2
     training.wait_for(lambda: written(run))
-    # All of them: also the one that multiprocessing has tidy up.
+    # All of them, including multiprocessing's resource tracker.
     os.killpg(training.process.pid, signal.SIGKILL)
     training.end()
     training.check_nothing_is_left()
     saved = load_tensors(run / "checkpoint.safetensors")[1]["frames"]
     assert saved >= 2 * BATCH
     end = saved + 4 * BATCH
-    # The planned end of a run cannot come earlier: only a test's can.
+    # The planned end of a run cannot be moved earlier, except in a test.
     plan(run, end)
     succeed("train", "--resume", run)
     assert int(rows(run)[-1]["frames"]) == end
@@ -249,7 +249,7 @@ def test_a_closed_terminal_leaves_a_checkpoint(tmp_path, temporary):
     deadline = time.monotonic() + 120
     while len(rows(run)) < 2:
         assert time.monotonic() < deadline
-        # What it prints must be read, or it waits.
+        # Its output must be read, otherwise it blocks.
         if select.select([terminal], [], [], 0.01)[0]:
             os.read(terminal, 1000)
     os.close(terminal)
@@ -294,7 +294,7 @@ def test_a_trainer_killed_twenty_times_loses_at_most_an_interval_each(start, tmp
         begun = time.monotonic()
         training = start(*args)
         if number % 2:
-            # In the middle of a checkpoint, of which ever fewer are waited for.
+            # While a checkpoint is being written; fewer and fewer are waited for.
             training.wait_for((run / "versions.json").exists)
             before = len(rows(run))
             training.wait_for(lambda before=before: len(rows(run)) != before)
@@ -323,7 +323,7 @@ def test_a_trainer_killed_twenty_times_loses_at_most_an_interval_each(start, tmp
     last = start("--resume", run)
     assert last.end() == 0, last.text()
     check_logs_have_no_gap(run)
-    # What never stopped is the same, bit for bit.
+    # Identical to an uninterrupted run, bit for bit.
     whole = tmp_path / "whole"
     size = ("--run-dir", whole, "--total-frames", str(end))
     unbroken = start(*SMALL, *size)
@@ -334,7 +334,7 @@ def test_a_trainer_killed_twenty_times_loses_at_most_an_interval_each(start, tmp
 
 @pytest.mark.slow
 def test_a_signal_to_the_whole_group_leaves_a_checkpoint(start, tmp_path):
-    # What a batch system does: workers must not go first.
+    # As a batch system does: workers must not end first.
     run = tmp_path / "run"
     training = start(*SMALL, "--run-dir", run)
     training.wait_for(lambda: len(rows(run)) > 1)
@@ -388,7 +388,7 @@ def test_a_loss_that_is_not_finite_is_dumped_and_replayed(tmp_path):
 
 
 def test_a_bad_weight_is_named_by_the_replay(run):
-    # As memory that lost a bit would: an infinite entry in the optimiser.
+    # As after a bit flip in memory: an infinite entry in the optimiser.
     path = run / "checkpoint.safetensors"
     tensors, header = load_tensors(path)
     tensors["optimizer/0/exp_avg"].view(-1)[3] = float("inf")
@@ -507,7 +507,7 @@ def test_a_run_folder_that_cannot_be_made_is_one_clear_error(tmp_path):
 def test_a_removed_run_folder_is_one_clear_error(start, run):
     training = start("--resume", run, "--total-frames", 10**6)
     training.wait_for(lambda: len(rows(run)) > DONE)
-    # Renamed, then removed: a row that is just being written would not come back.
+    # Renamed, then removed, so that a row being written does not reappear.
     shutil.rmtree(run.rename(run.with_name("gone")))
     message = f"No such file or directory: '{run}"
     check_failed_clearly(training, message, "start a new run")
@@ -535,7 +535,7 @@ def test_compiled_training_is_the_same_and_goes_on_without_a_compiler(
     for path in (plain, run):
         training = start("--resume", path, "--total-frames", 8 * BATCH)
         assert training.end() == 0, training.text()
-        assert training.text().count("kernels.cpp stays uncompiled") == 1
+        assert training.text().count("kernels.cpp is not compiled") == 1
     tensors = [load_tensors(r / "checkpoint.safetensors")[0] for r in (plain, run)]
     check_equal(*tensors)
 
@@ -543,7 +543,7 @@ def test_compiled_training_is_the_same_and_goes_on_without_a_compiler(
 def test_a_run_that_stored_whether_to_compile_goes_on(run):
     file = run / "config.json"
     content = json.loads(file.read_text())
-    # As it was written before there were checksums.
+    # As written before there were checksums.
     old = {k: v for k, v in content.items() if k not in ("format", "egoskin", "sha256")}
     del old["skin_sha256"]
     file.write_text(json.dumps({**old, "compile_kernels": True}))

@@ -1,4 +1,4 @@
-"""A run as a library user starts it: threads, kept policies, the recorded commit."""
+"""Runs started through the library: threads, saved policies, recorded commit."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def test_a_run_of_another_version_is_not_gone_on_with(config: TrainConfig):
     content, _ = read_sealed(file)
     del content["env"]["task"]["throws"]["lead"]
     file.write_bytes(sealed_json(content))
-    message = r"config\.json lacks env\.task\.throws\.lead: another version made it"
+    message = r"config\.json lacks env\.task\.throws\.lead: another version wrote it"
     with pytest.raises(ValueError, match=message):
         parse_config(args)
 
@@ -124,15 +124,15 @@ def test_a_standard_sets_throws_and_ends(args, version):
     config = parse_config([*args, "--seed", "3", "--sensor.range", "1"])
     assert config.env.standard == version
     assert config.env.task == training_task(version, DodgeballConfig())
-    # Nothing else.
+    # Nothing else changes.
     env = replace(config.env, task=DodgeballConfig())
     assert env == EnvConfig(sensor=SensorConfig(range=1.0))
     assert config.seed == 3
 
 
 def test_a_standard_that_sets_nothing_is_refused():
-    # Only the command line can tell what is a default and what was given.
-    with pytest.raises(ValueError, match=r"is of standard 2: .*training_task\('1'"):
+    # Only the command line can distinguish defaults from given values.
+    with pytest.raises(ValueError, match=r"has standard 2: .*training_task\('1'"):
         TrainConfig(standard="1")
     task = training_task("1", DodgeballConfig())
     assert TrainConfig(standard="1", env=EnvConfig(task=task)).env.standard == "1"
@@ -146,7 +146,7 @@ def test_a_throw_or_an_end_beside_a_standard_makes_it_custom():
     end = parse_config(["--task.success-s", "2", "--standard", "paper"]).env
     assert end.standard == "custom"
     assert end.task.throws.first_delay == (0.0, 0.0)
-    # What belongs to no standard does not.
+    # Options outside the standard do not.
     drive = ["--standard", "1", "--task.action-scale", "0.2"]
     assert parse_config(drive).env.standard == "1"
 
@@ -172,7 +172,7 @@ def test_a_policy_says_what_standard_it_was_trained_on(config: TrainConfig):
     assert load_tensors(file)[1]["policy"]["standard"] == "paper"
     assert egoskin.load_policy(file).env_config.standard == "paper"
     assert Run.open(run.path).config.env.standard == "paper"
-    # A resume has it already.
+    # On resume, it is known already.
     for version in ("paper", "2"):
         with pytest.raises(ValueError, match="--standard cannot be changed on resume"):
             parse_config(["--resume", str(run.path), "--standard", version])
@@ -206,12 +206,13 @@ def test_a_film_that_cannot_be_made_is_told_of(tmp_path, capfd):
     with FilmMaker(tmp_path) as maker:
         maker.start(tmp_path / "config.json")
     (line,) = capfd.readouterr().err.splitlines()
-    assert line.startswith("note: no film ")
+    assert line.startswith("note: film ")
+    assert ".mp4 failed: " in line
     assert "config.json" in line
 
 
 def test_metrics_go_to_weights_and_biases(config: TrainConfig, monkeypatch):
-    """By what the package would be given; a resume goes on with the same run there."""
+    """Checks the calls to wandb; a resume continues the same wandb run."""
     given = {}
 
     class Recorded:
@@ -244,7 +245,7 @@ def test_metrics_go_to_weights_and_biases(config: TrainConfig, monkeypatch):
 
 
 def test_a_commit_is_recorded_only_of_a_repository_that_holds_the_source(tmp_path):
-    # An installed copy in an ignored folder of somebody's own repository.
+    # An installed copy in an ignored folder of a user's repository.
     source = tmp_path / "site" / "run.py"
     source.parent.mkdir()
     source.write_text("")
@@ -263,7 +264,7 @@ def test_a_commit_is_recorded_only_of_a_repository_that_holds_the_source(tmp_pat
     assert git_state(source)["changed"]
 
 
-# --- folders that somebody else prepared --------------------------------------------
+# --- folders prepared by another user -----------------------------------------------
 
 
 def test_nothing_is_written_through_a_link(config: TrainConfig, tmp_path: Path):
@@ -272,7 +273,7 @@ def test_nothing_is_written_through_a_link(config: TrainConfig, tmp_path: Path):
         train(trainer)
     victim = tmp_path / "victim"
     victim.write_text("mine")
-    # Which process will write is easily foreseen.
+    # The id of the writing process is predictable.
     partial = f".checkpoint.safetensors.{os.getpid()}.partial"
     for name in (partial, "metrics.csv", "versions.json"):
         (run.path / name).unlink(missing_ok=True)
@@ -326,7 +327,7 @@ def test_a_metrics_file_turned_into_a_link_while_it_trains_is_not_followed(
 
 @contextmanager
 def full_disk() -> Iterator[None]:
-    """Let no file grow beyond some bytes."""
+    """Limit the size of all files to some bytes."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (16, before[1]))
     try:
@@ -382,9 +383,9 @@ def test_a_folder_renamed_while_it_trains_ends_with_one_clear_error(
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("optimizer/0/exp_avg", torch.zeros(3), "the optimiser is one of other"),
-        ("optimizer/1/step", torch.zeros(1), "the optimiser is one of other"),
-        ("optimizer/1/exp_avg_sq", None, "the optimiser is one of other"),
+        ("optimizer/0/exp_avg", torch.zeros(3), "optimiser state belongs to other"),
+        ("optimizer/1/step", torch.zeros(1), "optimiser state belongs to other"),
+        ("optimizer/1/exp_avg_sq", None, "optimiser state belongs to other"),
         ("agent/head.log_std", torch.zeros(21, 1), r"expected \[21\] of float32, got"),
         (
             "agent/head.log_std",

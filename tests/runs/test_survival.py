@@ -72,7 +72,7 @@ def test_what_ends_before_age_zero_makes_it_less_than_certain_by_hand():
 
 
 def test_steps_on_the_way_to_age_zero_count_once():
-    # However long the way, one that gets there is one at risk.
+    # However many steps precede age 0, the agent counts once as at risk.
     curve = SurvivalCurve(max_steps=1)
     for age in (-3, -2, -1, 0, 1):
         curve.update(torch.tensor([age]), torch.tensor([False]))

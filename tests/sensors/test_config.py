@@ -1,4 +1,4 @@
-"""Configurations of sensors that contradict themselves."""
+"""Contradictory sensor configurations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Field sensors against MuJoCo's own distances, and what no skin may change."""
+"""Field sensors compared with MuJoCo's distances, and invariances."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def sensor(skin) -> FieldSensor:
 
 @pytest.fixture(scope="module")
 def scene() -> mujoco.MjModel:
-    """The robot, one object of each kind, and a speck to be put where sensors are."""
+    """The robot, one object of each kind, and a point to place at the sensors."""
     spec = H1_2.spec()
     # MuJoCo iterates for the ellipsoid: here to 1e-9 m.
     spec.option.ccd_tolerance, spec.option.ccd_iterations = 1e-9, 1000
@@ -64,7 +64,7 @@ def draw_objects(model: mujoco.MjModel, rng) -> tuple[Shape, ...]:
 
 
 def mujoco_field(model, skin, state) -> tuple[np.ndarray, ...]:
-    """What MuJoCo says of each row, sensor and object, ``[n, S, O]``.
+    """MuJoCo's results for each row, sensor and object, ``[n, S, O]``.
 
     Distance, negative inside [m]; cosine of the closest point's angle from the normal.
     """
@@ -105,21 +105,21 @@ def test_distances_are_those_of_mujoco(skin, scene, random_state, seed, dtype):
     signed, cosine = mujoco_field(scene, mixed, state)
     half = np.array([f.half_angle_deg for f in mixed.coverage])[:, None]
     truth = signed.clip(0)
-    # An object that a sensor is inside is all around it.
+    # A sensor inside an object detects it in every direction.
     beside = (cosine < np.cos(np.radians(half))) & (half < 180) & (signed > 0)
     limit = mixed.range[:, None]
     active = state["object_active"][:, None].numpy()
     expected = np.where(beside | (truth > limit) | ~active, np.inf, truth)
     unsure = np.abs(truth - limit) < 1e-5
-    # MuJoCo tells where the closest point of an ellipsoid is to about 1e-4 m.
+    # MuJoCo's closest point of an ellipsoid is accurate to about 1e-4 m.
     edge = np.abs(cosine - np.cos(np.radians(half))) * np.abs(signed)
     unsure |= (half < 180) & (signed > -1e-5) & (edge < 2e-4)
     assert unsure.mean() < 0.02
     if int(mujoco.__version__.split(".")[0]) < 4:
-        # MuJoCo 3, the last for Python 3.10, is up to 3e-4 m off, whatever is asked.
+        # The last MuJoCo 3 for Python 3.10 is up to 3e-4 m off, whatever the tolerance.
         unsure[..., KINDS.index("ellipsoid")] = True
 
-    # Constants as exact as the inputs.
+    # Constants as precise as the inputs.
     chain = build_chain(H1_2.model, H1_2.base, dtype)
     apart = FieldSensor(mixed, chain, objects, 9, per_object=True)
     distance, detected = measure(apart, state)

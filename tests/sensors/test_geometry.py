@@ -1,4 +1,4 @@
-"""What fields and rays share: marked readings for bad input, none for what is away."""
+"""Fields and rays: bad input gives marked readings, inactive objects none."""
 
 from __future__ import annotations
 
@@ -86,11 +86,11 @@ def test_poses_of_inactive_objects_are_not_looked_at(skin, random_state, kind):
 @pytest.mark.parametrize(
     ("key", "change", "message"),
     [
-        ("joint_pos", torch.Tensor.double, "one floating type, got torch.float32, tor"),
-        ("joint_pos", torch.Tensor.int, "one floating type"),
+        ("joint_pos", torch.Tensor.double, "floating-point type, got torch.float32, t"),
+        ("joint_pos", torch.Tensor.int, "the same floating-point type"),
         ("object_active", torch.Tensor.float, "'object_active' must be bool"),
-        ("object_active", lambda x: x[:, :1], "for 2 objects, 'object_active' holds 1"),
-        ("object_pose", lambda x: x[:, :1], "for 2 objects, 'object_pose' holds 1"),
+        ("object_active", lambda x: x[:, :1], "2 objects, but 'object_active' holds 1"),
+        ("object_pose", lambda x: x[:, :1], "2 objects, but 'object_pose' holds 1"),
         ("object_pose", lambda x: x[..., :3], "'object_pose' must hold 7 num.*got 3"),
         ("base_pose", lambda x: x[:, :6], "'base_pose' must hold 7 numbers.*got 6"),
         ("base_pose", lambda x: x[:, None], r"must be \[\*B, 7\], got \[1, 7\] after"),

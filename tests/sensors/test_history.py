@@ -1,4 +1,4 @@
-"""What a history and the last signal are, by hand."""
+"""History and last signal, compared with values by hand."""
 
 from __future__ import annotations
 
@@ -74,12 +74,12 @@ def test_the_last_signal_by_hand():
     )
     data = stored([0, 0, 0, 0, 1, 0, 0, 0], signal=signal, object_detected=seen.bool())
     last = KeepLast()(data)["last_signal"][:, 0].tolist()
-    # The episode that starts at step 5 knows nothing of the one before.
+    # The episode that starts at step 5 contains nothing of the previous one.
     assert last == [0, 1, 2, 2, 2, 0, 5, 5]
 
 
 def test_what_sensors_of_any_kind_detect_is_kept():
-    # A skin of two kinds has two detections.
+    # A skin with two kinds of sensors has two detection keys.
     signal = torch.tensor([[1.0], [2], [3]])
     field = torch.tensor([[1], [0], [0]]).bool()
     ray = torch.tensor([[0], [1], [0]]).bool()
@@ -98,7 +98,7 @@ def test_a_detected_zero_is_a_sight():
     ("arguments", "text"),
     [
         ((0,), "length must be at least 1, got 0"),
-        ((2, ["a", "b"], ["c"]), "one out key for each in key"),
+        ((2, ["a", "b"], ["c"]), "need one out key per in key"),
     ],
 )
 def test_what_makes_no_history_is_refused(arguments, text):

@@ -1,4 +1,4 @@
-"""Masked sensors are as if they were not there: the others sense what they sensed."""
+"""Masked sensors detect nothing; the readings of the others do not change."""
 
 from __future__ import annotations
 
@@ -61,13 +61,13 @@ COMPILED = pytest.mark.parametrize(
 
 
 def without(skin: Skin, masked: list[int]) -> tuple[Skin, list[int]]:
-    """The skin from which sensors were taken away, and the indices of the others."""
+    """A skin with some sensors removed, and the indices of the others."""
     kept = [i for i in range(len(skin)) if i not in masked]
     return skin.select(kept), kept
 
 
 def flown(sensor: SensorConfig, skin: Skin, mask=(), steps: int = 45) -> torch.Tensor:
-    """What an environment says while the first balls come, ``[B, T]``."""
+    """Outputs of an environment while the first balls arrive, ``[B, T]``."""
     config = EnvConfig(task=TASK, sensor=sensor)
     env = make_worker_env(config, skin, num_envs=8, seed=0, keep_raw=True, mask=mask)
     return env.rollout(
@@ -103,7 +103,7 @@ def test_the_others_read_the_same_as_without_those_masked(
         distance, detected = measure(whole, state)
         assert torch.isinf(distance[:, masked]).all()
         assert_same_bits((distance[:, kept], detected), measure(part, state))
-        # Others instead, then none: nothing is remembered.
+        # Other sensors instead, then none: no state is kept.
         whole.mask(kept)
         rest = measure(whole, state)[0]
         assert torch.isinf(rest[:, kept]).all()
@@ -212,7 +212,7 @@ def test_all_sensors_masked_by_name_are_all_sensors_masked():
     all_of_them = flown(sensor, SKIN, MASK_ALL)
     assert torch.equal(by_name["signal"], all_of_them["signal"])
     assert (by_name["signal"] == 1).all()
-    # It does not matter how the names are listed.
+    # The order of the names does not matter.
     assert SENSING.masked(["all"]) == SENSING.masked(MASK_ALL)
     assert SENSING.masked(MASK_ALL) == list(range(len(SKIN)))
 
@@ -283,7 +283,7 @@ def test_a_policy_whose_sensors_are_masked_does_what_one_does_without_sensors():
         (
             {"coverage": "oracle"},
             ("torso_link",),
-            "an oracle has no sensors on links: mask all",
+            "an oracle has no sensors on links: its mask",
         ),
     ],
 )

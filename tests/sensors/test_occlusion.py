@@ -1,4 +1,4 @@
-"""What the robot's body hides from its sensors, against MuJoCo's rays."""
+"""Occlusion by the robot's body, compared with MuJoCo's rays."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ BODY = H1_2.primitives
 
 
 def crowd(random_state, seed: int, rows: int = 6):
-    """States in float64 with four active objects, turned anyhow."""
+    """States in float64 with four active objects at random orientations."""
     state = turned(random_state(rows, seed, torch.float64, objects=4), seed)
     state["object_active"][:] = True
     return state
@@ -99,7 +99,7 @@ def test_a_ray_sees_what_mujoco_sees_before_the_robot(skin, random_state, seed):
         )[0]
         for b in ((), BODY)
     )
-    # The same or nothing, never more.
+    # The same reading or no detection.
     assert (solid.isinf() | (solid == clear)).all()
     row, sensor, beam, _ = places = clear.isfinite().nonzero().unbind(1)
     hidden = solid[places].isinf().numpy()
@@ -133,7 +133,7 @@ def test_a_field_sees_what_mujoco_sees_before_the_robot(skin, random_state, seed
     )
 
 
-# --- what may not change a bit --------------------------------------------------
+# --- bit-identical results ------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", [FieldSensor, partial(RaySensor, coverage=WIDE)])

@@ -1,4 +1,4 @@
-"""From skin and configuration to a signal: resolved once, in the order of the skin."""
+"""Pipeline from skin and configuration to signal, in the order of the skin."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ BIG, SMALL, HALF = Ray(grid=(4, 4)), Ray(grid=(2, 3)), Field(half_angle_deg=90)
 
 @pytest.fixture(scope="module")
 def mixed() -> Skin:
-    """Nine sensors of three kinds by turns, each with a range of its own."""
+    """Nine sensors of three alternating kinds, each with its own range."""
     return replace(
         place_sensors(H1_2, 9, seed=0),
         coverage=(BIG, Field(), SMALL, None, HALF, SMALL, BIG, None, Field()),
@@ -33,7 +33,7 @@ def mixed() -> Skin:
 
 
 def measured(config: SensorConfig, skin: Skin, state: TensorDict) -> TensorDict:
-    """Stored states, each the first of an episode, with all that is made of them."""
+    """Stored states, each the first of an episode, and all values derived from them."""
     stored = state.clone().unsqueeze(-1)
     stored["is_init"] = torch.ones(*stored.shape, 1, dtype=torch.bool)
     for transform in SensorPipeline(config, H1_2, skin).transforms(BALLS, dt=1 / 60):
@@ -46,7 +46,7 @@ def measured(config: SensorConfig, skin: Skin, state: TensorDict) -> TensorDict:
 def test_a_mixed_skin_signals_sensor_by_sensor(mixed, random_state, kind, options):
     config = SensorConfig(signal=kind, range=1.0, **options)
     state = random_state(200, seed=3)
-    # By the skin of a single sensor, which cannot be out of order.
+    # Computed with single-sensor skins, which cannot be out of order.
     parts = []
     for i, coverage in enumerate(mixed.coverage):
         own = options if isinstance(coverage, Ray) else {}

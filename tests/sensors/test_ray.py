@@ -1,4 +1,4 @@
-"""Ray sensors against MuJoCo's rays, and what culling may not change."""
+"""Ray sensors compared with MuJoCo's rays; culling must not change results."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def draw_skin(skin: Skin, rng) -> Skin:
 
 def scene(sizes: np.ndarray) -> mujoco.MjModel:
     """The robot in group 0, and one object of each kind in groups 1 to 4."""
-    # Compiled anew for every size: MuJoCo culls rays by bounds made there.
+    # Recompiled for every size: MuJoCo computes its ray culling bounds there.
     spec = H1_2.spec()
     for group, (kind, size) in enumerate(zip(KINDS, sizes, strict=True), 1):
         body = spec.worldbody.add_body(name=kind, mocap=True)
@@ -85,7 +85,7 @@ def mujoco_rays(model, skin, state) -> np.ndarray:
 
 def inside(sizes: np.ndarray, skin, state) -> np.ndarray:
     """Signed distance from each sensor to each object, by `egoskin` ``[n, S, O]``."""
-    # Held to MuJoCo's in the tests of fields: a sensor inside reads 0 (row by row).
+    # Checked against MuJoCo in the field tests: a sensor inside reads 0.
     shapes = [shape_of(kind, size) for kind, size in zip(KINDS, sizes, strict=True)]
     plain = replace(skin, coverage=(), range=np.empty(0))
     state = state.clone()
@@ -116,14 +116,14 @@ def test_hits_are_those_of_mujoco(skin, random_state, seed, dtype):
     active = state["object_active"][:, None, None].numpy()
     expected = np.where((truth > limit) | ~active, np.inf, truth)
 
-    # Constants as exact as the inputs.
+    # Constants as precise as the inputs.
     chain = build_chain(H1_2.model, H1_2.base, dtype)
     sensor = RaySensor(mixed, chain, objects, 9, per_object=True)
     distance, detected = measure(sensor, state)
     assert distance.dtype == dtype
     assert distance.shape == (6, 16, 16, 4)
     distance = distance.numpy()
-    # On the surface MuJoCo may start in or out.
+    # On the surface, MuJoCo may start inside or outside.
     surface = np.broadcast_to((away > 0) & (away < 1e-5), truth.shape)
     decided = (np.isfinite(hits[-1e-5]) == np.isfinite(hits[1e-5])) | (away == 0)
     decided = decided & ~surface & ~(np.abs(truth - limit) < 1e-5)
@@ -250,7 +250,7 @@ def test_depth_is_the_component_along_the_normal():
     limited = one_sensor(1.0625, WALL, Ray(measure="depth"))
     assert look(limited, (0, 0, 1.25))[0] == pytest.approx([1] * 64)
     assert look(one_sensor(1.0625, WALL), (0, 0, 1.25))[0][0] == INF
-    # And a ball at the end of the longest beam is not culled: its depth is in range.
+    # A ball at the end of the longest beam is not culled: its depth is in range.
     wide = Ray(grid=(1, 2), fov_deg=along_axes(170), measure="depth")
     # tan(85 deg) / 2 = 5.715: at depth 1 the beam is 5.802 m long.
     ball = (Sphere(radius=0.01),)
@@ -309,7 +309,7 @@ def test_the_nearest_of_several_objects_is_measured():
     assert look(apart, *places) == ([[INF, 0.75]], [False, True])
 
 
-# --- what may not change a bit --------------------------------------------------
+# --- bit-identical results ------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""The three signals, worked out by hand."""
+"""The three signals, compared with values by hand."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_the_range_of_a_signal_is_that_of_its_sensor(kind, robot, skin, random_s
     expected = torch.where(seen, distance / limit, 1.0).flatten(1)
     signal = Proximity(sensor)(state)["signal"]
     torch.testing.assert_close(signal, expected)
-    # A number is a cut: nothing beyond 1 m, whatever the sensor sees.
+    # A number limits the range: nothing beyond 1 m, whatever the sensor detects.
     cut = Proximity(1.0)(state)["signal"] < 1.0
     assert torch.equal(cut, (distance < 1.0).flatten(1))
     assert torch.equal(Binary(sensor)(state)["signal"].bool(), seen.flatten(1))
@@ -169,6 +169,6 @@ def test_localization_in_a_row_of_nan_is_nan():
     (signal,) = localization.compute(base, pose, joints, detected)
     assert signal[:2].isnan().all()
     assert signal[2].tolist() == [1, 0, 0]
-    # What is not detected says nothing of where it is.
+    # The signal does not depend on the position of undetected objects.
     (signal,) = localization.compute(base, pose, joints, ~detected)
     assert signal.tolist() == [[0] * 3] * 3

@@ -1,4 +1,4 @@
-"""What every transform with a state promises: whoever resets, wherever it runs."""
+"""Contract of all stateful transforms, whatever resets them, wherever they run."""
 
 from __future__ import annotations
 
@@ -51,9 +51,9 @@ EVERYTHING = (
 
 
 class ScriptedEnv(EnvBase):
-    """Rows whose episodes differ in length; all is a function of (row, episode, step).
+    """Episodes of different lengths; all values depend on (row, episode, step).
 
-    Of the distances about 4 in 10 are finite and 1 in 50 is NaN.
+    About 4 in 10 distances are finite and 1 in 50 is NaN.
     """
 
     def __init__(self, num_envs: int, row_offset: int = 0) -> None:
@@ -139,7 +139,7 @@ def make(build, num_envs: int, row_offset: int = 0) -> TransformedEnv:
 
 
 def run(env, root=None, steps: int = STEPS) -> list[TensorDict]:
-    """What an environment gives, flat over its rows: next and then root, by step."""
+    """Outputs of an environment, flat over rows: next, then root, by step."""
     out, root = [], env.reset() if root is None else root
     out.append(root.reshape(-1).clone())
     for _ in range(steps):
@@ -295,7 +295,7 @@ def test_stored_steps_give_what_the_environment_gave(build, marked_by):
 @every_transform
 def test_stored_data_must_say_where_episodes_start(build):
     data = make(build, 5).rollout(3)
-    with pytest.raises(KeyError, match="where do episodes start"):
+    with pytest.raises(KeyError, match="unknown starts of episodes"):
         build()(data.select(*build().in_keys))
     with pytest.raises(ValueError, match="last batch dimension is time"):
         build()(data[0, 0])
@@ -315,10 +315,10 @@ def test_nested_keys_and_float64_change_no_value(build):
     plain = build()
     data = make(build, 5).rollout(STEPS, break_when_any_done=False)
     ins = [("robot_1", key) for key in plain.in_keys]
-    # A corruption names its state itself.
+    # A corruption chooses the names of its state keys.
     outs = plain.out_keys[: 1 if build.func is Corruption else None]
     outs = [("robot_1", key) for key in outs]
-    # Keys may be given by position.
+    # Keys can be given as positional arguments.
     arguments = build.args[:1]
     nested = build.func(*arguments, in_keys=ins, out_keys=outs, **build.keywords)
     stored = data.select(("next", "done"))

@@ -1,4 +1,4 @@
-"""Touch: contacts from forces, rewards and ends from contacts, contact-free data."""
+"""Tactile: contacts from forces, rewards and ends from contacts, contact-free data."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def test_a_threshold_that_is_none_is_refused(threshold):
 
 @pytest.mark.parametrize("prices", [{}, {"*": float("nan")}, {"*": float("inf")}])
 def test_prices_that_are_none_are_refused(prices):
-    with pytest.raises(ValueError, match="prices must be finite and at least one"):
+    with pytest.raises(ValueError, match="prices must be finite and not empty"):
         ContactPenalty(LINKS, prices)
 
 
@@ -156,7 +156,7 @@ def test_contact_of_a_counted_link_ends_and_leaves_other_ends():
 
 
 def actions(steps: int, rows: int) -> torch.Tensor:
-    """Fixed wild actions: robots fall soon, and not all at once."""
+    """Fixed extreme actions: robots fall soon, at different times."""
     generator = torch.Generator().manual_seed(0)
     size = 0.7 * torch.rand(rows, 1, generator=generator)
     shape = (steps, rows, len(H1_2.joints))

@@ -158,7 +158,7 @@ def rewrite_header(run: Path, **changes: Any) -> None:
 def test_what_a_checkpoint_holds_must_be_of_its_kind(name, value, run: Path):
     rewrite_header(run, **{name: value})
     with pytest.raises(
-        ValueError, match=r"checkpoint\.safetensors (is damaged|holds no)"
+        ValueError, match=r"checkpoint\.safetensors (is damaged|is not a policy)"
     ):
         egoskin.load_policy(run) if name == "policy" else Run.open(
             run
@@ -178,7 +178,7 @@ def test_a_log_of_starts_that_holds_none_is_named(content, run: Path):
     ("field", "value", "message"),
     [
         ("num_envs", 10**9, "num_envs must be at most"),
-        ("seed", 10**400, "seed must be a number of 64 bits"),
+        ("seed", 10**400, "seed must fit into 64 bits"),
         ("checkpoint_interval", 10**400, "a number of hundreds of digits"),
     ],
     ids=["agents", "whole", "float"],

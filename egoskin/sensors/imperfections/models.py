@@ -285,7 +285,7 @@ class RangeLimits(PointModel):
         """Raise ValueError for invalid values."""
         if self.below not in ("nothing", "minimum"):
             raise ValueError(
-                f"RangeLimits.below must be nothing or minimum, got {self.below!r}"
+                f"RangeLimits.below must be 'nothing' or 'minimum', got {self.below!r}"
             )
         if not 0 <= self.minimum < self.maximum:
             raise ValueError(

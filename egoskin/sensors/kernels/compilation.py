@@ -72,14 +72,14 @@ def _loaded(source: Path) -> ctypes.CDLL | None:
         folder = _cache()
         found = _find(folder, name)
         if found is None and is_parent:
-            _log.warning("compiling %s: some seconds, once on a machine", source.name)
+            _log.warning("compiling %s: a few seconds, once per machine", source.name)
             found = _keep(folder, name, _compile(command, source))
     # Path.home() raises RuntimeError.
     except (OSError, RuntimeError) as error:
         found = None
         if is_parent:
             _log.warning(
-                "%s stays uncompiled: sensors are slower, with the same results (%s)",
+                "%s is not compiled: sensors are slower, with the same results (%s)",
                 *(source.name, error),
             )
     return found
@@ -89,7 +89,7 @@ def _recipe(source: Path) -> tuple[list[str], str]:
     """Return the compile command of a source, and a name with a hash of the two."""
     compiler = _compiler()
     if compiler is None:
-        raise RuntimeError("no C++ compiler was found: install g++")
+        raise RuntimeError("no C++ compiler found: install g++")
     vectors = _VECTORS.get(torch.backends.cpu.get_cpu_capability(), "")
     command = [compiler, *_FLAGS.split(), *vectors.split()]
     recipe = " ".join([platform.machine(), *command]).encode()
@@ -108,7 +108,7 @@ def _cache() -> Path:
     about = folder.lstat()
     if not stat.S_ISDIR(about.st_mode) or about.st_uid != os.geteuid():
         raise RuntimeError(
-            f"{folder} is no folder of this user: remove it, or set XDG_CACHE_HOME"
+            f"{folder} is not a folder of this user: remove it, or set XDG_CACHE_HOME"
         )
     if about.st_mode & 0o077:
         folder.chmod(0o700)

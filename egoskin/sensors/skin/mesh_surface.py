@@ -87,7 +87,7 @@ def meshes_in_folder(folder: Path, links: Sequence[str]) -> dict[str, list[Trime
         if path.stem in links and path.suffix.lower() in formats:
             if path.stem in meshes:
                 raise ValueError(
-                    f"{folder} holds two meshes of {path.stem}: "
+                    f"{folder} contains two meshes of {path.stem}: "
                     f"{meshes[path.stem][0].metadata['name']} and {path.name}"
                 )
             check_regular(path, _LARGEST)
@@ -95,10 +95,10 @@ def meshes_in_folder(folder: Path, links: Sequence[str]) -> dict[str, list[Trime
                 mesh = trimesh.load_mesh(path)
             except Exception as error:  # of any kind, for a damaged file
                 raise ValueError(
-                    f"{path} is no mesh that trimesh can read: {error}"
+                    f"trimesh cannot read {path} as a mesh: {error}"
                 ) from error
             if len(mesh.faces) == 0:
-                raise ValueError(f"{path} holds no triangles")
+                raise ValueError(f"{path} contains no triangles")
             mesh.metadata["name"] = path.name
             meshes[path.stem] = [mesh]
     if not meshes:
@@ -128,7 +128,7 @@ def meshes_of_mjcf(path: Path, group: int | None = None) -> dict[str, list[Trime
         model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
         text = " ".join(str(error).split())
-        raise ValueError(f"{path} is no MuJoCo model: {text}") from error
+        raise ValueError(f"MuJoCo cannot load {path}: {text}") from error
     meshes: dict[str, list[Trimesh]] = {}
     seen = set()
     for geom in np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH):
@@ -244,10 +244,10 @@ def mesh_surface(robot: RobotConfig, links: Sequence[str], meshes: Meshes) -> Su
     """
     for link, on_link in meshes.items():
         if not on_link:
-            raise ValueError(f"meshes: none for {link!r}: leave it out")
+            raise ValueError(f"meshes: empty list for {link!r}; remove the entry")
         if link not in robot.links:
             raise ValueError(
-                f"{robot.name} has no link {link!r} to carry a mesh; its links are "
+                f"{robot.name} has no link {link!r} for a mesh; its links are "
                 f"{', '.join(robot.links)}"
             )
     frames = {

@@ -202,8 +202,8 @@ def _num_darts(area: float, spacing: float, num_sensors: int | None) -> int:
     if darts > _MAX_DARTS:
         finest = math.sqrt(_DARTS_PER_SQUARE * area / _MAX_DARTS)
         raise ValueError(
-            f"a spacing of {spacing:g} m lets in too many sensors to find them all: "
-            f"take at least {finest:.2g} m on these links, or give num_sensors"
+            f"a spacing of {spacing:g} m allows too many sensors to find them all: "
+            f"use at least {finest:.2g} m on these links, or give num_sensors"
         )
     return darts
 
@@ -222,11 +222,11 @@ def _check(
         )
     if spacing is not None and (method != "poisson_disk" or not 0 < spacing < math.inf):
         raise ValueError(
-            "spacing must be positive and goes with method='poisson_disk', got "
+            "spacing must be positive and needs method='poisson_disk', got "
             f"{spacing} with {method!r}"
         )
     if num_sensors is None and spacing is None:
-        raise ValueError("num_sensors=None needs a spacing to decide the number")
+        raise ValueError("num_sensors=None needs a spacing")
     if num_sensors is not None and num_sensors < 1:
         raise ValueError(f"the number of sensors must be positive, got {num_sensors}")
     if num_sensors is not None and num_sensors > MAX_SENSORS:
@@ -248,8 +248,8 @@ def _check_metres(
         name = robot.links[link[away.argmax()]]
         hint = f": are the meshes of {name} in metres?" if name in meshes else ""
         raise ValueError(
-            f"a sensor would lie {away.max():.3g} m from the origin of {name}, farther "
-            f"than any on a robot ({FARTHEST:g} m){hint}"
+            f"a sensor would be {away.max():.3g} m from the origin of {name}, farther "
+            f"than the limit of {FARTHEST:g} m{hint}"
         )
 
 

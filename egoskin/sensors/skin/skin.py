@@ -73,8 +73,8 @@ def _coverage(name: str, entry: object) -> Coverage:
         value = values.pop(field_name, only)
         if value != only:
             raise ValueError(
-                f"type {name!r}: {field_name!r} is no more, all are {only!r}; got "
-                f"{value!r}"
+                f"type {name!r}: {field_name!r} was removed; only {only!r} is "
+                f"supported, got {value!r}"
             )
     for field_name, value in values.items():
         _check_known(f"type {name!r}", field_name, known)
@@ -175,7 +175,7 @@ class Skin:
     def __post_init__(self) -> None:
         """Fill in defaults; check shapes and values."""
         if isinstance(self.links, str):
-            raise ValueError(f"links must be a name for each, got {self.links!r}")
+            raise ValueError(f"links must be one name per sensor, got {self.links!r}")
         shape, number = (len(self.links), 3), len(self.links)
         for name in ("position", "normal", "range", "roll_deg", "radius"):
             object.__setattr__(self, name, np.asarray(getattr(self, name), float))
@@ -442,6 +442,6 @@ class Skin:
         try:
             return cls.from_dict(json.loads(read_regular(path)))
         except RecursionError:
-            raise ValueError(f"skin file {path}: nested too deep") from None
+            raise ValueError(f"skin file {path}: nested too deeply") from None
         except (OSError, ValueError) as error:
             raise ValueError(f"skin file {path}: {error}") from error

@@ -1,4 +1,4 @@
-"""Each imperfection against numbers worked out by hand, and the presets in the task."""
+"""Each imperfection compared with values by hand, and the presets in the task."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def sequence(models, distances: torch.Tensor, **when) -> torch.Tensor:
     return torch.stack(readings)
 
 
-# --- what does not depend on chance -----------------------------------------------
+# --- deterministic models ---------------------------------------------------------
 
 
 def test_quantisation_by_hand():
@@ -148,7 +148,7 @@ def test_a_rate_above_that_of_control_holds_nothing(rate):
     assert torch.equal(sequence([SampleAndHold(rate_hz=rate)], distances), distances)
 
 
-# --- chance -------------------------------------------------------------------------
+# --- random models ------------------------------------------------------------------
 
 MANY = 2**18  # readings, as 2**12 rows of 64 sensors
 
@@ -218,7 +218,7 @@ def test_bias_is_drawn_for_each_sensor():
     beams = read(bias, everywhere(1.0, 2**12, 64, 2), step=9) - 6
     assert torch.equal(beams[..., 0], errors)
     assert torch.equal(beams[..., 1], errors)
-    # Another episode has other sensors, unless there is one robot for good.
+    # Another episode draws other sensors, unless the robot is kept.
     episode = torch.ones(2**12).long()
     assert (
         not torch.isclose(read(bias, many(1.0), episode=episode) - 6, errors)
@@ -311,7 +311,7 @@ def test_models_apply_in_order():
     cut, shift = RangeLimits(maximum=1.0), Bias(offset=0.1)
     assert read([cut, shift], distance).item() == pytest.approx(1.06)
     assert read([shift, cut], distance).item() == INF
-    # What is lost is not found again by a model that follows.
+    # A lost reading is not restored by a later model.
     assert read([Bias(offset=0.1), cut, Bias(offset=-0.5)], distance).item() == INF
 
 
@@ -359,7 +359,7 @@ def test_a_row_does_not_depend_on_the_others(rows, seed, data):
 
 
 def test_beams_and_sensors_are_read_alike():
-    # A reduced ray is a sensor of one beam.
+    # A reduced ray sensor has a single beam.
     distance = torch.rand(4, 9)
     assert torch.equal(read(ALL, distance), read(ALL, distance[..., None])[..., 0])
 
@@ -459,7 +459,7 @@ def test_names_of_keys_follow_the_reading():
         (lambda: Latency(seconds=INF), "Latency.seconds must not be infinite, got inf"),
         (
             lambda: replace(RangeLimits(), below="none"),
-            "below must be nothing or minimum, got 'none'",
+            "below must be 'nothing' or 'minimum', got 'none'",
         ),
         (lambda: RangeLimits(minimum=2, maximum=1), "0 <= minimum < maximum, got 2"),
         (

@@ -1,4 +1,4 @@
-"""The C++ kernels: the bits of the PyTorch code, which is tested against MuJoCo."""
+"""C++ kernels: bit-identical to the PyTorch code, which is tested against MuJoCo."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ needs_compiler = pytest.mark.skipif(not can_compile(), reason="needs a C++ compi
 
 @pytest.fixture(autouse=True)
 def compiling(monkeypatch) -> Iterator[None]:
-    """Compile, as users do and other tests do not."""
+    """Enable compilation, as for users; other tests disable it."""
     monkeypatch.delenv(compilation.SETTING)
     yield
     compilation._loaded.cache_clear()
@@ -60,7 +60,7 @@ def pair(kind, *args, **options):
 
 
 def assert_same(fast, plain) -> None:
-    """Equal; in float64 but for the last bit, which PyTorch's root does not round."""
+    """Assert equality; in float64 except the last bit, as PyTorch's root is inexact."""
     for a, b in zip(fast, plain, strict=True):
         atol = 1e-14 if a.dtype == torch.float64 else 0
         torch.testing.assert_close(a, b, rtol=0, atol=atol, equal_nan=True)
@@ -231,7 +231,7 @@ def test_what_the_kernels_lack_is_computed_in_pytorch(skin, random_state):
 
 @pytest.fixture
 def cache(tmp_path: Path, monkeypatch) -> Path:
-    """The folder of the compiled libraries, not there yet."""
+    """Folder of the compiled libraries, which does not exist yet."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     return tmp_path / "cache" / "egoskin"
 
@@ -244,7 +244,7 @@ def source(tmp_path: Path) -> Path:
 
 
 def load_anew(source: Path) -> ctypes.CDLL | None:
-    """Load as another process would."""
+    """Load the library as in another process."""
     compilation._loaded.cache_clear()
     return load_library(source)
 
@@ -254,19 +254,19 @@ def is_one(library: ctypes.CDLL | None) -> bool:
 
 
 def logged(caplog) -> list[str]:
-    """What was logged since the last call."""
+    """Return the messages logged since the last call."""
     messages = [record.getMessage() for record in caplog.records]
     caplog.clear()
     return messages
 
 
 def check_stays_plain(source: Path, caplog, *expected: str) -> None:
-    """Loading gives nothing, and says why in one line, once."""
+    """Assert that loading returns None and logs the reason once, in one line."""
     assert load_anew(source) is None
     assert load_library(source) is None
     lines = [line for line in logged(caplog) if not line.startswith("compiling")]
     assert len(lines) == 1
-    for text in ("one.cpp stays uncompiled", *expected):
+    for text in ("one.cpp is not compiled", *expected):
         assert text in lines[0]
     assert "\n" not in lines[0]
 
@@ -274,14 +274,14 @@ def check_stays_plain(source: Path, caplog, *expected: str) -> None:
 @needs_compiler
 def test_a_library_is_compiled_once_for_this_user_alone(source, cache, caplog):
     assert is_one(load_anew(source))
-    assert logged(caplog) == ["compiling one.cpp: some seconds, once on a machine"]
+    assert logged(caplog) == ["compiling one.cpp: a few seconds, once per machine"]
     (file,) = cache.iterdir()
     assert stat.S_IMODE(cache.stat().st_mode) == 0o700
     before = file.stat()
     assert is_one(load_anew(source))
     assert logged(caplog) == []
     assert file.stat() == before
-    # What others could write to is closed before anything is taken from it.
+    # A folder writable by others is closed before anything is loaded from it.
     cache.chmod(0o777)
     assert is_one(load_anew(source))
     assert stat.S_IMODE(cache.stat().st_mode) == 0o700
@@ -297,7 +297,7 @@ def test_a_damaged_library_is_compiled_again(source, cache, caplog, damage):
     file.unlink()
     if damage == "folder":
         file.mkdir()
-        # Its name is taken: nothing can be kept.
+        # The name is taken: the library cannot be saved.
         check_stays_plain(source, caplog, "Is a directory", str(file))
         return
     flipped = bytes([content[-1] ^ 1])
@@ -305,7 +305,7 @@ def test_a_damaged_library_is_compiled_again(source, cache, caplog, damage):
     file.write_bytes(changed[damage])
     caplog.clear()
     assert is_one(load_anew(source))
-    assert logged(caplog) == ["compiling one.cpp: some seconds, once on a machine"]
+    assert logged(caplog) == ["compiling one.cpp: a few seconds, once per machine"]
     assert [path.read_bytes() for path in cache.iterdir()] == [content]
 
 
@@ -319,7 +319,7 @@ def test_what_belongs_to_another_user_is_not_loaded(source, cache, caplog):
     assert file.stat().st_uid == 0
     os.chown(cache, 12345, -1)
     caplog.clear()
-    check_stays_plain(source, caplog, f"{cache} is no folder of this user")
+    check_stays_plain(source, caplog, f"{cache} is not a folder of this user")
 
 
 @needs_compiler
@@ -327,7 +327,7 @@ def test_a_link_to_a_folder_is_no_cache(source, cache, caplog, tmp_path):
     cache.parent.mkdir()
     (tmp_path / "other").mkdir()
     cache.symlink_to(tmp_path / "other")
-    check_stays_plain(source, caplog, f"{cache} is no folder of this user")
+    check_stays_plain(source, caplog, f"{cache} is not a folder of this user")
     assert not list((tmp_path / "other").iterdir())
 
 
@@ -390,7 +390,7 @@ def test_without_a_compiler_sensors_measure_the_same(
     args, state = (skin, H1_2.chain, BALLS[:1], 1.0), random_state(20, objects=1)
     plain, asked = (FieldSensor(*args, compile=c) for c in (False, True))
     (line,) = logged(caplog)
-    assert "no C++ compiler was found: install g++" in line
+    assert "no C++ compiler found: install g++" in line
     copied = copy.deepcopy(asked)
     compilation._loaded.cache_clear()
     for sensor in (asked, copied):

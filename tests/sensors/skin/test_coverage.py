@@ -1,4 +1,4 @@
-"""What one sensor sees: beams worked out by hand, and what is no coverage."""
+"""Coverage of a sensor: beams compared with values by hand; invalid coverages."""
 
 from __future__ import annotations
 
@@ -67,9 +67,9 @@ def test_beams_are_unit_symmetric_and_inside_the_view(rows, columns, angle):
     np.testing.assert_allclose(np.linalg.norm(beams, axis=-1), 1, atol=1e-12)
     tangent = beams[..., :2] / beams[..., 2:]
     assert (np.abs(tangent) < ray.half_extent).all()
-    # Turned half a turn about the normal, the last beam is the first.
+    # Rotated by half a turn about the normal, the last beam becomes the first.
     np.testing.assert_allclose(beams[::-1] * [-1, -1, 1], beams, atol=1e-12)
-    # No beam is farther off the normal than half the diagonal.
+    # No beam deviates more from the normal than half the diagonal.
     assert (beams[..., 2] > math.cos(math.radians(angle / 2)) - 1e-12).all()
 
 

@@ -1,4 +1,4 @@
-"""Sensors on meshes sit on the outer shell, whatever the meshes hide inside."""
+"""Sensors on meshes are placed on the outer shell, not on hidden parts."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def sample(robot, meshes, links=("base",), **options):
 
 @pytest.fixture
 def bare_robot(small_robot):
-    """A base without any shape, and a link turned by 90 degrees about z beside it."""
+    """A base without a shape, and a link beside it, rotated 90 degrees about z."""
     return small_robot("<body name='b' pos='.3 0 0' euler='0 0 90'/>")
 
 
@@ -233,10 +233,10 @@ def test_damaged_meshes_are_refused_by_name(tmp_path):
     raw = trimesh.creation.box().export(file_type="stl")
     path = tmp_path / "pelvis.stl"
     for content, text in (
-        # Which of the two is trimesh's affair: from 5.2 on it takes it for text.
-        (raw[:300], "(is no mesh that|holds no triangles)"),
-        (b"endsolid a solid b endsolid", "is no mesh that"),
-        (b"", "holds no triangles"),
+        # Depends on trimesh: from 5.2 on, it parses the file as text.
+        (raw[:300], "(as a mesh: |contains no triangles)"),
+        (b"endsolid a solid b endsolid", "as a mesh: "),
+        (b"", "contains no triangles"),
     ):
         path.write_bytes(content)
         with pytest.raises(ValueError, match=rf"pelvis\.stl {text}"):
@@ -273,7 +273,7 @@ def mjcf(tmp_path: Path) -> Path:
 
 def test_meshes_of_a_model_are_scaled_and_posed(mjcf):
     meshes = meshes_of_mjcf(mjcf)
-    # Base: the same mesh twice in one place is one mesh.
+    # Base: duplicates of a mesh in one place are dropped.
     assert {body: len(found) for body, found in meshes.items()} == {"base": 1, "b": 2}
     bounds = meshes["base"][0].bounds
     np.testing.assert_allclose(bounds, [[0, -0.1, -0.15], [0.1, 0.1, 0.15]], atol=1e-6)
@@ -355,9 +355,9 @@ def test_links_that_collide_as_meshes_wear_sensors_on_them(mjcf):
 
 
 def test_meshes_of_unknown_or_empty_links_are_refused(bare_robot):
-    with pytest.raises(ValueError, match="no link 'arm' to carry a mesh"):
+    with pytest.raises(ValueError, match="no link 'arm' for a mesh"):
         mesh_surface(bare_robot, ["base"], {"arm": [ball(0.1)]})
-    with pytest.raises(ValueError, match="meshes: none for 'base': leave it out"):
+    with pytest.raises(ValueError, match="meshes: empty list for 'base'; remove"):
         mesh_surface(bare_robot, ["base"], {"base": []})
     flat = trimesh.Trimesh(
         [[0, 0, 0], [1, 0, 0], [2, 0, 0]], [[0, 1, 2]], process=False

@@ -1,4 +1,4 @@
-"""Sensors sit on the outer surface, in the shares and at the distances asked for."""
+"""Sensors lie on the outer surface, with the requested shares and distances."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_the_default_skin_is_that_of_policies_trained_before():
     assert skin.links == tuple(H1_2.links[i] for i in points.link)
     np.testing.assert_array_equal(skin.position, points.position.round(6))
     np.testing.assert_array_equal(skin.normal, points.normal.round(6))
-    # Read off the skin of the first policies.
+    # Taken from the skin of the first policies.
     assert skin.links[:2] == ("right_shoulder_pitch_link", "right_wrist_roll_link")
     np.testing.assert_array_equal(skin.position[0], [-0.013936, -0.086686, 0.033983])
     np.testing.assert_array_equal(skin.position[1], [0.148002, -0.005519, 0.035369])
@@ -223,7 +223,7 @@ def test_density_scales_the_spacing_by_its_root(small_robot):
     plain, dense = (pair_distances(points[on]).min() for on in (~on_b, on_b))
     assert 0.1 <= plain + 2e-6 < 0.105
     assert 0.05 <= dense + 2e-6 < 0.0525
-    # 4 times as many to the area.
+    # 4 times as many per area.
     assert on_b.sum() / (~on_b).sum() == pytest.approx(4, rel=0.1)
 
 
@@ -283,7 +283,7 @@ def test_the_time_of_an_elimination_grows_as_the_number_of_points():
         times.append(time.process_time() - start)
     # Ten times as many; comparing all pairs takes a hundred times as long.
     assert times[1] < 35 * times[0]
-    # As far apart as few are: most keep the closest distance that counts.
+    # As far apart as if there were few: most keep the minimum distance.
     closest = 2 * (1 / (2 * 3**0.5 * n / 5)) ** 0.5 * 0.65 * (1 - 0.2**1.5)
     kept = throw_darts(points[left], np.full(len(left), closest / 2), n)
     assert len(kept) > 0.98 * n / 5
@@ -298,7 +298,7 @@ def test_darts_are_thrown_in_lots_until_there_are_enough(small_robot, monkeypatc
     for skin in (once, lots):
         assert len(skin) == 300
         assert pair_distances(skin.position).min() >= 0.08 - 2e-6
-    # Each lot is another.
+    # Each batch differs.
     assert not np.array_equal(once.position, lots.position)
     with pytest.raises(ValueError, match=r"only \d+ sensors fit"):
         place_sensors(robot, 1000, **options)
@@ -317,7 +317,7 @@ def test_darts_are_thrown_in_lots_until_there_are_enough(small_robot, monkeypatc
         ({"links": []}, "at least one link to cover"),
         ({"method": "grid"}, "method must be .* got 'grid'"),
         ({"num_sensors": None}, "num_sensors=None needs a spacing"),
-        ({"spacing": 0.1}, "goes with method='poisson_disk'"),
+        ({"spacing": 0.1}, "needs method='poisson_disk'"),
         ({"method": "poisson_disk", "spacing": 0.0}, "spacing must be positive"),
         ({"method": "poisson_disk", "spacing": 0.2}, r"only \d+ sensors fit"),
         ({"stand_off": -0.01}, "stand_off must be finite and not negative"),
@@ -327,7 +327,7 @@ def test_darts_are_thrown_in_lots_until_there_are_enough(small_robot, monkeypatc
         ({"density": {"*": 0.0}}, "the weights place no sensors on torso_link"),
         (
             {"method": "poisson_disk", "num_sensors": None, "spacing": 1e-3},
-            "take at least 0.004",
+            "use at least 0.004",
         ),
     ],
 )

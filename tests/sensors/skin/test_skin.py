@@ -88,7 +88,7 @@ def test_a_misplaced_skin_is_off_by_the_deviations_given():
     moved = skin.misplaced(0.002, 3.0, seed=1)
     assert (moved.position - skin.position).std() == pytest.approx(0.002, rel=0.03)
     turn = moved.rotation() @ skin.rotation().transpose(0, 2, 1)
-    # The turn as a vector, from the antisymmetric part: sin(angle) k.
+    # Rotation vector from the antisymmetric part: sin(angle) k.
     vector = np.stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], -1) - np.stack(
         [turn[:, 1, 2], turn[:, 2, 0], turn[:, 0, 1]], -1
     )
@@ -229,7 +229,7 @@ def skin_content(*sensors: object) -> dict:
         (skin_content({**SENSOR, "range": 10**400}), "'range' must be a number"),
         (skin_content({**SENSOR, "radius": float("nan")}), "'radius' must be a number"),
         ("1" * 5000, "limit"),
-        ("[" * 100_000, "nested too deep"),
+        ("[" * 100_000, "nested too deeply"),
         ({**skin_content(), "sensors": None}, "'sensors' must be a list, got None"),
         (skin_content(5), "sensor 0 must be an object, got 5"),
         (skin_content({**SENSOR, "link": 3}), "sensor 0: 'link' must be a name, got 3"),
@@ -246,10 +246,10 @@ def skin_content(*sensors: object) -> dict:
                 ({"coverage": ["ray"]}, "'coverage' must be one of field, ray"),
                 ({"grid": 5}, r"'grid' must be like \[8, 8\], got 5"),
                 ({"grid": [8.5, 8]}, "grid must be two positive integers"),
-                ({"fov_deg": 10**400}, "fov_deg must be a number of 64 bits"),
+                ({"fov_deg": 10**400}, "fov_deg must fit into 64 bits"),
                 ({"fov_deg": "63"}, "'fov_deg' must be like 63.0, got '63'"),
                 ({"measure": 1.5}, "'measure' must be like \"beam\", got 1.5"),
-                ({"sub_beams": 3}, "'sub_beams' is no more, all are 1; got 3"),
+                ({"sub_beams": 3}, "'sub_beams' was removed; only 1 .* got 3"),
             )
         ),
     ],
@@ -298,7 +298,9 @@ def test_lists_are_taken_for_arrays_and_a_name_for_links_is_refused():
     lists = {"position": [[0, 0, 1]], "normal": [[0, 0, 1]], "range": [2]}
     skin = Skin(robot="h1_2", links=("torso_link",), **lists)
     assert skin.position.tolist() == [[0, 0, 1]]
-    with pytest.raises(ValueError, match="links must be a name for each, got 'base'"):
+    with pytest.raises(
+        ValueError, match="links must be one name per sensor, got 'base'"
+    ):
         Skin(robot="h1_2", links="base", **lists)
 
 
@@ -318,5 +320,5 @@ def test_an_unknown_link_is_refused_with_the_closest_name():
 
 def test_placing_sensors_beside_a_skin_file_is_refused(tmp_path):
     config = SkinConfig(path=tmp_path / "my.json", num_sensors=10)
-    with pytest.raises(ValueError, match=r"skin\.num_sensors has no effect beside"):
+    with pytest.raises(ValueError, match=r"skin\.num_sensors has no effect with"):
         config.build(H1_2)

@@ -52,8 +52,8 @@ class Xml:
 
         def refuse(*_: object) -> None:
             raise ValueError(
-                f"{path}:{parser.CurrentLineNumber + above}: a DOCTYPE has no place "
-                "in a robot description; take it out"
+                f"{path}:{parser.CurrentLineNumber + above}: a DOCTYPE is not "
+                "allowed; remove it"
             )
 
         parser.StartElementHandler = start
@@ -114,7 +114,7 @@ def read_description(xml: Xml, names: Links, problems: Problems) -> Export:
         kept = [j for j in joints if _MAGNETIC not in j.get("name", "")]
         if not kept:
             raise ValueError(
-                f"{xml.path}: no sensors of GenTact in it: neither <{_SENSOR_TAGS[0]}> "
+                f"{xml.path}: no GenTact sensors found: neither <{_SENSOR_TAGS[0]}> "
                 "nor fixed joints named <namespace>_sensor_<number>_joint or "
                 "<namespace>/sensor_<number>_joint"
             )
@@ -140,7 +140,7 @@ def _read_xacro(xml: Xml, names: Links, problems: Problems) -> list[Sensor]:
     if len(macros) > 1:
         raise ValueError(
             f"{xml.where(macros[1])}: expected one macro with sensors, got "
-            f"{len(macros)}; put each into a file of its own"
+            f"{len(macros)}; put each into its own file"
         )
     macro = macros[0] if macros else xml.root
     base, name = np.eye(3), "${parent}"
@@ -219,8 +219,8 @@ class _Tree:
             child = _end(xml, joint, "child")
             if child in self._above:
                 raise ValueError(
-                    f"{xml.where(joint)}: the link {child!r} hangs on another joint "
-                    f"already ({xml.where(self._above[child])}); take one out"
+                    f"{xml.where(joint)}: the link {child!r} is already the child "
+                    f"of a joint ({xml.where(self._above[child])}); remove one"
                 )
             self._above[child] = joint
         # Results so far: link of the robot and frame in it; or, if there is none, the
@@ -251,8 +251,8 @@ class _Tree:
             self._frames[under] = found
         if isinstance(found, str):
             raise SensorError(
-                f"{self._xml.where(joint)}: the sensor hangs on {found!r}, which is no "
-                "link of the robot nor fixed to one; map it with link_map "
+                f"{self._xml.where(joint)}: the sensor is attached to {found!r}, which "
+                "is neither a link of the robot nor fixed to one; map it with link_map "
                 "(--link-map)",
                 self._names.known(),
             )
@@ -305,8 +305,8 @@ def _framed(
         if (own != np.eye(3)).any():
             raise SensorError(
                 f"{where}: the normal {normal.tolist()} and the z axis of rpy, "
-                f"{own[:, 2].round(4).tolist()}, must be one direction, got "
-                f"{angle:.1f} deg between them; take out the wrong one (a wrong rpy: "
+                f"{own[:, 2].round(4).tolist()}, must have the same direction, got "
+                f"{angle:.1f} deg between them; remove the wrong one (for rpy: set "
                 "0 0 0)"
             )
         x_axis = None

@@ -94,9 +94,9 @@ def load_gentact(
     skins = [skin for skin in parts if skin is not None]
     if not skins:
         raise ValueError(
-            f"no sensor can be read; the first: {problems.found[0]}"
+            f"no sensor can be read; first error: {problems.found[0]}"
             if problems.found
-            else f"{paths[0]}: there is no sensor in it"
+            else f"{paths[0]}: no sensors found"
         )
     provenance = dict(skins[0].provenance)
     if len(paths) > 1:
@@ -127,7 +127,7 @@ def _load(
     try:
         text = read_regular(path, _LARGEST).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: not UTF-8 text ({error}); save it as such") from None
+        raise ValueError(f"{path}: not UTF-8 text ({error}); save as UTF-8") from None
     names.found = {}
     if text.lstrip().startswith("<"):
         export = read_description(Xml(text, path), names, problems)
@@ -189,8 +189,8 @@ def _check_new(sensor: Sensor, first: dict[str, str]) -> None:
     """Raise SensorError if the sensor's name is a duplicate, else record it."""
     if sensor.name in first:
         raise SensorError(
-            f"{sensor.where}: {sensor.name!r} is there already "
-            f"({first[sensor.name]}); give each sensor a number of its own"
+            f"{sensor.where}: duplicate sensor {sensor.name!r} (first: "
+            f"{first[sensor.name]}); give each sensor its own number"
         )
     first[sensor.name] = sensor.where
 
@@ -199,13 +199,13 @@ def _metres_per_unit(path: Path, export: Export, scale: float | None) -> float:
     """Return the unit of the file [m]; raise ValueError if it is unknown or wrong."""
     if export.unit_is_given and scale not in (None, export.unit):
         raise ValueError(
-            f"{path}: the header says {export.unit:g} m to the unit, scale says "
+            f"{path}: the header gives a unit of {export.unit:g} m, but scale is "
             f"{scale:g}; leave out one of the two (--scale)"
         )
     unit = export.unit if scale is None else scale
     if unit is None:
         raise ValueError(
-            f"{path}: a 3-D print export of an old version, whose unit is unknown; "
+            f"{path}: the unit of this old 3-D print export is unknown; "
             "give scale (--scale 0.001 for millimetres, --scale 1 for metres)"
         )
     if scale is None and unit != 1.0 and export.sensors:
@@ -220,8 +220,8 @@ def _wrong_unit(sensor: Sensor, length: float, unit: float) -> SensorError:
     """Return the error for a sensor at an implausible distance from its link."""
     return SensorError(
         f"{sensor.where}: the sensor lies {length:.3g} m from the origin of its link "
-        f"with {unit:g} m to the unit of the file",
-        "give the right one as scale (--scale 0.001 for millimetres, --scale 1 for "
+        f"if the unit of the file is {unit:g} m",
+        "give the correct unit as scale (--scale 0.001 for millimetres, --scale 1 for "
         "metres)",
     )
 
@@ -240,9 +240,9 @@ def _radius(sensor: Sensor, unit: float) -> float:
         return math.nan
     if not (math.isnan(radius) or _SMALLEST <= radius <= _LARGEST_RADIUS):
         raise SensorError(
-            f"{sensor.where}: the radius is {radius:.3g} m with {unit:g} m to its unit",
-            "say its unit in the header of the table, as in 'Radius [mm]', or give the "
-            "right scale (--scale)",
+            f"{sensor.where}: the radius is {radius:.3g} m if its unit is {unit:g} m",
+            "give its unit in the header of the table, as in 'Radius [mm]', or the "
+            "correct scale (--scale)",
         )
     return radius
 
@@ -278,9 +278,9 @@ def _normal(sensor: Sensor, outward: np.ndarray) -> tuple[np.ndarray, bool]:
         length = float(np.linalg.norm(outward))
         if not length >= _SHORTEST:
             why = (
-                f"{sensor.link} has no primitive shape to take it from"
+                f"{sensor.link} has no primitive shape to compute one"
                 if math.isnan(length)
-                else f"the surface of {sensor.link} is equally near all around"
+                else f"the nearest surface point of {sensor.link} is not unique"
             )
             raise SensorError(
                 f"{sensor.where}: the file has no normals and {why}",

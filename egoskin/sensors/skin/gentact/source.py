@@ -55,7 +55,7 @@ class Problems:
             self.found.append(error)
             if len(self.found) > _MOST_INVALID:
                 raise ValueError(
-                    f"more than {_MOST_INVALID:,} sensors cannot be read; the first: "
+                    f"more than {_MOST_INVALID:,} sensors cannot be read; first error: "
                     f"{self.found[0]}"
                 ) from None
 
@@ -69,7 +69,7 @@ class Problems:
             remedies = dict.fromkeys(e.remedy for e in self.found if e.remedy)
             rest = len(self.found) - _SHOWN
             lines = [
-                f"{len(self.found)} sensors cannot be read; mend them, or leave them "
+                f"{len(self.found)} sensors cannot be read; fix them, or leave them "
                 "out with skip_invalid (--skip-invalid):",
                 *(f"  {error.what}" for error in self.found[:_SHOWN]),
                 *([f"  and {rest} more"] if rest > 0 else []),
@@ -173,8 +173,8 @@ class Links:
             if rest:
                 raise SensorError(
                     f"{where}: {'/'.join(rest)!r} of the Parent {path!r} may be a part "
-                    f"of {parts[last]!r}, or a link that {self.robot_name} lacks; say "
-                    f"which link it means with link_map (--link-map {rest[-1]}=...)",
+                    f"of {parts[last]!r}, or a link that {self.robot_name} lacks; set "
+                    f"its link with link_map (--link-map {rest[-1]}=...)",
                     self.known(),
                 )
             return self.found.setdefault(path, link)
@@ -183,7 +183,7 @@ class Links:
         hint = f" (did you mean {' or '.join(close)}?)" if close else ""
         raise SensorError(
             f"{where}: no part of the Parent {path!r} names a link{hint}; map a part "
-            "of it or all of it with link_map (--link-map)",
+            "or all of it with link_map (--link-map)",
             self.known(),
         )
 
@@ -203,8 +203,8 @@ class Links:
             self._needs_parent = True
             return self._parent
         raise SensorError(
-            f"{where}: the file does not say on which link its sensors sit; give it "
-            f"as parent (--parent){did_you_mean(name, self.links)}",
+            f"{where}: the file does not name the link of its sensors; give it as "
+            f"parent (--parent){did_you_mean(name, self.links)}",
             self.known(),
         )
 
@@ -213,7 +213,7 @@ class Links:
         if self._parent is not None and not self._needs_parent:
             found = ", ".join(sorted(set(self.found.values())))
             raise ValueError(
-                "parent decides nothing, for what is read tells the links itself "
+                "parent has no effect: the files name the links themselves "
                 f"({found}); leave it out, or use link_map (--link-map)"
             )
 

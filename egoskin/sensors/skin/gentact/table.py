@@ -74,7 +74,9 @@ def save_gentact(skin: Skin, path: Path | str) -> tuple[str, ...]:
     """
     slashed = [name for name in (*skin.links, skin.robot) if "/" in name]
     if slashed:
-        raise ValueError(f"{slashed[0]!r} holds '/', which divides GenTact's paths")
+        raise ValueError(
+            f"{slashed[0]!r} contains '/', the separator of GenTact's paths"
+        )
     with open(path, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(_HEADER.split(","))
@@ -140,7 +142,7 @@ def read_table(text: str, path: Path, names: Links, problems: Problems) -> Expor
     if is_print:
         rows = [(w, cells) for w, cells in rows if _kind(cells) == "sensors"]
     if not rows:
-        raise ValueError(f"{path}: there is no sensor in it")
+        raise ValueError(f"{path}: no sensors found")
     # Without the parent column, all sensors are on one link.
     link = None if "parent" in columns else names.default(where)
     sensors = []
@@ -180,14 +182,14 @@ def _read_header(
         column = _COLUMN_OF.get(word)
         if heading is None or column is None:
             raise ValueError(
-                f"{where}: unknown header {','.join(header)!r}; GenTact's are "
+                f"{where}: unknown header {','.join(header)!r}; GenTact writes "
                 + "; ".join(map(repr, _HEADERS))
-                + f"; rename or take out the column {cell!r}"
+                + f"; rename or remove the column {cell!r}"
             )
         if column in columns:
             raise ValueError(
                 f"{where}: {header[columns.index(column)]!r} and {cell!r} are both the "
-                f"sensor's {column}; take one out"
+                f"sensor's {column}; remove one"
             )
         if heading["unit"] is not None and column in (*_PLACE, *_STEM, "radius"):
             unit = _UNITS.get(heading["unit"].strip().casefold())
@@ -207,7 +209,7 @@ def _read_header(
         if missing:
             raise ValueError(f"{where}: there is no column {', '.join(missing)}")
     if len({units.get(axis) for axis in _PLACE}) > 1:
-        raise ValueError(f"{where}: x, y and z must have one unit")
+        raise ValueError(f"{where}: x, y and z must have the same unit")
     return columns, units
 
 
