@@ -204,7 +204,7 @@ def test_a_picture_shows_sensors_and_normals_from_both_sides(mixed):
             "it must be one of h1_2, g1, a folder",
         ),
         (["import", "bad.csv", "--robot", "bad.csv", "--out", "a.json"], "(.urdf, .x"),
-        (["show", "pipe"], "skin file pipe: pipe must be a file, and is a named pipe"),
+        (["show", "pipe"], "skin file pipe: pipe must be a file, but is a named pipe"),
         (["show", "/dev/zero"], "skin file /dev/zero: /dev/zero must be a file"),
         (["export", "deep.json", "--out", "a.csv"], "skin file deep.json: nested"),
         (["export", "bad.csv", "--out", "a.csv"], "skin file bad.csv"),
