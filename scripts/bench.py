@@ -1,6 +1,6 @@
 """Measure speed and accuracy.
 
-As `egoskin bench`:
+The same as `egoskin bench`:
 python scripts/bench.py loop --json loop.json
 """
 

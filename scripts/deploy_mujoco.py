@@ -1,11 +1,11 @@
-"""A policy on a simulated robot, without PyTorch.
+"""Run a policy on a simulated robot, without PyTorch.
 
 python scripts/deploy_mujoco.py prepare field_proximity --out deployed
 python scripts/deploy_mujoco.py run deployed
 
-The first exports a policy, writes the model of the robot and a set of throws, and says
-how many the policy survives in PyTorch. The second plays the same throws without it:
-what it does with the model through `egoskin.deploy`, a driver does with a robot.
+The first exports a policy, writes the model of the robot and a set of throws, and
+prints how many the policy survives in PyTorch. The second plays the same throws without
+PyTorch: it uses `egoskin.deploy` on the model as a driver would on a robot.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ import numpy as np
 
 from egoskin.deploy import Controller
 
-# What `prepare` writes.
+# Files that `prepare` writes.
 POLICY, MODEL, THROWS = "policy.onnx", "scene.mjb", "throws.npz"
-# Balls that are not in play wait here [m].
+# Position of balls that are not in play [m].
 PARKING = (0.0, 0.0, 1000.0)
-# A robot that runs away is led as if it ran at most at this share of the ball's speed.
+# The aim leads a moving robot by at most this share of the ball's speed.
 MAX_LEAD_RATIO = 0.9
 
 
 def prepare(policy: str, out: Path, episodes: int, throw_set: int) -> None:
-    """Write policy, model and throws into a folder: the one part that needs PyTorch."""
+    """Write policy, model and throws to a folder; only this part needs PyTorch."""
     import torch
 
     from egoskin.envs.physics.contract import Scene
@@ -43,7 +43,7 @@ def prepare(policy: str, out: Path, episodes: int, throw_set: int) -> None:
 
     loaded = load_policy(policy)
     config = standard_task(loaded.env_config, "2")
-    # Nobody looks at what comes after.
+    # What comes later is not used.
     task = replace(config.task, episode_length_s=config.task.success_s)
     config = replace(config, task=task)
     robot, skin = config.robot_config, loaded.skin
@@ -57,7 +57,7 @@ def prepare(policy: str, out: Path, episodes: int, throw_set: int) -> None:
     seed = throw_seed(config, throw_set)
     env = make_worker_env(config, skin, num_envs=episodes, seed=seed, keep_raw=True)
     start = env.reset()
-    # One more than there is time for.
+    # More throws than fit into the time.
     number = int(task.success_s / throws.interval[0]) + 2
     row, throw = torch.arange(episodes).repeat_interleave(number), torch.arange(number)
     thrower = Thrower(throws, robot, physics.timestep)
@@ -84,17 +84,17 @@ def prepare(policy: str, out: Path, episodes: int, throw_set: int) -> None:
 
 
 class Robot:
-    """The robot and the balls in MuJoCo, with a skin: what a driver reads and writes.
+    """The robot, its skin and the balls in MuJoCo, as a driver would access them.
 
     Args:
         model: The model.
-        metadata: What the exported policy says of the robot and its skin.
+        metadata: The exported policy's metadata on the robot and its skin.
     """
 
     def __init__(self, model: mujoco.MjModel, metadata: dict[str, Any]) -> None:
         sensor = metadata["sensor"]
         if sensor["coverage"] == "ray" or sensor["field"]["half_angle_deg"] < 180:
-            raise SystemExit("this example measures fields that see all around alone")
+            raise SystemExit("this example needs field sensors that see all around")
         self.model, self.data = model, mujoco.MjData(model)
         joints = [model.joint(name) for name in metadata["joints"]]
         self._q = np.array([joint.qposadr[0] for joint in joints])
@@ -119,14 +119,14 @@ class Robot:
         self.in_play = np.zeros(self.num_balls, dtype=bool)
 
     def reset(self, base_pose: np.ndarray, joint_pos: np.ndarray) -> None:
-        """Put it at rest into a pose; no ball is in play."""
+        """Set the robot to a pose, at rest; no ball is in play."""
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[:7], self.data.qpos[self._q] = base_pose, joint_pos
         self.in_play[:] = False
         self._look()
 
     def body(self) -> dict[str, Any]:
-        """Return what the robot's encoders and its IMU tell."""
+        """Return the readings of the robot's encoders and IMU."""
         return {
             "base_quat": self.data.qpos[3:7],
             "base_ang_vel_b": self.data.qvel[3:6],
@@ -135,7 +135,7 @@ class Robot:
         }
 
     def distance(self) -> np.ndarray:
-        """Return what the sensors measure [m], infinite where nothing is in range."""
+        """Return the measured distances [m], infinite where nothing is in range."""
         turn = self.data.xmat[self._link].reshape(-1, 3, 3)
         sensor = self.data.xpos[self._link] + (turn @ self._position[..., None])[..., 0]
         balls = self.data.qpos[self._ball_q[self.in_play]]
@@ -144,7 +144,7 @@ class Robot:
         return np.where(nearest <= self._range, nearest, np.inf)
 
     def step(self, target: np.ndarray) -> bool:
-        """Go on by a control step; return whether it is untouched and upright."""
+        """Simulate a control step; return whether it is untouched and upright."""
         data, balls = self.data, self.num_balls
         data.qpos[self._ball_q[~self.in_play]] = PARKING
         data.qvel[self._ball_v[~self.in_play]] = 0.0
@@ -152,7 +152,7 @@ class Robot:
         fine = True
         for _ in range(self._substeps):
             mujoco.mj_step(self.model, data)
-            # Numbers of contacts: with each ball, with itself, floor, its feet with it.
+            # Numbers of contacts: with each ball, itself, the floor, and feet on floor.
             hits, floor, feet = np.split(data.sensordata, [balls + 1, balls + 2])
             fine &= not hits[:balls][self.in_play].any() and not floor > feet.sum()
         self.in_play &= data.qpos[self._ball_q[:, 2]] > self._radius
@@ -160,7 +160,7 @@ class Robot:
         return bool(fine)
 
     def throw(self, ball: int, throw: dict[str, Any]) -> None:
-        """Throw a ball at a point of the robot, which it leads."""
+        """Throw a ball at a point of the robot, leading its motion."""
         data, link = self.data, self.model.body(str(throw["aim_link"])).id
         base, forward = data.qpos[:3], np.zeros(3)
         mujoco.mju_rotVecQuat(forward, np.array([1.0, 0, 0]), data.qpos[3:7])
@@ -180,12 +180,12 @@ class Robot:
         self.in_play[ball] = True
 
     def _look(self) -> None:
-        """Bring the poses of the links up to date."""
+        """Update the poses of the links."""
         mujoco.mj_kinematics(self.model, self.data)
 
 
 def run(folder: Path, episodes: int | None, margin: float) -> None:
-    """Play the throws that `prepare` wrote, and say how many are survived."""
+    """Play the throws that `prepare` wrote, and print how many are survived."""
     controller = Controller(folder / POLICY, margin=margin)
     hz = controller.metadata["control_hz"]
     model = mujoco.MjModel.from_binary_path(str(folder / MODEL))
@@ -230,8 +230,8 @@ def main() -> None:
     first.add_argument("--episodes", type=int, default=512, help="throw sequences")
     first.add_argument("--throw-set", type=int, default=0, help="seed of the throws")
     second = commands.add_parser("run", help="play the throws, without PyTorch")
-    second.add_argument("folder", type=Path, help="what `prepare` wrote")
-    second.add_argument("--episodes", type=int, help="how many of them")
+    second.add_argument("folder", type=Path, help="folder that `prepare` wrote")
+    second.add_argument("--episodes", type=int, help="number of episodes (all)")
     second.add_argument(
         "--margin", type=float, default=1.0, help="how far targets may be out of range"
     )

@@ -1,6 +1,6 @@
-"""Play a policy on a fixed set of throws.
+"""Evaluate a policy on a fixed set of throws.
 
-As `egoskin evaluate`:
+The same as `egoskin evaluate`:
 python scripts/evaluate.py runs/NAME --json out.json
 """
 

@@ -1,6 +1,6 @@
 """Write a policy as ONNX, for a robot without PyTorch.
 
-As `egoskin export`:
+The same as `egoskin export`:
 python scripts/export.py runs/NAME --out policy.onnx
 """
 

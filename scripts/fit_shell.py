@@ -1,12 +1,12 @@
-"""How well the H1-2's primitive collision shell fits the official meshes.
+"""Measure how well the H1-2's collision primitives fit the official meshes.
 
-Skin sits on the outside of the robot, so outsides are compared, in the default pose.
-A point of a mesh is *outer* if at least ``min_openness`` of the cosine-weighted rays
-over its outward hemisphere leave the robot without meeting any mesh: 0.15 rejects the
-floor of a round pit deeper than 1.2 diameters. Points of the primitives are those that
-skin is placed on (`egoskin.robots.surface`). Distances run between the outer points of
-one region, nearest to nearest, both ways. Points stand for surfaces, so a figure is
-too high, never too low: a perfect fit gives half the spacing of the points.
+Skin sits on the outside of the robot, so the outer surfaces are compared, in the
+default pose. A point of a mesh is *outer* if at least ``min_openness`` of the
+cosine-weighted rays over its outward hemisphere leave the robot without hitting any
+mesh: 0.15 rejects the floor of a round pit deeper than 1.2 diameters. Points of the
+primitives are those that skin is placed on (`egoskin.robots.surface`). Distances are
+between nearest outer points of a region, in both directions. Surfaces are sampled, so
+distances are too high, never too low: a perfect fit gives half the point spacing.
 
     python scripts/fit_shell.py --meshes DIR
 
@@ -44,13 +44,13 @@ Array = NDArray[np.float64]
 Scene = tuple[mujoco.MjModel, mujoco.MjData]
 Span = tuple[float, float]  # lowest and highest z in the world [m]
 
-# The torso's mesh carries neck and head. Its trunk is a box that ends here [m].
+# The torso's mesh includes neck and head. Its trunk is a box that ends here [m].
 NECK_HEIGHT = 0.485
 
-# Rays start this far off the face that they leave [m].
+# Distance between the start of a ray and the face that it leaves [m].
 CLEARANCE = 1e-4
 
-# Rays over the hemisphere of each mesh point.
+# Number of rays over the hemisphere of each mesh point.
 RAYS = 48
 
 UPPER_ARM = ("shoulder_pitch_link", "shoulder_roll_link", "shoulder_yaw_link")
@@ -64,22 +64,22 @@ REGIONS = {"torso": ["torso_link"], "head": ["torso_link"]} | {
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """What to compare, and how finely."""
+    """Compare the H1-2's collision primitives with its meshes."""
 
     meshes: Path
     """Directory of the official meshes, ``<link>.STL``."""
     samples: int = 8000
-    """Points drawn on the meshes of a region; primitives, which are cheap, get more."""
+    """Points sampled on the meshes of a region; primitives get more."""
     min_openness: float = 0.15
     """Share of the rays that must escape for a mesh point to be outer, 0 to 1."""
     limit_mm: float = 15.0
     """Largest accepted mean distance of a region, over both directions [mm]."""
     seed: int = 0
-    """Seed of the points drawn."""
+    """Seed of the sampled points."""
 
 
 class Fit(NamedTuple):
-    """Distances between the two outsides of one region, nearest to nearest [m]."""
+    """Distances between nearest points of a region's outer surfaces [m]."""
 
     region: str
     ours_to_mesh: Array  # of each outer point of the primitives, [N]
@@ -89,7 +89,7 @@ class Fit(NamedTuple):
 
 
 def mesh_file(directory: Path, link: str) -> Path:
-    """Path of a link's mesh; left and right share the one of the wrist's last link.
+    """Return the path of a link's mesh; both wrist yaw links share one file.
 
     Raises:
         FileNotFoundError: If the directory or the file does not exist.
@@ -104,7 +104,7 @@ def mesh_file(directory: Path, link: str) -> Path:
 
 
 def default_pose() -> Scene:
-    """The robot in its default pose, kinematics computed."""
+    """Return the robot in its default pose, with its kinematics computed."""
     model = H1_2.model
     data = mujoco.MjData(model)
     data.qpos[7:] = H1_2.default_joint_pos
@@ -113,15 +113,15 @@ def default_pose() -> Scene:
 
 
 def mesh_scene(data: mujoco.MjData, meshes: Path) -> Scene:
-    """A static scene of every link's mesh where the pose puts it, for ray casts."""
+    """Return a static scene of the links' meshes in the pose, for ray casts."""
     spec = mujoco.MjSpec()
     for link in H1_2.links:
         mesh = spec.add_mesh(name=link, file=str(mesh_file(meshes, link).resolve()))
-        # A shell has an inertia even where its surface is not closed.
+        # A shell has an inertia even if its surface is not closed.
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
         geom = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=link)
         geom.pos, geom.quat = data.body(link).xpos, data.body(link).xquat
-        geom.contype = geom.conaffinity = 0  # spares the convex hulls
+        geom.contype = geom.conaffinity = 0  # saves computing convex hulls
     scene = spec.compile()
     scene_data = mujoco.MjData(scene)
     mujoco.mj_forward(scene, scene_data)
@@ -129,11 +129,11 @@ def mesh_scene(data: mujoco.MjData, meshes: Path) -> Scene:
 
 
 def openness(scene: Scene, points: Array, normals: Array) -> Array:
-    """Share of the cosine-weighted outward rays that meet no mesh, ``[N]``.
+    """Return the share of cosine-weighted outward rays that hit no mesh, ``[N]``.
 
     Points on the meshes [m] and unit normals there are ``[N, 3]``, world frame.
     """
-    # Even spread over the unit sphere along a golden-angle spiral.
+    # Evenly spread over the unit sphere along a golden-angle spiral.
     k = np.arange(RAYS) + 0.5
     z, angle = 1.0 - 2.0 * k / RAYS, k * math.pi * (3.0 - math.sqrt(5.0))
     ring = np.sqrt(1.0 - z**2)
@@ -141,7 +141,7 @@ def openness(scene: Scene, points: Array, normals: Array) -> Array:
     share = np.empty(len(points))
     geom, distance = np.empty(RAYS, dtype=np.int32), np.empty(RAYS)
     for i, (point, normal) in enumerate(zip(points, normals, strict=True)):
-        # Lambert: normal + uniform unit vector points along a cosine-weighted ray.
+        # Lambert: normal + uniform unit vector gives a cosine-weighted direction.
         ray = normal + sphere
         ray /= np.linalg.norm(ray, axis=1, keepdims=True)
         start = point + CLEARANCE * normal
@@ -153,15 +153,15 @@ def openness(scene: Scene, points: Array, normals: Array) -> Array:
 
 
 def within(points: Array, span: Span) -> NDArray[np.bool_]:
-    """Whether the heights of points lie in a span, ``[N]``."""
+    """Return whether the heights of points lie in a span, ``[N]``."""
     return (points[:, 2] >= span[0]) & (points[:, 2] < span[1])
 
 
 def primitive_points(
     data: mujoco.MjData, links: list[str], span: Span, options: Options
 ) -> Array:
-    """Outer points of the links' primitives, even by area, world [m], ``[N, 3]``."""
-    # No rays to cast: many points cost little.
+    """Return outer points of the links' primitives, uniform, world [m], ``[N, 3]``."""
+    # Many points are cheap, because no rays are cast.
     surface = sample_surface(H1_2, links, 20 * options.samples, options.seed)
     frames = [data.body(link) for link in H1_2.links]
     turn = np.stack([frame.xmat.reshape(3, 3) for frame in frames])[surface.link]
@@ -173,7 +173,7 @@ def primitive_points(
 def mesh_points(
     data: mujoco.MjData, scene: Scene, links: list[str], span: Span, options: Options
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Points of the links' meshes, even by area, world [m], and which are outer."""
+    """Return points of the links' meshes, uniform, world [m], and which are outer."""
     meshes = []
     for link in links:
         frame, transform = data.body(link), np.eye(4)
@@ -181,7 +181,7 @@ def mesh_points(
         mesh = trimesh.load_mesh(mesh_file(options.meshes, link))
         meshes.append(mesh.apply_transform(transform))
     mesh = trimesh.util.concatenate(meshes)
-    # Enough for a span that holds a tenth of the area.
+    # Enough for a span with a tenth of the area.
     count, seed = 10 * options.samples, options.seed
     points, faces = trimesh.sample.sample_surface(mesh, count, seed=seed)[:2]
     kept = np.flatnonzero(within(points, span))[: options.samples]
@@ -190,7 +190,7 @@ def mesh_points(
 
 
 def measure(options: Options) -> Iterator[Fit]:
-    """Yields the fit of each region; raises as its parts do."""
+    """Yield the fit of each region."""
     model, data = default_pose()
     scene = mesh_scene(data, options.meshes)
     # The pose is upright, so heights in the torso's frame are heights in the world.
@@ -212,7 +212,7 @@ def measure(options: Options) -> Iterator[Fit]:
 
 
 def main(options: Options) -> int:
-    """Prints the table of fits; exit status 0, 1 (poor fit) or 2 (error)."""
+    """Print the table of fits; return 0, 1 (poor fit) or 2 (error)."""
     print("[mm]             ours->mesh    mesh->ours      both ways  inner  primi-")
     print("region           mean    p95   mean    p95   mean    p95  share  tives")
     worst = 0.0

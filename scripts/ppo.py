@@ -1,4 +1,4 @@
-"""Train a robot to dodge: the main job, to run and to copy from.
+"""Train a robot to dodge: the main script, to run or to copy from.
 
 python scripts/ppo.py --sensor.signal localization --sensor.range 2 --seed 1
 python scripts/ppo.py --resume runs/NAME --total-frames 100_000_000

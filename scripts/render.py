@@ -1,6 +1,6 @@
 """Film an episode, with a contact sheet of its moments.
 
-As `egoskin film`:
+The same as `egoskin film`:
 python scripts/render.py runs/NAME --out a.mp4
 """
 

@@ -1,6 +1,6 @@
 """Replay an update that was not finite.
 
-As `egoskin replay`:
+The same as `egoskin replay`:
 python scripts/replay.py runs/NAME/not-finite-FRAMES.safetensors
 """
 

@@ -1,14 +1,14 @@
-"""Proximity sensors on Gymnasium's Humanoid, in a plain TorchRL environment.
+"""Use the proximity sensors on Gymnasium's Humanoid, in a plain TorchRL environment.
 
 python scripts/reuse_gymnasium.py       (needs `pip install "gymnasium[mujoco]"`)
 
-The pattern for any environment: one transform of your own that says where the base,
-the joints and the objects are, then the sensors as they come.
+The pattern for any environment: write one transform that gives the poses of the base,
+the joints and the objects, then append the sensors unchanged.
 
-Several at once are a vector environment whose autoreset is DISABLED, as below, or
-``GymEnv(name, num_workers=4)``. Not ``GymEnv(name, num_envs=4)``: in TorchRL 0.14.1 it
-writes zeros for the last observation of each episode (and starts the next from it), so
-that the robot has no orientation there, and sensors say NaN.
+For several environments at once, use a vector environment whose autoreset is DISABLED,
+as below, or ``GymEnv(name, num_workers=4)``. Do not use ``GymEnv(name, num_envs=4)``:
+in TorchRL 0.14.1 it writes zeros for the last observation of each episode (and starts
+the next from it), so the robot has no orientation there, and sensors return NaN.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def skin_of_rings() -> Skin:
 
 
 class HumanoidState(RowTransform):
-    """What the sensors need, from Humanoid's observation and the count of steps.
+    """Compute the sensors' inputs from Humanoid's observation and the step count.
 
     Reads ``observation [*B, 350]`` and ``step_count [*B, 1]``. Writes ``base_pose
     [*B, 7]``, ``joint_pos [*B, 17]``, and a ball that flies at the robot:
@@ -89,9 +89,9 @@ class HumanoidState(RowTransform):
     def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Return the four outputs."""
         observation, steps = inputs
-        # qpos comes first: the torso's pose, then the joints in the order of the model.
+        # qpos comes first: the torso's pose, then the joints in the model's order.
         position, quat = observation[:, :3], observation[:, 3:7]
-        # At a reset Gymnasium adds noise to the quaternion and leaves it so.
+        # Gymnasium's reset adds noise to the quaternion without normalizing it.
         quat = quat / quat.norm(dim=-1, keepdim=True)
         start, velocity = observation.new_tensor([BALL_START, BALL_VELOCITY])
         ball = start + velocity * STEP * steps
@@ -114,7 +114,7 @@ class HumanoidState(RowTransform):
 
 
 def make_env(skin: Skin, num_envs: int) -> TransformedEnv:
-    """Return Humanoids with a skin and a ball, ``[num_envs]``: they add ``signal``."""
+    """Return Humanoids with a skin and a ball, ``[num_envs]``, and key ``signal``."""
     envs = gymnasium.make_vec(
         "Humanoid-v5",
         num_envs,
@@ -130,7 +130,7 @@ def make_env(skin: Skin, num_envs: int) -> TransformedEnv:
 
 
 def main() -> None:
-    """Run an episode of random actions and print what the skin feels of the ball."""
+    """Run an episode of random actions and print what the skin sees of the ball."""
     skin = skin_of_rings()
     env = make_env(skin, num_envs=1)
     torch.manual_seed(0)

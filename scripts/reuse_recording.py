@@ -1,9 +1,9 @@
-"""What other sensors would have seen: transforms on a recording, after the fact.
+"""Measure a recording with other sensors, offline.
 
 python scripts/reuse_recording.py --folder /tmp/recording
 
 A recording is a TensorDict ``[B, T]`` on disk with the poses of robot and objects; it
-may as well come from motion capture or a real robot.
+may also come from motion capture or a real robot.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from egoskin.envs.throws import ThrowConfig
 from egoskin.robots.config import H1_2
 from egoskin.sensors import FieldSensor, Ray, RaySensor, place_sensors
 
-# The first ball at once: a recording is short.
+# The first ball comes at once, because recordings are short.
 TASK = DodgeballConfig(throws=ThrowConfig(first_delay=(0.0, 0.0)))
 KEYS = ("base_pose", "joint_pos", "object_pose", "object_active")
 STEP = 1 / TASK.physics.control_hz
@@ -41,14 +41,14 @@ class ReplayConfig:
     """Measure a recording with several sensors."""
 
     folder: Path | None = None
-    """Memory-mapped recording, made there if there is none; None: a throw-away one."""
+    """Memory-mapped recording, created if missing; None: a temporary one."""
     num_envs: int = 64
-    """Robots ``B`` in a new recording."""
+    """Number of robots ``B`` in a new recording."""
     num_steps: int = 60
-    """Control steps ``T`` in a new recording."""
+    """Number of control steps ``T`` in a new recording."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for counts that record nothing."""
+        """Raise ValueError for counts below 1."""
         if min(self.num_envs, self.num_steps) < 1:
             raise ValueError("num_envs and num_steps must be at least 1")
 
@@ -62,7 +62,7 @@ def record(folder: Path, num_envs: int, num_steps: int) -> None:
 
 
 def seconds_of_warning(seen: Tensor, gap: Tensor) -> Tensor:
-    """Return how long an object was in sight, without a break, until it was closest.
+    """Return how long an object was seen without interruption until it was closest.
 
     Args:
         seen: Whether the object is seen, ``[B, T]`` bool.

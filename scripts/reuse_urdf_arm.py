@@ -1,9 +1,9 @@
-"""Proximity sensors on an arm that is described by a URDF; no simulator at all.
+"""Use the proximity sensors on an arm from a URDF file, without any simulator.
 
 python scripts/reuse_urdf_arm.py
 
-The chain is that of pytorch-kinematics, as it reads the URDF. A robot that stands
-fixed has a constant base pose.
+pytorch-kinematics builds the chain from the URDF. A fixed robot has a constant base
+pose.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from egoskin.commands.errors import clear_errors
 from egoskin.sensors import FieldSensor, Ray, RaySensor, Skin
 from egoskin.shapes import Sphere
 
-# Six tubes: name of the link, length [m], axis of the joint that turns it.
+# Six tubes: name of the link, length [m], axis of its joint.
 TUBES = (
     ("shoulder", 0.20, "0 0 1"),
     ("upper_arm", 0.35, "0 1 0"),
@@ -44,7 +44,7 @@ BALL_POSE = (0.85, 0.2, 1.1, 1.0, 0.0, 0.0, 0.0)
 
 
 def urdf() -> str:
-    """Return the arm: each tube stands on the one before and turns about its foot."""
+    """Return the arm: each tube sits on the previous one and turns about its foot."""
     parts, parent, foot = ["<link name='base'/>"], "base", 0.0
     for name, length, axis in TUBES:
         parts.append(
@@ -72,7 +72,7 @@ def skin_of_rings() -> Skin:
 
 
 def sweep(steps: int) -> TensorDict:
-    """Return a motion past the ball, ``[T]``: the keys that sensors read."""
+    """Return a motion past the ball, ``[T]``, with the keys that sensors read."""
     joint_pos = torch.zeros(steps, len(TUBES))
     joint_pos[:, 0] = torch.linspace(-1.5, 1.5, steps)  # [rad]
     joint_pos[:, 1], joint_pos[:, 2] = 0.6, 0.9
@@ -88,7 +88,7 @@ def sweep(steps: int) -> TensorDict:
 
 
 def sensors(skin: Skin) -> Compose:
-    """Return two kinds of sensors at the same places, under different keys."""
+    """Return two kinds of sensors at the same positions, with different keys."""
     chain = pk.build_chain_from_urdf(urdf())
     beams = ("beams", "beams_detected")
     return Compose(

@@ -1,6 +1,6 @@
-"""Look at a robot before it is trained.
+"""Check a robot before training, and draw it.
 
-As `egoskin robot`:
+The same as `egoskin robot`:
 python scripts/robot.py check my_robot --out robot.png
 """
 

@@ -1,6 +1,6 @@
 """Place, import, export and show skins.
 
-As `egoskin skin`:
+The same as `egoskin skin`:
 python scripts/skin.py show skin.json --picture skin.png
 """
 

@@ -1,6 +1,6 @@
 """Plan, run and report many trainings.
 
-As `egoskin study`:
+The same as `egoskin study`:
 python scripts/study.py plan findings
 """
 

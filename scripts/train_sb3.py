@@ -1,9 +1,10 @@
-"""Stable-Baselines3's PPO on the dodgeball task, many robots at once.
+"""Train Stable-Baselines3's PPO on the dodgeball task, with many robots at once.
 
 python scripts/train_sb3.py --seconds 60        (needs `pip install stable-baselines3`)
 
-Stable-Baselines3 has a form of its own for many environments, into which `Robots` puts
-Gymnasium's. One robot needs none: ``PPO("MlpPolicy", gymnasium.make(ENV_ID))``.
+Stable-Baselines3 has its own interface for vector environments; `Robots` adapts
+Gymnasium's to it. A single robot needs no adapter:
+``PPO("MlpPolicy", gymnasium.make(ENV_ID))``.
 """
 
 from __future__ import annotations
@@ -23,10 +24,10 @@ from egoskin.gym import ENV_ID
 
 
 class Robots(VecEnv):
-    """Robots as Stable-Baselines3 wants environments.
+    """Adapter from Gymnasium's vector environments to Stable-Baselines3's.
 
     Args:
-        envs: Gymnasium's vector form.
+        envs: Gymnasium's vector environment.
     """
 
     def __init__(self, envs: gymnasium.vector.VectorEnv) -> None:
@@ -42,7 +43,7 @@ class Robots(VecEnv):
         return observations
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Take the actions of the next step."""
+        """Store the actions of the next step."""
         self._actions = actions
 
     def step_wait(self) -> Any:
@@ -59,34 +60,34 @@ class Robots(VecEnv):
         return observations, rewards, done, infos
 
     def close(self) -> None:
-        """End the processes."""
+        """Stop the worker processes."""
         self._envs.close()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """Return what all robots have in common, once for each."""
+        """Return an attribute that all robots share, once for each."""
         value = getattr(self._envs, attr_name)
         return [value for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Refuse: the robots have nothing of their own."""
+        """Raise AttributeError: robots have no attributes or methods of their own."""
         raise AttributeError(attr_name)
 
     def env_method(
         self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any
     ) -> list[Any]:
-        """Refuse: the robots have nothing of their own."""
+        """Raise AttributeError: robots have no attributes or methods of their own."""
         raise AttributeError(method_name)
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
-        """Return that none is."""
+        """Return False for each robot."""
         return [False for _ in self._get_indices(indices)]
 
 
 class Until(BaseCallback):
-    """Ends a training after some time.
+    """Ends training after a given time.
 
     Args:
-        seconds: How long [s].
+        seconds: Training time [s].
     """
 
     def __init__(self, seconds: float) -> None:
@@ -94,7 +95,7 @@ class Until(BaseCallback):
         self._seconds = seconds
 
     def _on_training_start(self) -> None:
-        # The processes run by now.
+        # The worker processes are running by now.
         self._begin = time.monotonic()
 
     def _on_step(self) -> bool:
@@ -103,7 +104,7 @@ class Until(BaseCallback):
 
 
 def main(args: Sequence[str] | None = None) -> PPO:
-    """Train; return what was trained."""
+    """Train a policy and return it."""
     parser = argparse.ArgumentParser(description="Train with Stable-Baselines3.")
     parser.add_argument("--num-envs", type=int, default=256, help="robots")
     parser.add_argument("--seconds", type=float, default=60.0, help="how long to train")

@@ -1,6 +1,6 @@
-"""Search what the body could still do when a ball is in reach.
+"""Search for what the body could still do when a ball is in reach.
 
-As `egoskin upper-bound`:
+The same as `egoskin upper-bound`:
 python scripts/upper_bound.py runs/NAME
 """
 

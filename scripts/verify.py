@@ -1,6 +1,6 @@
-"""Check that training is exact on this machine.
+"""Check that training is reproducible on this machine.
 
-As `egoskin verify`:
+The same as `egoskin verify`:
 python scripts/verify.py --iterations 3
 """
 

@@ -1,6 +1,6 @@
 """See a policy in the browser, and throw balls at it.
 
-As `egoskin view`:
+The same as `egoskin view`:
 python scripts/view.py field_proximity
 """
 

@@ -1,6 +1,6 @@
 """Show what a skin sees, before any training.
 
-As `egoskin visibility`:
+The same as `egoskin visibility`:
 python scripts/visibility.py --skin.path skin.json
 """
 

@@ -310,7 +310,7 @@ def test_it_runs_a_study(egoskin: Installed, run: str):
     report = egoskin.folder / "study" / "report" / "report.md"
     assert "tiny" in report.read_text()
     error = egoskin.run("egoskin", "study", "adopt", "study", run, status=2)
-    assert "no run of this study" in error
+    assert "is not a run of this study" in error
 
 
 def test_what_it_exports_runs_without_pytorch(egoskin: Installed, run: str):

@@ -125,7 +125,7 @@ def _page() -> str:
             "",
             *lines,
             "",
-            "egoskin COMMAND --help tells more of a command. For example:",
+            "egoskin COMMAND --help describes a command. For example:",
             "",
             "  egoskin evaluate field_proximity --episodes 256",
             "  egoskin film field_proximity --longest-of 16 --out dodge.mp4",

@@ -88,7 +88,7 @@ class EvaluateConfig:
             raise ValueError("engine mujoco simulates on the CPU: leave out device")
         if self.engine == "warp" and (self.behaviour or self.map or self.perturbed):
             raise ValueError(
-                "behaviour, map and perturbed are played by engine mujoco alone"
+                "behaviour, map and perturbed are only available with engine mujoco"
             )
 
     @property
@@ -155,7 +155,7 @@ def behaviour_table(result: Behaviour) -> str:
             f"    mechanical power {waiting.power:7.1f} W",
             f"    fallen           {share(waiting.fallen)}",
         ]
-    lines += ["", "  way from the start     mean   a tenth exceeds  base height     of"]
+    lines += ["", "  distance from start    mean   90th percentile  base height     of"]
     for way in result.displacement:
         lines.append(
             f"    after {way.age:g} s       {_metres(way.mean):>8} "
@@ -285,7 +285,7 @@ def main(args: list[str]) -> None:
     if checked is not None:
         print("\n" + table(checked, title + physics_rate(finer), age))
         lost = 100 * (result.success.mean - checked.success.mean)
-        print(f"  success lost by the other physics rate: {lost:.2f} points")
+        print(f"  success lost with the other physics rate: {lost:.2f} points")
         content["check_substeps"] = config.check_substeps
         content["checked"] = dataclasses.asdict(checked)
     if config.perturbed:

@@ -53,4 +53,4 @@ def main(args: list[str]) -> None:
     for part in parts:
         age = f", {part['age']} steps before" if part["age"] else ""
         print(f"  {part['name']:<16} {part['width']:5} {part['unit']}{age}")
-    print(f"as PyTorch's to {difference:.1e} x max(1, |action|)")
+    print(f"equal to PyTorch within {difference:.1e} x max(1, |action|)")

@@ -21,7 +21,7 @@ Train a robot to dodge balls with a skin of proximity sensors.
   --robot NAME|PATH       h1_2, g1, or your own: a folder with robot.toml, or
                           my_robot.py:ROBOT (h1_2)
   --standard {2,1,paper}  version of the throws; see docs/standard-throw.md
-  --seed INT              of everything random (0)
+  --seed INT              seed of all random numbers (0)
   --total-frames INT      environment steps of the whole run (65536000)
   --run-dir PATH          folder of the run; else a new one under runs/
   --resume PATH           run folder to resume, bit for bit
@@ -47,7 +47,7 @@ Evaluate a policy on a fixed set of held-out throws.
   --perturbed             also with other masses, friction, gains, delays, pushes
   --map PATH              picture of success against speed, tempo, height, direction
   --check-substeps INT    also with finer physics (8: 480 Hz)
-  --json PATH             file to write the figures to
+  --json PATH             JSON file to write the results to
 
   egoskin evaluate field_proximity --episodes 256
   egoskin evaluate runs/NAME --mask
@@ -57,10 +57,10 @@ Evaluate a policy on a fixed set of held-out throws.
 See a policy in the browser, and throw balls at it; or a skin, or a robot.
 
   POLICY ...              run folder (followed while it trains), checkpoint, policy
-                          file, or a policy of the package; two stand side by side
+                          file, or a policy of the package; two are shown side by side
   --skin PATH             a skin file on its robot, without a policy
   --robot NAME            a robot without a policy: its name, or an MJCF or URDF
-  --port INT              port of this machine, 127.0.0.1; 0: any that is free (8080)
+  --port INT              local port, on 127.0.0.1; 0: any free port (8080)
 
   egoskin view field_proximity
   egoskin view runs/NAME runs/OTHER
@@ -73,7 +73,7 @@ Film an episode of a policy, with a contact sheet of its moments.
                           package; none: the robot holds its default pose
   --out PATH              film to write, .mp4 or .gif (episode.mp4)
   --longest-of INT        film the longest of this many episodes (1)
-  --episode INT           which episode of the throw set (0)
+  --episode INT           index of the episode in the throw set (0)
   --throw-set INT         seed of the throw set (0)
   --standard {2,1,paper,run}
                           version of the throws (2)
@@ -92,13 +92,13 @@ Place, import, export and show skins.
   egoskin skin place --method poisson_disk --num-sensors 48 --out my.json
                           sensors spread over a robot's surface
   egoskin skin import shell.csv --out my.json
-                          an export of GenTact's (CSV, xacro, URDF)
+                          a skin file from GenTact's exports (CSV, xacro, URDF)
   egoskin skin export my.json --out my.csv
                           a skin file as GenTact's CSV
   egoskin skin show my.json --picture my.png
                           what is in a skin file, and its picture
 
-egoskin skin place --help lists the options of place, and so for each.
+egoskin skin place --help lists the options of place; likewise for the others.
 """,
     "robot": """\
 Check a robot before training; docs/your-robot.md says how to bring your own.
@@ -115,15 +115,15 @@ Show what a skin sees of the throws; no training is needed.
 
   --skin.path PATH        skin file; else 64 random sensors
   --skin.num-sensors INT  number of sensors to place (64)
-  --robot NAME            the robot, or where yours is (h1_2)
+  --robot NAME|PATH       the robot (h1_2)
   --coverages {field,ray} ...
                           coverages compared (field ray)
   --ranges FLOAT ...      ranges compared [m] (0.2 0.5 1.0 2.0)
   --occlusion             the robot's own body hides what lies behind it
-  --num-throws INT        throws followed (2000)
+  --num-throws INT        number of throws (2000)
   --seed INT              of the throws and of the points on the surface (0)
   --out PATH              picture to write (visibility.png)
-  --json PATH             all figures, to write (visibility.json)
+  --json PATH             JSON file to write all results to (visibility.json)
 
   egoskin visibility --skin.path my.json --out my.png
   egoskin visibility --ranges 0.5 1 --occlusion
@@ -140,7 +140,7 @@ Search for what the body could still do when a ball comes within reach.
   --search.samples INT    plans tried in each iteration (128)
   --search.iterations INT iterations of the search (20)
   --search.seed INT       seed of the plans drawn (0)
-  --json PATH             file to write the figures to
+  --json PATH             JSON file to write the results to
 
   egoskin upper-bound field_proximity --ball 2
 """,
@@ -165,10 +165,10 @@ Run a study: trainings that differ in a few fields, over several seeds.
   egoskin study slurm studies/findings > study.sh
                           a job array for Slurm
   egoskin study adopt studies/findings runs/NAME
-                          take in an existing run
+                          add an existing run
 
 A study is paper, paper-1000, findings, smoke, or a JSON file. egoskin study run --help
-lists the options of run, and so for each.
+lists the options of run; likewise for the others.
 """,
     "export": """\
 Write a policy as ONNX, for a robot without PyTorch; docs/deploy.md says how to run it.
@@ -201,9 +201,9 @@ Measure speed and accuracy.
   egoskin bench accuracy  the physics against a finer rate
   egoskin bench gradients --run runs/NAME
                           the actor's gradients of several rollouts, compared
-  egoskin bench gymnasium Gymnasium's forms of the environment
+  egoskin bench gymnasium the Gymnasium interfaces of the environment
 
-egoskin bench loop --help lists the options of loop, and so for each.
+egoskin bench loop --help lists the options of loop; likewise for the others.
 """,
 }
 """Text by command."""

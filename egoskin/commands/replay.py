@@ -38,7 +38,7 @@ def load(path: Path) -> tuple[PPO, TensorDict, dict[str, Any]]:
     """
     tensors, header = load_tensors(path)
     if "error" not in header:
-        raise ValueError(f"{path} is no dump of an update: it names no error")
+        raise ValueError(f"{path} is not a dump of an update: it has no error")
     spec = PolicySpec.from_header(header["policy"], str(path))
     agent = spec.build_agent()
     load_agent_tensors(agent, part("agent", tensors), str(path))
@@ -104,5 +104,5 @@ def main(args: list[str]) -> None:
     for number, text in enumerate(found):
         print(f"{'first:' if number == 0 else '      '} {text}")
     if error is None:
-        raise SystemExit("the step is finite here: not the same machine or versions?")
+        raise SystemExit("the step is finite here: the machine or versions may differ")
     print(f"again:    {error}")

@@ -80,8 +80,8 @@ class Check:
             print(f"{self.out}: the robot with its skin")
         if wrong:
             raise ValueError(
-                f"{robot.name} cannot be trained: {counted(wrong, 'thing')} above must "
-                "be mended"
+                f"{robot.name} cannot be trained: fix the {counted(wrong, 'error')} "
+                "above"
             )
 
 
@@ -95,7 +95,7 @@ def findings(robot: RobotConfig, skin: SkinConfig) -> Iterator[Finding]:
     static = [*_joints(robot), *_feet(robot), *_skin(robot, skin)]
     yield from static
     if any(finding.kind == "wrong" for finding in static):
-        yield Finding("note", "whether it stands is told once that is mended")
+        yield Finding("note", "whether it stands is tested once this is fixed")
         return
     yield from _actuation(robot)
     yield from _standing(robot)
@@ -118,13 +118,13 @@ def _joints(robot: RobotConfig) -> Iterator[Finding]:
     if without:
         yield Finding(
             "wrong",
-            f"no torque limit: {without}; say actuatorfrcrange of the joint (URDF: "
+            f"no torque limit: {without}; set actuatorfrcrange of the joint (URDF: "
             "effort of its limit)",
         )
     low, high = robot.joint_range
     if without := _names(robot, low >= high):
         yield Finding(
-            "note", f"no range: {without}; nothing stops them but their own shapes"
+            "note", f"no range: {without}; only their collision shapes limit them"
         )
     pose = robot.default_joint_pos
     outside = _names(robot, (low < high) & ((pose < low) | (pose > high)))
@@ -140,12 +140,12 @@ def _names(robot: RobotConfig, which: np.ndarray) -> str:
 def _feet(robot: RobotConfig) -> Iterator[Finding]:
     """Check the feet and the links that touch the ground."""
     if not robot.feet:
-        yield Finding("wrong", "no feet: to touch the floor with anything is a fall")
+        yield Finding("wrong", "no feet: any contact with the floor counts as a fall")
     if missing := sorted({*robot.feet} - {*robot.links}):
-        yield Finding("wrong", f"feet that are no links: {', '.join(missing)}")
+        yield Finding("wrong", f"feet that are not links: {', '.join(missing)}")
     try:
         if not robot.primitives:
-            yield Finding("wrong", "no shape touches anything")
+            yield Finding("wrong", "no collision shapes")
             return
         base, tall = robot.default_base_height, robot.standing_height
     except ValueError as error:
@@ -155,7 +155,7 @@ def _feet(robot: RobotConfig) -> Iterator[Finding]:
     kind = "ok" if lowest in robot.feet else "wrong"
     yield Finding(
         kind,
-        f"it stands on {lowest}{'' if kind == 'ok' else ', which is no foot'}: "
+        f"it stands on {lowest}{'' if kind == 'ok' else ', which is not a foot'}: "
         f"{tall:.2f} m tall, its base {base:.2f} m up",
     )
 
@@ -163,11 +163,11 @@ def _feet(robot: RobotConfig) -> Iterator[Finding]:
 def _skin(robot: RobotConfig, skin: SkinConfig) -> Iterator[Finding]:
     """Check the links that carry sensors, at which the throws are aimed."""
     if not robot.skin_links:
-        yield Finding("wrong", "no skin_links: no sensor sits, no ball is aimed there")
+        yield Finding("wrong", "no skin_links to place sensors on and to aim balls at")
         return
     for name in ("skin_links", "untargeted_links"):
         if missing := sorted({*getattr(robot, name)} - {*robot.links}):
-            yield Finding("wrong", f"{name} that are no links: {', '.join(missing)}")
+            yield Finding("wrong", f"{name} that are not links: {', '.join(missing)}")
             return
     try:
         made = skin.build(robot)
@@ -192,8 +192,8 @@ def _actuation(robot: RobotConfig) -> Iterator[Finding]:
         if small := _names(robot, reach < _SMALL_REACH):
             yield Finding(
                 "note",
-                f"... by less than {_SMALL_REACH:g} rad: {small}; stiff for their "
-                "torque limit, a policy will hardly move them",
+                f"... by less than {_SMALL_REACH:g} rad: {small}; too stiff for their "
+                "torque limit, a policy can hardly move them",
             )
 
 
@@ -227,12 +227,12 @@ def _standing(robot: RobotConfig) -> Iterator[Finding]:
         else:
             yield Finding("ok", f"gains {name}: it stands for {_STAND_S:g} s by itself")
         if touched:
-            yield Finding("note", "in its default pose it touches itself")
+            yield Finding("note", "it touches itself in its default pose")
         if fell < 0.5:
             yield Finding(
                 "wrong",
                 f"gains {name}: it falls within {fell:.2f} s, before it can learn: "
-                "look at the default pose and the feet",
+                "check the default pose and the feet",
             )
         elif math.isfinite(fell):
             yield Finding(

@@ -158,7 +158,7 @@ class Import:
         skin.save(self.out)
         print(table(skin, str(self.out)))
         for name in skin.provenance.get("unused_link_map", ()):
-            print(f"remark: no file needs {name!r} of --link-map")
+            print(f"note: no file uses {name!r} of --link-map")
         for text in skin.provenance.get("left_out", ()):
             print(f"left out: {text}")
         files = skin.provenance.get("files", [skin.provenance])
@@ -166,8 +166,8 @@ class Import:
         off = max(abs(end) for extent in extents for end in extent)
         if off > _FAR_OFF:
             print(
-                f"warning: a sensor is {off:.2f} m off the robot's surface: is it the "
-                "right --scale and --link-map? Look at: egoskin skin "
+                f"warning: a sensor is {off:.2f} m off the robot's surface: check "
+                "--scale and --link-map, and look at the picture of: egoskin skin "
                 f"show {self.out} --picture skin.png"
             )
 
@@ -226,8 +226,8 @@ class Show:
         if self.picture is not None:
             if robot is None:
                 raise ValueError(
-                    f"{self.skin} is for the robot {skin.robot!r}: say where it is, "
-                    "--robot PATH"
+                    f"{self.skin} is for the robot {skin.robot!r}: give its path "
+                    "with --robot PATH"
                 )
             save_picture(self.picture, views(robot, skin))
 

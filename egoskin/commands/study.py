@@ -55,7 +55,7 @@ def find_study(name: str) -> Manifest:
         return resolve(STUDIES[name])
     if not name.endswith(".json"):
         raise ValueError(
-            f"no study {name!r}; there are {', '.join(STUDIES)}, or name a .json file"
+            f"no study {name!r} (valid: {', '.join(STUDIES)}, or a .json file)"
         )
     if not Path(name).is_file():
         raise ValueError(f"there is no file {name}")
@@ -114,11 +114,11 @@ class Plan:
         total = cost(manifest, per_s)
         print(
             f"{total.runs} runs, {total.frames / 1e6:,.1f} M frames, "
-            f"{total.core_s / 3600:,.1f} core-hours ({per_s:,.0f} steps/s and core, "
+            f"{total.core_s / 3600:,.1f} core-hours ({per_s:,.0f} steps/s per core, "
             f"{source}):\n"
             f"  {duration(total.wall_s(cores))} on the {counted(cores, 'core')} here, "
             f"{duration(total.wall_s(_MANY_CORES))} on {_MANY_CORES}; evaluation adds "
-            f"minutes a run\n"
+            f"minutes per run\n"
             f"  {total.disk / 1e9:,.2f} GB of disk"
         )
         if self.visibility:
@@ -138,10 +138,10 @@ def describe(manifest: Manifest) -> None:
     for cell in manifest.cells:
         own = manifest.overrides(cell).items()
         text = ", ".join(f"{k.removeprefix('env.')}={brief(v)}" for k, v in own)
-        print(f"  {cell.name:<32} {text or 'nothing else'}")
+        print(f"  {cell.name:<32} {text or 'no other changes'}")
     seeds = ", ".join(map(str, manifest.seeds))
     print(
-        f"  seeds {seeds}; judged on standard {manifest.evaluation.standard}, throw "
+        f"  seeds {seeds}; evaluated on standard {manifest.evaluation.standard}, throw "
         f"set {manifest.evaluation.throw_set} of {manifest.evaluation.episodes}"
     )
 
@@ -152,7 +152,7 @@ def what_is_seen(manifest: Manifest) -> dict[str, Any]:
         c.config.env.sensor for c in manifest.cells if c.config.env.sensor.uses_skin
     ]
     if not sensors:
-        print("no cell has a skin: nothing is seen")
+        print("no cell has a skin: there is no visibility to analyse")
         return {}
     base = manifest.base.env
     analysis = analyse(
@@ -165,7 +165,7 @@ def what_is_seen(manifest: Manifest) -> dict[str, Any]:
         control_period=1 / base.task.physics.control_hz,
     )
     report = analysis.report()
-    print("before any training: of the thrown balls that hit a standing robot")
+    print("visibility of the thrown balls that hit a standing robot, without training:")
     for cell, row in zip(analysis.cells, report["cells"], strict=True):
         warning = row["warning"]
         times = [warning[key] for key in ("5%", "median", "95%")]
@@ -176,7 +176,7 @@ def what_is_seen(manifest: Manifest) -> dict[str, Any]:
     for a, one in enumerate(analysis.cells):
         for b, other in enumerate(analysis.cells[:a]):
             if shares and shares[a][b] < _ALIKE:
-                print(f"  {other} and {one} see alike")
+                print(f"  {other} and {one} see the same")
     return {"config": to_plain(base), **report}
 
 
@@ -379,7 +379,7 @@ class Adopt:
         folder = StudyFolder(self.dir)
         manifest = folder.manifest()
         for source in self.runs:
-            print(f"{source} is {folder.adopt(manifest, source).name}")
+            print(f"{source} adopted as {folder.adopt(manifest, source).name}")
 
 
 def main(args: list[str]) -> None:

@@ -69,7 +69,7 @@ def announce(trainer: Trainer) -> None:
         where = f"MuJoCo Warp, {config.device}"
     elif to_do > _SOON_DONE:
         seconds = estimate_seconds(config, trainer.run.load_skin(), to_do)
-        time = f"; here about {_rough_time(seconds)}"
+        time = f"; about {_rough_time(seconds)} on this machine"
     print(
         f"{to_do:,} frames{f' after {done:,}' if done else ''}: "
         f"{counted(config.num_envs, 'agent')} on {where}, "
@@ -100,7 +100,7 @@ def what_came_out(trainer: Trainer, metrics: Mapping[str, float]) -> str:
     path, task = trainer.run.path, trainer.config.env.task
     told = f"done: {trainer.frames:,} frames"
     if metrics:
-        told += f" in {clock(metrics['time/wall_s'])}; while exploring "
+        told += f" in {clock(metrics['time/wall_s'])}; with exploration "
         # NaN if no episode could last long enough.
         if not math.isnan(success := metrics["episode/success"]):
             told += f"{success:.1%} untouched for {task.success_s:g} s, "
@@ -109,7 +109,7 @@ def what_came_out(trainer: Trainer, metrics: Mapping[str, float]) -> str:
         f"{told}\n"
         f"evaluate it with: egoskin evaluate {path}\n"
         f"film it with:     egoskin film {path} --longest-of 16\n"
-        f"see it in a page: egoskin view {path}"
+        f"view it with:     egoskin view {path}"
     )
 
 

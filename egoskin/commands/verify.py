@@ -118,7 +118,7 @@ class VerifyConfig:
             raise ValueError(f"iterations must be at least 2, got {self.iterations}")
         if self.num_envs < 16 or self.num_envs % 4:
             raise ValueError(
-                f"num_envs must be a multiple of 4 from 16 on, got {self.num_envs}"
+                f"num_envs must be a multiple of 4, at least 16, got {self.num_envs}"
             )
 
     @property
@@ -195,7 +195,7 @@ def agree(config: TrainConfig, folder: Path, title: str, half: int) -> bool:
     _, first, then = machines
     rollouts = counted(half, "rollout")
     value = resumed(at("resumed"), half, first, then)
-    show(value, f"the second, gone on with after {rollouts} as the third")
+    show(value, f"the second, resumed after {rollouts} as the third")
     return len(set(hashes)) == 1
 
 

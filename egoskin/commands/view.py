@@ -30,7 +30,7 @@ class ViewConfig:
 
     policies: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
     """Run folder (followed while it trains), checkpoint, policy file, or the name of a
-    policy that comes with the package; two stand side by side with the same throws.
+    policy that comes with the package; two are shown side by side with the same throws.
     Without any, field_proximity."""
     skin: Path | None = None
     """A skin file, shown on its robot without a policy."""
@@ -64,7 +64,7 @@ def main(args: list[str]) -> None:
     else:
         page = _skin_page(config)
     try:
-        print(f"{page.address}   (Ctrl-C ends it)", flush=True)
+        print(f"{page.address}   (Ctrl-C to stop)", flush=True)
         page.run()
     finally:
         page.close()
@@ -86,7 +86,7 @@ def _skin_page(config: ViewConfig) -> SkinPage:
         name = skin.robot
         if name not in ROBOTS:
             raise ValueError(
-                f"{config.skin} is for the robot {name!r}: say where it is, --robot "
+                f"{config.skin} is for the robot {name!r}: give its path with --robot "
                 "PATH of its MJCF or URDF"
             )
     return SkinPage(find_robot(name), skin, config.port)

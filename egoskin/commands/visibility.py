@@ -122,7 +122,7 @@ def print_table(analysis: Analysis, report: dict[str, Any]) -> None:
             share = report["differing_share"][a][b]
             if share < ALIKE:
                 print(
-                    f"{other} and {one} see alike: {share:.1%} of the warnings "
+                    f"{other} and {one} see the same: {share:.1%} of the warnings "
                     "differ by more than a control step"
                 )
 
@@ -256,8 +256,8 @@ def main(args: list[str]) -> None:
     verb = "sees" if len(skin) == 1 else "see"
     title = f"What {counted(len(skin), 'sensor')} on {robot.name} {verb}"
     if config.occlusion:
-        title += ", its body in the way"
+        title += ", occluded by its body"
     figure = draw(analysis, report, title)
     figure.savefig(config.out, dpi=110)
     plt.close(figure)
-    print(f"picture {config.out}, figures {config.json}")
+    print(f"picture {config.out}, results {config.json}")

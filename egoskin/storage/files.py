@@ -97,8 +97,8 @@ def _check(status: os.stat_result, path: Path | str, limit: int) -> None:
     """Raise ValueError unless the status is of a regular file of bounded size."""
     if not stat.S_ISREG(status.st_mode):
         kind = _KINDS.get(stat.S_IFMT(status.st_mode), "something else")
-        raise ValueError(f"{path} must be a file, and is {kind}")
+        raise ValueError(f"{path} must be a file, but is {kind}")
     if status.st_size > limit:
         raise ValueError(
-            f"{path} must have at most {limit:,} bytes, and has {status.st_size:,}"
+            f"{path} must have at most {limit:,} bytes, but has {status.st_size:,}"
         )

@@ -174,19 +174,19 @@ def unseal(
     """
     number = content.get("format", 1)
     if not isinstance(number, int) or number < 1:
-        raise ValueError(f"{what} is damaged: its format is {number!r}")
+        raise ValueError(f"{what} is damaged: its format number is {number!r}")
     if number > FORMAT:
         raise ValueError(
-            f"{what} has format {number}, and this egoskin "
-            f"({package_version('egoskin')}) reads formats up to {FORMAT}: it needs "
-            f"egoskin {content.get('egoskin')} or a later one"
+            f"{what} has format {number}, but this egoskin "
+            f"({package_version('egoskin')}) reads formats up to {FORMAT}: use "
+            f"egoskin {content.get('egoskin')} or later"
         )
     given = {key: value for key, value in content.items() if key != "sha256"}
     if "sha256" in content:
         if content_hash(given, tensors) != content["sha256"]:
             raise ValueError(
-                f"{what} is damaged or was edited: its content is not that of its "
-                "SHA-256; put it back as it was written"
+                f"{what} is damaged or was edited: its content does not match its "
+                "SHA-256; restore the original file"
             )
     elif number > 1:
         raise ValueError(f"{what} is damaged or was edited: its SHA-256 is missing")
@@ -199,8 +199,8 @@ def unseal(
 def _note(what: str) -> None:
     """Print, once for each file, that it cannot be verified."""
     print(
-        f"note: {what} is of an egoskin without checksums: whether it is whole cannot "
-        "be verified",
+        f"note: {what} was written by an egoskin without checksums: its integrity "
+        "cannot be verified",
         file=sys.stderr,
     )
 
@@ -280,7 +280,7 @@ def present_config(config: Mapping[str, Any], number: int, what: str) -> dict[st
     present, retired = migrate(config, number)
     for name, value in retired.items():
         raise ValueError(
-            f"{what} was made with {name}={value}, an option that is no more: use the "
+            f"{what} was made with {name}={value}, an option that was removed: use the "
             "egoskin that made it"
         )
     return present

@@ -30,7 +30,7 @@ def read_json(path: Path) -> Any:
     try:
         value = json.loads(content)
         if _depth(value) > _DEEPEST:
-            raise ValueError(f"it is nested more than {_DEEPEST} deep")
+            raise ValueError(f"it is nested more than {_DEEPEST} levels deep")
         return value
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not JSON: {error}") from error
@@ -104,7 +104,7 @@ def _float(value: Any) -> Any:
     try:
         return float(value) if whole or value in ("inf", "-inf") else value
     except OverflowError as error:
-        raise ValueError("a number of hundreds of digits is none that fits") from error
+        raise ValueError("a number with hundreds of digits is out of range") from error
 
 
 def _path(value: Any) -> Any:

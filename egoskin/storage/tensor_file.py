@@ -122,7 +122,7 @@ def load_tensors(
             tensors = {key: file.get_tensor(key) for key in file.keys()}
     except SafetensorError as error:
         raise ValueError(
-            f"{path} is truncated or no checkpoint of egoskin ({error})"
+            f"{path} is truncated or not an egoskin checkpoint ({error})"
         ) from error
     if _HEADER not in metadata:
         raise ValueError(f"{path} was not written by egoskin")
@@ -131,7 +131,7 @@ def load_tensors(
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is damaged: its header is not JSON") from error
     if not isinstance(header, dict):
-        raise ValueError(f"{path} is damaged: its header is no object")
+        raise ValueError(f"{path} is damaged: its header is not a JSON object")
     header, number = unseal(header, str(path), tensors, quiet=quiet)
     return tensors, present_header(header, number, str(path))
 

@@ -353,7 +353,7 @@ def equivalence(manifest: Manifest, table: Table) -> Figure | None:
         ]
     )
     axes.set_xlim(-1.1 * reach - MARGIN, 1.1 * reach + MARGIN)
-    axes.set_xlabel("difference of the success at 3 s [percentage points]")
+    axes.set_xlabel("difference in success at 3 s [percentage points]")
     axes.spines[["top", "right", "left"]].set_visible(False)
     axes.tick_params(axis="y", length=0)
     return figure
@@ -391,7 +391,7 @@ def sample_efficiency(manifest: Manifest, results: Sequence[Result]) -> Figure |
     axes.set_yticks(range(len(rows)), [row[0] for row in rows], fontsize=8)
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.set_xlim(left=0)
-    axes.set_xlabel("environment steps to 50 and 90 % of the run's own end [millions]")
+    axes.set_xlabel("environment steps to 50 and 90 % of final success [millions]")
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(axis="x", linewidth=0.4, alpha=0.5)
     return figure

@@ -222,7 +222,8 @@ FINDINGS = (
     Finding(
         label="6b",
         text="Field proximity beyond 1 m converges in under 1000 of 3000 epochs",
-        stand_in="at 2 m it reaches 90 % of its own end within a third of our budget",
+        stand_in="at 2 m it reaches 90 % of its final success within a third of our "
+        "budget",
         metric="share_to_90",
         claims=(
             Claim(

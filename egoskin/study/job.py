@@ -100,7 +100,7 @@ def work(folder: StudyFolder, name: str, stop: Stop, cores: int = 1) -> int:
                 train(trainer, lambda: stop.requested, line.update)
             if trainer.frames < planned.end:
                 return STOPPED
-        print(f"{now()} judged on {manifest.evaluation.episodes} throws", flush=True)
+        print(f"{now()} evaluate on {manifest.evaluation.episodes} throws", flush=True)
         try:
             judge_run(folder, planned, manifest.evaluation, stop.check)
         except _StoppedError:

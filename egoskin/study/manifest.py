@@ -97,10 +97,10 @@ class Study:
     def __post_init__(self) -> None:
         """Raise ValueError for an empty study or invalid values."""
         if not self.cells or not self.seeds:
-            raise ValueError(f"study {self.name}: needs at least a cell and a seed")
+            raise ValueError(f"study {self.name}: needs at least one cell and one seed")
         if not re.fullmatch(r"[\w.-]+", self.name):
             raise ValueError(
-                f"a study's name has letters, digits, '-', '_' and '.' alone, got "
+                f"a study's name may only have letters, digits, '-', '_', '.', got "
                 f"{self.name!r}"
             )
         for seed in self.seeds:
@@ -209,11 +209,11 @@ class Manifest:
             own, new = getattr(self, name), getattr(other, name)
             if own != new:
                 raise ValueError(
-                    f"the manifest's {name} cannot be changed: it is {own}, not {new}"
+                    f"the manifest's {name} cannot be changed from {own} to {new}"
                 )
         if changed := _differences(self.base, other.base):
             raise ValueError(
-                "the manifest's configuration cannot be changed; another is: "
+                "the manifest's configuration cannot be changed; it differs in "
                 + ", ".join(changed)
             )
         own = {cell.name: cell for cell in self.cells}
@@ -222,7 +222,7 @@ class Manifest:
             if before != cell:
                 names = [*_differences(before.config, cell.config)] or ["skin"]
                 raise ValueError(
-                    f"the manifest's cell {cell.name} cannot be changed; another is: "
+                    f"the manifest's cell {cell.name} cannot be changed; it differs in "
                     + ", ".join(names)
                 )
         seeds = dict.fromkeys((*self.seeds, *other.seeds))
@@ -258,8 +258,8 @@ class Manifest:
         """
         if not path.is_file():
             raise ValueError(
-                f"{path.parent} is no folder of a study: it has no {path.name} (begin "
-                "with: egoskin study plan NAME --dir FOLDER)"
+                f"{path.parent} is not a study folder: it has no {path.name} (create "
+                "one with: egoskin study plan NAME --dir FOLDER)"
             )
         content, number = read_sealed(path)
         what = str(path)
@@ -288,7 +288,7 @@ class Manifest:
                 evaluation=from_plain(EvaluationPlan, content["evaluation"], what),
             )
         except (KeyError, TypeError, AttributeError) as error:
-            raise ValueError(f"{path} is no manifest of a study: {error}") from error
+            raise ValueError(f"{path} is not a study manifest: {error}") from error
 
 
 def load_study(path: Path) -> Study:
@@ -327,7 +327,7 @@ def resolve(study: Study) -> Manifest:
             raise ValueError(f"{what}: {error}") from error
         cell = Cell(name=cell_name(base, config), config=config, skin_sha256=digest)
         if cell.name in cells:
-            raise ValueError(f"{what}: {cell.name} is there twice")
+            raise ValueError(f"{what}: cell {cell.name} is defined twice")
         cells[cell.name] = cell
     return Manifest(
         study=study.name,
@@ -357,7 +357,7 @@ def override(
     for name, value in overrides.items():
         full = _full_name(name)
         if full.split(".")[0] in fixed:
-            raise ValueError(f"{what}: {name} cannot be chosen here")
+            raise ValueError(f"{what}: {name} cannot be set here")
         try:
             if full == _ROBOT and isinstance(value, str):
                 value = kept_robot(value)

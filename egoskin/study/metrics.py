@@ -121,19 +121,19 @@ METRICS = (
     ),
     Metric(
         name="m_frames_to_50",
-        label="frames to 50 % of its own end",
+        label="frames to 50 % of its final success",
         unit="M frames",
         of=_millions(0.5),
     ),
     Metric(
         name="m_frames_to_90",
-        label="frames to 90 % of its own end",
+        label="frames to 90 % of its final success",
         unit="M frames",
         of=_millions(0.9),
     ),
     Metric(
         name="share_to_90",
-        label="share of the budget to 90 % of its own end",
+        label="share of the budget to 90 % of its final success",
         unit="%",
         of=_share_to_90,
     ),

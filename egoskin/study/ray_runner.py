@@ -66,7 +66,7 @@ def connect(address: str) -> int:
         )
     except (OSError, ValueError, RuntimeError) as error:
         raise ValueError(
-            f"no Ray cluster at {address!r} ({_lines(error)[0]}); begin one with: "
+            f"no Ray cluster at {address!r} ({_lines(error)[0]}); start one with: "
             "ray start --head"
         ) from None
     finally:
@@ -89,7 +89,7 @@ class RayRunner(Runner):
         if self._cores > max(cores, default=0):
             raise ValueError(
                 f"--cores-per-run {self._cores}: the nodes of the cluster have "
-                f"{', '.join(map(str, cores))} cores, and a run needs one node"
+                f"{', '.join(map(str, cores))} cores, but a run must fit on one"
             )
         self._tasks: dict[str, ray.ObjectRef] = {}
 
@@ -153,7 +153,7 @@ def _work(path: str, name: str, nice: int, cores: int) -> tuple[int, str]:
     folder = StudyFolder(Path(path))
     if not folder.manifest_path.is_file():
         node = ray.util.get_node_ip_address()
-        return FAILED, f"node {node} does not see {path}: all nodes need the folder"
+        return FAILED, f"node {node} has no access to {path}: share the folder"
     with _Cancel() as cancel:
         job = start_job(folder, name, nice, cores)
         try:

@@ -110,26 +110,27 @@ def _pictures(
     drawn = {
         "success-by-range": (
             success_by_range(manifest, success),
-            "Success against range: interquartile mean and range over seeds, each seed "
-            "a dot.",
+            "Success against range: interquartile mean and range over seeds; each dot "
+            "is a seed.",
         ),
         "findings": (
             forest(judged) if judged else None,
-            "The findings. Shaded: where each claim says that its effect lies; 90 % "
-            "(thick) and 95 % (thin) intervals; hollow: one seed, no interval.",
+            "The findings. Shaded: the region claimed for each effect; 90 % (thick) "
+            "and 95 % (thin) intervals; hollow: one seed, no interval.",
         ),
         "equivalence": (
             equivalence(manifest, success),
-            "Which signals are as good as one another. Shaded: the margin of "
-            "equivalence; 90 % (thick) and 95 % (thin) intervals; hollow: one seed.",
+            "Which signals are equivalent. Shaded: the margin of equivalence; 90 % "
+            "(thick) and 95 % (thin) intervals; hollow: one seed.",
         ),
         "learning-curves": (
             learning_curves(manifest, results),
-            "Success in training, exploration on: each seed thin, their mean thick.",
+            "Success in training, with exploration. Thin: each seed; thick: their "
+            "mean.",
         ),
         "sample-efficiency": (
             sample_efficiency(manifest, results),
-            "How soon a run reaches 50 and 90 % of its own end.",
+            "Environment steps until a run reaches 50 and 90 % of its final success.",
         ),
     }
     return {k: (f, text) for k, (f, text) in drawn.items() if f is not None}
@@ -147,12 +148,12 @@ def _blocks(
     yield Heading(f"Study {manifest.study}")
     yield Text(
         f"{manifest.purpose[0].upper()}{manifest.purpose[1:]}. {len(results)} of "
-        f"{total} runs are done. Judged on standard {plan.standard}, throw set "
-        f"{plan.throw_set} of {plan.episodes:,} sequences, mean action. The unit is "
-        "the seed: intervals are over seeds, not over throws."
+        f"{total} runs are done. Evaluated on standard {plan.standard}, throw set "
+        f"{plan.throw_set} of {plan.episodes:,} sequences, with the mean action. "
+        "Intervals are over seeds, not over throws."
     )
     if not results:
-        yield Text("There is nothing to tell yet.")
+        yield Text("There are no results yet.")
         return
     if judged:
         yield Text(_answer(judged))
@@ -161,28 +162,29 @@ def _blocks(
     if judged:
         yield Heading("The findings")
         yield Text(
-            "Fixed in code before the runs. A finding is confirmed if each of its "
-            "claims lies in its region, refuted if one lies beyond; p-values are "
-            "corrected for the number of findings (Holm). Shown is the claim that "
-            "decides. *Seeds* are those it rests on and, if it is undecided, how many "
-            "in all would decide it with a power of 80 % if effect and spread stay as "
-            "observed. For findings that speak of another budget stands a stand-in."
+            "The tests were fixed in code before the runs. A finding is confirmed if "
+            "each of its claims lies in its region, and refuted if one lies outside; "
+            "p-values are corrected for the number of findings (Holm). The table shows "
+            "the deciding claim. *Seeds* is the number it is based on and, if it is "
+            "undecided, the total that would decide it with a power of 80 % if effect "
+            "and spread stay as observed. Findings about another budget are tested by "
+            "a stand-in."
         )
         yield _finding_rows(judged, results)
         yield shown["findings"]
     yield Heading("The cells")
     yield Text(
         "Interquartile mean and range over seeds; in brackets the mean with its 95 % "
-        "t interval, which one seed does not give."
+        "t interval, which needs two seeds or more."
     )
     yield _cell_rows(manifest, values)
     for name in ("equivalence", "learning-curves", "sample-efficiency"):
         if name in shown:
             yield shown[name]
-    yield Heading("Which metric tells cells apart")
+    yield Heading("How well each metric separates the cells")
     yield Text(
-        "Standard deviation between cells over that between the seeds of a cell: at 1 "
-        "two cells differ about as much as two seeds of one."
+        "Standard deviation between cells divided by that between the seeds of a cell: "
+        "at 1, two cells differ about as much as two seeds of one cell."
     )
     ratios = [(separation(values[m.name]), m) for m in METRICS]
     known = sorted((r for r in ratios if r[0] >= 0), key=lambda r: -r[0])
@@ -194,20 +196,20 @@ def _blocks(
         yield Text("Unknown: no cell has two seeds that differ.")
     seen = folder.path / "visibility.json"
     if seen.is_file():
-        yield Heading("What is seen before any training")
+        yield Heading("What the skins see, without training")
         yield _seen_rows(read_json(seen))
-    yield Heading("What is missing")
+    yield Heading("Missing runs")
     missing = [s for s in folder.status(manifest) if s.state != "done"]
-    yield Text(", ".join(map(_missing, missing)) or "Nothing: all runs are done.")
+    yield Text(", ".join(map(_missing, missing)) or "None: all runs are done.")
     yield Heading("The runs")
     default = manifest.not_default().items()
     yield Text(
-        "Not the default in all of them: "
+        "Settings that differ from the default, in all runs: "
         + (
             ", ".join(f"{k.removeprefix('env.')} = {brief(v)}" for k, v in default)
-            or "nothing"
+            or "none"
         )
-        + ". All figures in full precision: runs.csv."
+        + ". All values in full precision: runs.csv."
     )
     yield Rows(
         ("run", "success at 3 s", "wall time", "commit", "machine"),

@@ -257,9 +257,9 @@ def slurm_script(
     logs = shlex.quote(str(folder / "logs" / "slurm-%A-%a.log"))
     path = shlex.quote(str(folder))
     return f"""#!/bin/bash
-# Study {manifest.study}: {len(manifest.runs)} runs that all elements share.
-# An element that reaches its time limit stops with checkpoints, and one that is lost
-# loses a minute: submit this again as long as `status` says that runs are missing.
+# Study {manifest.study}: {len(manifest.runs)} runs, shared by all elements.
+# An element that reaches its time limit stops with checkpoints; one that is killed
+# loses a minute of work. Submit this again until `status` shows no missing runs.
 #SBATCH --job-name=egoskin-{manifest.study}
 #SBATCH --array=0-{elements - 1}
 #SBATCH --nodes=1

@@ -175,8 +175,8 @@ class StudyFolder:
         if not path.exists():
             if path.is_symlink():
                 raise ValueError(
-                    f"{path} is a link to {os.readlink(path)}, which is not there: put "
-                    "it back, or remove the link to train the run anew"
+                    f"{path} is a link to {os.readlink(path)}, which does not exist: "
+                    "restore it, or remove the link to train the run again"
                 )
             # Renamed when complete: no incomplete folder has the run's name.
             new = path.with_name(f".{planned.name}.new")
@@ -186,13 +186,13 @@ class StudyFolder:
         stored = Run.open(path).config
         if differs := planned.differences(stored):
             raise ValueError(
-                f"{path} is another run than the manifest's: it differs in "
+                f"{path} does not match the manifest: it differs in "
                 + ", ".join(differs)
             )
         if stored.total_frames > config.total_frames:
             raise ValueError(
                 f"{path} is planned for {stored.total_frames:,} frames, the study for "
-                f"{config.total_frames:,}: a longer run is another one"
+                f"{config.total_frames:,}: a longer run is a different run"
             )
         run = Run(
             path,
@@ -202,8 +202,8 @@ class StudyFolder:
         if content_hash(read_json(run.skin_path)) != planned.cell.skin_sha256:
             raise ValueError(
                 f"{run.skin_path} is not the skin of the study's cell "
-                f"{planned.cell.name}: its file, or where this version of egoskin "
-                "places sensors, has changed"
+                f"{planned.cell.name}: the skin file or the placement of sensors in "
+                "this version of egoskin has changed"
             )
         return run
 
@@ -276,19 +276,19 @@ class StudyFolder:
         stored = load_run(folder)
         if differs := planned.differences(stored.config):
             raise ValueError(
-                f"{folder} is another run than the manifest's: it differs in "
+                f"{folder} does not match the manifest: it differs in "
                 + ", ".join(differs)
             )
         (file,) = folder.glob(_EVALUATION)
         evaluation = stored.evaluation
         if evaluation["frames"] != planned.end:
             raise ValueError(
-                f"{file} is of a policy of {evaluation['frames']:,} frames, not of "
-                f"{planned.end:,}"
+                f"{file} evaluates a policy of {evaluation['frames']:,} frames, "
+                f"expected {planned.end:,}"
             )
         digest = policy_hash(folder / "policies" / f"{planned.end:012d}.safetensors")
         if digest != evaluation["policy_sha256"]:
-            raise ValueError(f"{file} is of another policy than the one beside it")
+            raise ValueError(f"{file} does not belong to the policy stored with it")
         return Result(run=planned, stored=stored, policy_sha256=digest)
 
     def results(self, manifest: Manifest) -> list[Result]:
@@ -376,12 +376,12 @@ class StudyFolder:
         run = min(manifest.runs, key=lambda run: len(differs[run]))
         if differs[run]:
             raise ValueError(
-                f"{source} is no run of this study; the closest, {run.name}, differs "
-                f"in {', '.join(differs[run])}"
+                f"{source} is not a run of this study; the closest, {run.name}, "
+                f"differs in {', '.join(differs[run])}"
             )
         path = self.run_path(run.name)
         if os.path.lexists(path):
-            raise ValueError(f"{path} is there already")
+            raise ValueError(f"{path} already exists")
         path.parent.mkdir(parents=True, exist_ok=True)
         path.symlink_to(source.resolve(), target_is_directory=True)
         try:

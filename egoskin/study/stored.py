@@ -159,9 +159,9 @@ def load_run(path: Path) -> StoredRun:
     evaluations = sorted(path.glob("evaluation_*.json"))
     for file in (path / "config.json", what, path / "metrics.csv"):
         if not file.is_file():
-            raise ValueError(f"{path} is not whole: it has no {file.name}")
+            raise ValueError(f"{path} is incomplete: it has no {file.name}")
     if not evaluations:
-        raise ValueError(f"{path} is not whole: it has no evaluation")
+        raise ValueError(f"{path} is incomplete: it has no evaluation")
     with open(path / "metrics.csv", newline="") as source:
         rows = list(csv.DictReader(source))
     curve = np.array(

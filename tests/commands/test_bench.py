@@ -1,4 +1,4 @@
-"""Benchmarks: their rows, and that they leave alone what they measure."""
+"""Benchmarks: their rows, and that they do not change the runs they measure."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_bench_loop_gives_its_rows(tmp_path: Path):
         assert by_name[name]["value"] > 0
     assert rows[0]["name"] == "raw"
     assert rows[0]["ratio"] == 1.0
-    # The parts of the wall time are what the whole of a step takes.
+    # The parts of the wall time add up to the time of a whole step.
     parts = [row["value"] for row in rows if row["name"].endswith("_wall")]
     assert len(parts) == 7
     assert sum(parts) == pytest.approx(1e6 / by_name["train_field"]["value"])

@@ -54,7 +54,7 @@ def test_a_resumed_run_equals_one_that_never_stopped(trained: Path, tmp_path: Pa
     whole, _ = load_tensors(trained / "checkpoint.safetensors")
     halves, _ = load_tensors(tmp_path / "halves" / "checkpoint.safetensors")
     assert whole.keys() == halves.keys()
-    # The log of metrics has times in it.
+    # The log of metrics contains times.
     for key in whole.keys() - {"log/metrics"}:
         assert torch.equal(whole[key], halves[key]), key
     for one, two in zip(metrics(trained), metrics(tmp_path / "halves"), strict=True):
@@ -145,8 +145,8 @@ def test_an_evaluation_says_what_the_policy_does_and_at_another_physics_rate(
     )
     assert "physics at 120 Hz" in out
     assert "physics at 480 Hz" in out
-    assert "success lost by the other physics rate" in out
-    # On the throws of its training it waits for the first.
+    assert "success lost with the other physics rate" in out
+    # With the throws of its training, the first throw comes after a delay.
     assert "before the first throw, from 0.5 s on" in out
     assert "speed at arrival" in out
     assert "mechanical power" in out
@@ -154,7 +154,7 @@ def test_an_evaluation_says_what_the_policy_does_and_at_another_physics_rate(
     assert result["check_substeps"] == 8
     assert result["checked"]["episodes"] == result["episodes"] == EPISODES
     assert 0 < result["behaviour"]["waiting"]["base_speed"] < 1
-    # Another rate is another course of events.
+    # Another rate gives other episodes.
     assert result["checked"]["survival_time"] != result["survival_time"]
     numbers = result["behaviour"]["throws"]["number of the ball"]
     assert [g["name"] for g in numbers] == ["first", "second", "third", "later"]
@@ -171,8 +171,8 @@ def test_an_evaluation_says_by_which_standard_it_judges(evaluated):
         assert result["standard"] == judged
         assert f"on standard 2; standard {judged}, throw set 0" in text
         results[standard] = result["survival_time"]
-    # It is judged by 2 as by the paper's, with the first ball at the start; on the
-    # throws of its training that comes later, and version 1 is aimed elsewhere.
+    # Standards 2 and paper give the same result, with the first ball at the start; in
+    # its training that ball comes later, and version 1 aims elsewhere.
     assert results["2"] == results["paper"]
     assert len({str(value) for value in results.values()}) == 3
 
@@ -187,7 +187,7 @@ def test_an_evaluation_may_mask_all_sensors_or_those_of_some_links(
         result, text = figures_of(tmp_path, trained, "--mask", *names)
         assert result["mask"] == mask
         assert f"sensors masked: {', '.join(mask)}" in text
-        # Its success is that of the policy whose sensors are masked.
+        # Its success is that of the policy with masked sensors.
         played = evaluate(
             policy,
             *(task, policy.skin),
@@ -232,7 +232,7 @@ def test_an_evaluation_draws_an_operating_map(
     trained: Path, tmp_path: Path, monkeypatch
 ):
     pytest.importorskip("matplotlib")
-    # Two lines, of two points and of one.
+    # Two lines: one of two points and one of a single point.
     fast, tempo = operating_map._speed((4.0, 8.0)), operating_map._interval((1.0,))
     monkeypatch.setattr(operating_map, "_MAPS", ((fast,), (tempo,), (fast, tempo)))
     picture = tmp_path / "map.png"
@@ -249,7 +249,7 @@ def test_an_evaluation_draws_an_operating_map(
 def test_an_evaluation_tells_what_a_policy_bears(
     trained: Path, tmp_path: Path, monkeypatch
 ):
-    # The first, and the one that has all of them.
+    # Keep the first, and the one that combines all.
     for name in list(PERTURBATIONS)[1:-1]:
         monkeypatch.delitem(PERTURBATIONS, name)
     result, text = figures_of(tmp_path, trained, "--perturbed")
@@ -261,7 +261,7 @@ def test_an_evaluation_tells_what_a_policy_bears(
 def test_an_upper_bound_counts_what_policy_and_search_avoid(tmp_path: Path):
     out = tmp_path / "upper-bound.json"
     search = ("--search.samples", "4", "--search.iterations", "1")
-    # So long that each plan sees its ball arrive, so short that it takes seconds.
+    # Long enough for the ball to arrive in each plan, short enough to take seconds.
     done = call(
         "upper-bound",
         *("field_proximity", "--throws", "12", "--json", out),
@@ -314,7 +314,7 @@ CELLS = [
 ]
 
 
-# By default, one of each kind of observation; all others are slow.
+# By default one of each kind of observation; the others are marked slow.
 QUICK = (
     "oracle-2",
     "field-localization",

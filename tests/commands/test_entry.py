@@ -1,4 +1,4 @@
-"""The command `egoskin`: help at once, the nearest name, and scripts that are it."""
+"""The command `egoskin`: fast help, suggested names, and scripts that call it."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from egoskin.commands.pages import PAGES, WITH_SUBCOMMANDS, page
 from egoskin.commands.train import main as train
 
 ROOT = SCRIPTS.parent
-# Scripts that do what no installed package needs, and examples to be read.
+# Scripts that are not commands: development tools and examples.
 OWN = {"fit_shell", "deploy_mujoco", "reuse_gymnasium", "reuse_recording"}
 OWN |= {"reuse_urdf_arm", "train_sb3"}
 
 
 def egoskin(monkeypatch, *args: str) -> None:
-    """Call the function that `[project.scripts]` names, as the command."""
+    """Call the function that `[project.scripts]` names, as the command does."""
     project = read_configuration(ROOT / "pyproject.toml")["project"]
     name, group = "egoskin", "console_scripts"
     monkeypatch.setattr(sys, "argv", [name, *args])
@@ -62,7 +62,7 @@ def test_help_that_nobody_reads_is_no_error(args: tuple[str, ...]):
 
 
 def heavy(import_times: str) -> set[str]:
-    """Return which packages that take long a report of ``-X importtime`` lists."""
+    """Return the slow packages that a report of ``-X importtime`` lists."""
     imported = {line.split()[-1].split(".")[0] for line in import_times.splitlines()}
     assert "egoskin" in imported
     return imported & {"torch", "numpy", "mujoco", "torchrl", "tyro"}
@@ -94,7 +94,7 @@ def test_every_command_has_a_first_page(monkeypatch, capsys):
 
 @pytest.mark.parametrize("name", [n for n in COMMANDS if n not in WITH_SUBCOMMANDS])
 def test_the_first_page_says_what_the_options_are(name):
-    """Names, choices and defaults are those of the parser."""
+    """Names, choices and defaults are the same as in the parser."""
     _, described = re.split(
         r"\boptions  *[-─ ]", call(name, "--help").stdout, maxsplit=1
     )
@@ -149,7 +149,7 @@ def test_the_command_says_its_version(monkeypatch, capsys):
         ("evalute", "evaluate"),
         ("upperbound", "upper-bound"),
         ("--hepl", "--help"),
-        # Names of scripts, and of commands as they once were.
+        # Names of scripts, and former names of commands.
         ("render", "film"),
         ("ppo", "train"),
         ("ceiling", "upper-bound"),
@@ -222,7 +222,7 @@ def test_a_script_is_a_command_or_has_a_reason():
 
 
 def test_the_main_job_is_the_same_code_as_the_command():
-    # The script is there to be read and copied, so it holds the code itself.
+    # The script is meant to be read and copied, so it contains the code itself.
     script = runpy.run_path(str(SCRIPTS / "ppo.py"))["main"]
     assert inspect.getsource(script) == inspect.getsource(train)
 

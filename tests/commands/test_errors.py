@@ -1,4 +1,4 @@
-"""What the scripts share: errors before the work, and in one line."""
+"""What all commands share: errors in one line, before the work starts."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_a_file_that_cannot_be_written_is_told_of_before_the_work(tmp_path):
     check_output(kept, "--json")
     assert kept.read_text() == "before"
     assert list(tmp_path.iterdir()) == [kept]
-    # Root may write anywhere but there.
+    # Even root cannot write there.
     for path in (tmp_path / ("x" * 300), Path("/proc/new.json")):
         with pytest.raises(ValueError, match=rf"--json: {path} cannot be written \("):
             check_output(path, "--json")
@@ -106,10 +106,10 @@ def test_a_fault_of_ours_keeps_its_traceback():
 def test_a_pipe_that_nobody_reads_is_no_error(monkeypatch, capfd):
     read, write = os.pipe()
     os.close(read)
-    # Closing it, as at the end of a process, writes what is left.
+    # Closing it, as at the end of a process, flushes the buffer.
     with open(write, "w") as output:
         monkeypatch.setattr(sys, "stdout", output)
-        # What is printed at last is still in a buffer; --help ends by SystemExit.
+        # The last output is still in the buffer; --help ends with SystemExit.
         print("text")
         with pytest.raises(SystemExit) as ended, clear_errors():
             raise SystemExit(0)

@@ -1,4 +1,4 @@
-"""`egoskin film`: a film and a sheet, of the episode that is asked for; bad input."""
+"""`egoskin film`: film and contact sheet of the requested episode; bad input."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_without_opengl_it_says_what_to_install(
     tmp_path: Path, environment: dict[str, str]
 ):
     (tmp_path / "a.mp4").write_text("old")
-    # MuJoCo chooses its OpenGL when it is imported: in a process of its own.
+    # MuJoCo chooses its OpenGL at import, so this needs a separate process.
     done = subprocess.run(
         [sys.executable, SCRIPTS / "render.py", "--out", "a.mp4", "--seconds", "0.1"],
         cwd=tmp_path,

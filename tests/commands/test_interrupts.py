@@ -1,4 +1,4 @@
-"""Ctrl-C and its like: one line at every moment, whatever the script does."""
+"""Ctrl-C and similar signals: one line at any time, whatever the script does."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from egoskin.commands import errors
 from egoskin.commands.errors import clear_errors
 from egoskin.interrupts import ENDING, say, take
 
-# The main job, and one of those that hand over to a command at once: all are alike.
+# The main script, and one of those that only call a command (all are alike).
 SCRIPTS = [calling.SCRIPTS / "ppo.py", calling.SCRIPTS / "evaluate.py"]
 
 
 @pytest.fixture(autouse=True)
 def handlers() -> Iterator[None]:
-    """Give pytest its handlers of signals back."""
+    """Restore pytest's signal handlers after each test."""
     before = {number: signal.getsignal(number) for number in ENDING}
     say.cache_clear()
     yield
@@ -42,7 +42,7 @@ def test_ctrl_c_twice_while_a_script_imports_is_one_line(script: Path):
         text=True,
     )
     maps = Path(f"/proc/{process.pid}/maps")
-    # The first package of others that is loaded.
+    # The first third-party package that is loaded.
     while "numpy" not in maps.read_text():
         assert process.poll() is None
         time.sleep(0.005)
@@ -53,7 +53,7 @@ def test_ctrl_c_twice_while_a_script_imports_is_one_line(script: Path):
 
 
 class Noting:
-    """What is to be closed."""
+    """An object that records that it was closed."""
 
     def __init__(self, said: list[str]) -> None:
         self._said = said

@@ -1,4 +1,4 @@
-"""Looking at a robot before it is trained, as a user does it."""
+"""The command `egoskin robot`: checks of a robot before training."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_a_robot_that_stands_is_told_so_and_drawn(script, tmp_path):
     assert "wrong" not in out
     image = np.asarray(Image.open(picture))
     assert image.shape == (960, 1280, 3)
-    # Sensors are drawn: nothing else has their colour.
+    # Sensors are drawn: only they have this colour.
     assert (np.abs(image.astype(int) - [25, 242, 255]).sum(-1) < 120).sum() > 500
 
 
@@ -41,8 +41,8 @@ def test_a_robot_that_falls_must_learn_to_stand():
         ('actuatorfrcrange="-60 60" ', "", "no torque limit: left_shoulder, right"),
         ("<freejoint/>", "", "must be the free joint of its base 'trunk'"),
         ('range="-1.5 1.5"', 'range="0.2 1.5"', "out of range: left_shoulder, right"),
-        ('feet = ["*_foot"]', "feet = []", "no feet: to touch the floor"),
-        ('feet = ["*_foot"]', 'feet = ["*_leg"]', "left_foot, which is no foot"),
+        ('feet = ["*_foot"]', "feet = []", "no feet: any contact with the floor"),
+        ('feet = ["*_foot"]', 'feet = ["*_leg"]', "left_foot, which is not a foot"),
         ("*_arm", "left_arm", None),
         ("left_shoulder = 0.1", '"*_hip" = 1.5', "falls within"),
     ],

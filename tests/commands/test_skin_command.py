@@ -1,4 +1,4 @@
-"""Making, converting and showing skins, as a user does it."""
+"""The command `egoskin skin`: placing, converting and showing skins."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ TABLE = """Index,X,Y,Z,NormX,NormY,NormZ,Radius,Parent,Object Name in Blender
 
 @pytest.fixture(autouse=True)
 def folder(monkeypatch, tmp_path: Path) -> None:
-    """Work in the test's folder."""
+    """Run in the test's temporary folder."""
     monkeypatch.chdir(tmp_path)
 
 
@@ -66,7 +66,7 @@ def test_a_skin_can_be_placed_on_meshes():
         *("--num-sensors", "10", "--stand-off", "0.01", "--out", "skin.json"),
     )
     skin = Skin.load(Path("skin.json"))
-    # On a box of these half sizes, 1 cm off it.
+    # 1 cm off a box with these half sizes.
     beyond = np.abs(skin.position) - [0.2, 0.25, 0.3]
     np.testing.assert_allclose(beyond.max(-1), 0.01, atol=1e-5)
 
@@ -110,11 +110,11 @@ def test_files_of_any_robot_make_one_skin():
     fail("skin", *args)
     out = run(*args, "--skip-invalid")
     assert "skin.json: 2 sensors on links of crane" in out
-    assert "remark: no file needs 'arm' of --link-map" in out
+    assert "note: no file uses 'arm' of --link-map" in out
     assert "left out: boom.csv:3: the sensor lies 9 m" in out
     skin = Skin.load(Path("skin.json"))
     assert skin.links == ("boom", "hook")
-    # The first from the box; the hook's cylinder is no primitive.
+    # The first normal is from the box; the hook's cylinder is not a primitive.
     np.testing.assert_allclose(skin.normal, [[0, 1, 0], [1, 0, 0]], atol=1e-6)
 
 
@@ -182,7 +182,7 @@ def test_a_picture_shows_sensors_and_normals_from_both_sides(mixed):
     image = np.asarray(Image.open("skin.png"), int)
     assert image.shape == (960, 1280, 3)
     red, green, blue = np.moveaxis(image, -1, 0)
-    # Normals are cyan, like nothing else; all three point at the front camera.
+    # Only normals are cyan; all three point at the front camera.
     lines = (green - red > 100) & (blue - red > 100)
     front, back = lines[:, :640], lines[:, 640:]
     assert front.sum() > 30
@@ -204,14 +204,14 @@ def test_a_picture_shows_sensors_and_normals_from_both_sides(mixed):
             "it must be one of h1_2, g1, a folder",
         ),
         (["import", "bad.csv", "--robot", "bad.csv", "--out", "a.json"], "(.urdf, .x"),
-        (["show", "pipe"], "skin file pipe: pipe must be a file, and is a named pipe"),
+        (["show", "pipe"], "skin file pipe: pipe must be a file, but is a named pipe"),
         (["show", "/dev/zero"], "skin file /dev/zero: /dev/zero must be a file"),
         (["export", "deep.json", "--out", "a.csv"], "skin file deep.json: nested"),
         (["export", "bad.csv", "--out", "a.csv"], "skin file bad.csv"),
         (["show", "other.json"], "did you mean 'torso_link'"),
         (
             ["show", "alien.json", "--picture", "a.png"],
-            "for the robot 'alien': say where it is, --robot PATH",
+            "for the robot 'alien': give its path with --robot PATH",
         ),
         (["show", "alien.json", "--picture", "a.jpg"], "must end in .png"),
         (["place", "--density", "torso_link=x", "--out", "a.json"], "must be a number"),

@@ -25,7 +25,7 @@ from egoskin.storage.tensor_file import load_tensors, save_tensors
     [
         ([], 2),
         (["--sensor.coverage", "ray", "--sensor.signal", "closeness"], 2),
-        # Nothing that could be corrupted.
+        # No sensors that could be corrupted.
         (["--sensor.signal", "localization"], 1),
         (["--sensor.coverage", "none"], 1),
     ],
@@ -36,8 +36,8 @@ def test_training_is_exact(sensor, skins, monkeypatch):
     # 6 rollouts: the first throws land, rows reset at different times.
     text = succeed("verify", "--num-envs", "64", "--iterations", "6", *sensor)
     assert "equal: training is exact" in text
-    # Of 64 and of 45 agents.
-    assert text.count("gone on with after 3 rollouts") == 2 * skins
+    # With 64 and with 45 agents.
+    assert text.count("resumed after 3 rollouts") == 2 * skins
     assert text.count("compiled kernels") == 3 * skins
     assert text.count("plain kernels") == 3 * skins
     assert "5 workers, 2 physics threads, 4 learner threads, plain kernels" in text
@@ -68,7 +68,7 @@ def test_a_difference_of_one_bit_is_found(exact, monkeypatch, tmp_path, capsys):
     lines = capsys.readouterr().out.splitlines()[1:]
     assert len(lines) == 4
     one, two, four, resumed = (line.split()[0] for line in lines)
-    # With one worker and with four it is the same either way.
+    # One worker and four give the same result in both cases.
     assert one == four
     assert (one == two == resumed) == exact
 
@@ -84,14 +84,14 @@ def test_the_hash_is_of_values_alone(tmp_path):
     metrics = run.path / "metrics.csv"
     lines = [line.split(",") for line in metrics.read_text().splitlines()]
 
-    # The order of fields and columns, times, and what describes the run do not count.
+    # The order of fields and columns, times and descriptions of the run do not count.
     header["policy"], header["wall_s"] = {"other": 1}, -1.0
     reversed_ = dict(reversed(list(tensors.items())))
     save_tensors(run.checkpoint_path, reversed_, header)
     metrics.write_text("\n".join(",".join(reversed(line)) for line in lines) + "\n")
     assert run_hash(run) == before
 
-    # Every value does.
+    # Every value counts.
     key = "agent/head.log_std"
     tensors[key] = tensors[key] + 1e-6
     save_tensors(run.checkpoint_path, tensors, header)

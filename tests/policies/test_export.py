@@ -236,7 +236,7 @@ def test_the_command_writes_the_file_and_lists_its_input(tmp_path):
     said = succeed("export", "localization", "--to", "onnx", "--out", out)
     assert f"{out}: observation [1, 51] -> action" in said
     assert "joint_vel           21 rad/s" in said
-    assert "as PyTorch's to" in said
+    assert "equal to PyTorch within" in said
     assert run(out.read_bytes(), np.zeros((1, 51))).shape == (1, 21)
 
 

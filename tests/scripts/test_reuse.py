@@ -16,7 +16,7 @@ from torchrl.envs import GymEnv
 from torchrl.envs.utils import check_env_specs
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
-# Stands for a point: MuJoCo measures distances between geoms.
+# Radius of a geom that stands for a point: MuJoCo measures between geoms [m].
 TINY = 1e-9
 
 
@@ -25,7 +25,7 @@ def script(name: str) -> SimpleNamespace:
 
 
 def with_specks(spec: mujoco.MjSpec, skin, ball) -> mujoco.MjModel:
-    """The robot with a speck at each sensor, and the ball."""
+    """Return the robot with a tiny geom at each sensor, and the ball."""
     for i, (link, position) in enumerate(zip(skin.links, skin.position, strict=True)):
         spec.body(link).add_geom(name=f"sensor_{i}", size=[TINY, 0, 0], pos=position)
     ball.add_geom(spec.worldbody.add_body(name="ball", mocap=True), name="ball")
@@ -33,7 +33,7 @@ def with_specks(spec: mujoco.MjSpec, skin, ball) -> mujoco.MjModel:
 
 
 def mujoco_distances(model: mujoco.MjModel, data: mujoco.MjData, count) -> np.ndarray:
-    """Distance from every sensor to the ball, 0 inside, ``[S]``."""
+    """Return the distance from each sensor to the ball, 0 inside, ``[S]``."""
     mujoco.mj_kinematics(model, data)
     ball, unused = model.geom("ball").id, np.zeros(6)
     sensors = [model.geom(f"sensor_{i}").id for i in range(count)]
@@ -44,11 +44,11 @@ def mujoco_distances(model: mujoco.MjModel, data: mujoco.MjData, count) -> np.nd
 
 
 def assert_distances(distance: torch.Tensor, truth: np.ndarray, max_range: float):
-    # Within rounding of the range either side may say "nothing".
+    # Within rounding of the range, either result may be infinite.
     clear = np.abs(truth - max_range) > 1e-5
     expected = np.where(truth <= max_range, truth, np.inf)
     np.testing.assert_allclose(distance[clear], expected[clear], 0, 1e-5)
-    # The sample covers what matters.
+    # The sample has enough sensors in and out of range.
     assert 0.1 < np.isfinite(expected).mean() < 0.9
 
 
@@ -76,7 +76,7 @@ def test_sensors_on_gymnasiums_humanoid_equal_mujoco(humanoid, episode):
     model = with_specks(mujoco.MjSpec.from_file(str(path)), skin, humanoid.BALL)
     data, truth = mujoco.MjData(model), []
     for row in episode.unbind(0):
-        # Straight from Gymnasium's own observation, not from what the script made.
+        # Directly from Gymnasium's observation, not from the script's keys.
         data.qpos[:] = row["observation"][:24]
         data.mocap_pos[0] = row["object_pose"][0, :3]
         truth.append(mujoco_distances(model, data, len(skin)))
@@ -108,16 +108,16 @@ def test_several_humanoids_end_their_episodes_in_a_state_that_was_one(humanoid):
     last = rollout["next"]
     done = last["done"][..., 0]
     assert done.sum() >= 3
-    # Upright enough to be one, low enough to have ended there.
+    # The quaternion is valid, and the torso is low enough for the episode to end.
     norm = last["observation"][..., 3:7].norm(dim=-1)
     torch.testing.assert_close(norm, torch.ones_like(norm), atol=0.05, rtol=0)
     assert (last["observation"][done][:, 2] < 1.0).all()
     assert last["signal"].isfinite().all()
-    # The next step starts anew.
+    # The next step starts a new episode.
     after = rollout[:, 1:][done[:, :-1]]
     assert (after["observation"][:, 2] > 1.3).all()
     assert (after["step_count"] == 0).all()
-    # Each is what it would be alone.
+    # Each one is measured as if it were alone.
     sensors = humanoid.Compose(humanoid.HumanoidState(), *env.transform[-2:])
     alone = sensors(last.select("observation", "step_count")[1, 7].unsqueeze(0))
     torch.testing.assert_close(alone["signal"][0], last["signal"][1, 7])
@@ -224,7 +224,7 @@ def test_a_recording_is_measured_row_by_row_and_step_by_step(replay, recording):
     for step in range(0, 40, 7):
         now = sensor(states[:, step].clone())["distance"]
         torch.testing.assert_close(now, whole[:, step])
-    # What is stored stays as it was.
+    # The stored recording is unchanged.
     assert set(TensorDict.load_memmap(recording).keys()) == set(replay.KEYS)
 
 
@@ -242,12 +242,12 @@ def test_a_longer_range_sees_more_and_earlier(replay, recording, capsys):
 
 
 def test_warning_by_hand(replay):
-    # Closest at step 4; in sight at 0, lost at 1, then in sight for steps 2 and 3.
+    # Closest at step 4; seen at step 0, lost at 1, then seen at steps 2 and 3.
     gap = torch.tensor([[5.0, 4, 3, 2, 1, 2]])
     seen = torch.tensor([[True, False, True, True, True, True]])
     warning = replay.seconds_of_warning(seen, gap)
     torch.testing.assert_close(warning, torch.tensor([2 * replay.STEP]))
-    # Never out of sight: all four steps. Never in sight: none.
+    # Always seen: all four steps. Never seen: none.
     always = replay.seconds_of_warning(torch.ones_like(seen), gap)
     torch.testing.assert_close(always, torch.tensor([4 * replay.STEP]))
     assert replay.seconds_of_warning(torch.zeros_like(seen), gap) == 0

@@ -1,4 +1,4 @@
-"""What is read of other people's paths, and what is refused without a wait."""
+"""Reading files from given paths: what is read, and what is refused at once."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def test_a_file_is_read_whole_and_through_a_link(tmp_path: Path):
 
 @pytest.fixture
 def odd(tmp_path: Path) -> dict[str, Path]:
-    """Paths that are no regular files, by what they are called."""
+    """Paths that are not regular files, by the name of their kind."""
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "link").symlink_to("pipe")
     with socket.socket(socket.AF_UNIX) as server:
@@ -36,8 +36,8 @@ def odd(tmp_path: Path) -> dict[str, Path]:
 @pytest.mark.parametrize("kind", ["a folder", "a named pipe", "a socket", "a device"])
 @pytest.mark.parametrize("use", [check_regular, read_regular])
 def test_only_regular_files_are_read(use, kind, odd):
-    # A pipe that nobody writes to would be waited for until the test is killed.
-    with pytest.raises(ValueError, match=f"{odd[kind]} must be a file, and is {kind}"):
+    # Opening a pipe without a writer would block until the test is killed.
+    with pytest.raises(ValueError, match=f"{odd[kind]} must be a file, but is {kind}"):
         use(odd[kind])
 
 
@@ -61,11 +61,11 @@ def test_a_file_may_be_as_large_as_the_limit_and_no_larger(use, tmp_path: Path):
     path = tmp_path / "file"
     path.write_bytes(b"12345")
     use(path, limit=5)
-    with pytest.raises(ValueError, match="at most 4 bytes, and has 5"):
+    with pytest.raises(ValueError, match="at most 4 bytes, but has 5"):
         use(path, limit=4)
-    # A file of holes takes no disk, and would take memory.
+    # A sparse file takes no disk space, but would take memory.
     os.truncate(path, 10**12)
-    with pytest.raises(ValueError, match="and has 1,000,000,000,000"):
+    with pytest.raises(ValueError, match="but has 1,000,000,000,000"):
         use(path)
 
 

@@ -1,4 +1,4 @@
-"""File formats: nothing damaged loads changed, older files load, newer ones say so."""
+"""File formats: damage is detected, older files load, newer ones are refused."""
 
 from __future__ import annotations
 
@@ -58,14 +58,14 @@ def run(trained: Path, tmp_path: Path) -> Path:
 
 
 def rewrite(file: Path, change: Callable[[dict[str, Any]], object]) -> None:
-    """Change a sealed JSON file as somebody would who seals it again."""
+    """Change a sealed JSON file and seal it again."""
     content, _ = read_sealed(file)
     change(content)
     file.write_bytes(sealed_json(content))
 
 
 def resume(path: Path) -> None:
-    """Go on with a run, to the end of it: nothing is left to be trained."""
+    """Resume a finished run: no training is left."""
     config = parse_config(["--resume", str(path)])
     with open_trainer(Run(path, config)) as trainer:
         train(trainer)
@@ -75,7 +75,7 @@ def resume(path: Path) -> None:
 
 
 def damage(content: bytes, draw: random.Random) -> bytes:
-    """Flip bits, cut, zero, or overwrite with noise: what disks and people do."""
+    """Flip bits, cut, zero, overwrite with noise, delete or repeat a part."""
     spoilt = bytearray(content)
     start = draw.randrange(len(spoilt))
     end = min(len(spoilt), start + draw.choice([1, 8, 100, 4096]))
@@ -123,7 +123,7 @@ READERS: dict[str, Callable[[Path], Any]] = {
 def test_every_file_of_a_run_is_read_by_a_test_of_damage(trained: Path):
     files = {str(p.relative_to(trained)) for p in trained.rglob("*") if p.is_file()}
     others = {f for f in files if f == "lock" or f.startswith("events.out.tfevents")}
-    # Nothing reads the lock; each record of the events has a checksum of its own.
+    # Nothing reads the lock; each record of the events has its own checksum.
     assert files - others - {"policies/000000000000.safetensors"} == READERS.keys()
 
 
@@ -140,8 +140,8 @@ def test_a_damaged_file_of_a_run_never_loads_changed(name: str, run: Path):
             found = read(file)
         except ValueError as error:
             refusal = str(error)
-        # Blank space between words of JSON may change; and the log of metrics is that
-        # of the checkpoint.
+        # White space in JSON may change without effect; the log of metrics is restored
+        # from the checkpoint.
         assert found == expected, spoilt
         assert refusal is None or file.name in refusal
         refused += refusal is not None
@@ -179,7 +179,7 @@ def test_a_log_of_starts_that_holds_none_is_named(content, run: Path):
     [
         ("num_envs", 10**9, "num_envs must be at most"),
         ("seed", 10**400, "seed must fit into 64 bits"),
-        ("checkpoint_interval", 10**400, "a number of hundreds of digits"),
+        ("checkpoint_interval", 10**400, "a number with hundreds of digits"),
     ],
     ids=["agents", "whole", "float"],
 )
@@ -242,7 +242,7 @@ def test_a_newer_format_names_the_egoskin_it_needs(run: Path):
             now = b"format" + quote + b": %d" % FORMAT
             content = content.replace(now, b"format" + quote + b": 9")
         file.write_bytes(content)
-    message = r"config\.json has format 9, .* needs egoskin 0\.1\.0 or a later one"
+    message = r"config\.json has format 9, .* use egoskin 0\.1\.0 or later"
     with pytest.raises(ValueError, match=message):
         Run.open(run)
     with pytest.raises(ValueError, match=r"checkpoint\.safetensors has format 9"):
@@ -250,7 +250,7 @@ def test_a_newer_format_names_the_egoskin_it_needs(run: Path):
 
 
 def unsealed(run: Path) -> None:
-    """Make the files of a run what they were in format 1."""
+    """Rewrite the files of a run as they were in format 1."""
     config, _ = read_sealed(run / "config.json")
     del config["skin_sha256"]
     throws = config["env"]["task"]["throws"]
@@ -279,13 +279,13 @@ def test_a_configuration_of_format_1_throws_as_it_did_and_is_noted_once(
         assert len(Run.open(run).starts()) == 1
     lines = capsys.readouterr().err.splitlines()
     for line, name in zip(lines, ("config.json", "versions.json"), strict=True):
-        assert line.startswith(f"note: {run / name} is of an egoskin without")
+        assert line.startswith(f"note: {run / name} was written by an egoskin without")
 
 
 def test_a_run_of_format_1_goes_on_and_is_sealed(run: Path, capsys):
     metrics = (run / "metrics.csv").read_bytes()
     unsealed(run)
-    # After the checkpoint, and cut short.
+    # A row from after the checkpoint, and a truncated one.
     with open(run / "metrics.csv", "ab") as file:
         file.write(metrics.splitlines(keepends=True)[-1].replace(b"128", b"192", 1))
         file.write(b"256,1.")
@@ -407,7 +407,7 @@ def test_an_edited_skin_is_not_gone_on_with(run: Path):
     file.write_text(json.dumps(skin))
     with pytest.raises(ValueError, match=r"skin\.json is damaged or was edited"):
         resume(run)
-    # Its hash in config.json brought up to date, too: the checkpoint has its own.
+    # The hash in config.json is updated as well; the checkpoint has its own.
     rewrite(run / "config.json", lambda c: c.update(skin_sha256=content_hash(skin)))
     message = r"skin\.json is not the skin that .*checkpoint.* was trained with"
     with pytest.raises(ValueError, match=message):
@@ -443,7 +443,7 @@ def test_machine_settings_may_change_at_a_resume_and_change_nothing(
     with open_trainer(Run(run, config)) as trainer:
         train(trainer)
     assert Run.open(run).config.num_workers == 2
-    # As the run that goes on as it was.
+    # The same result as resuming without changes.
     other = Path(shutil.copytree(trained, run.with_name("other")))
     plain = parse_config(["--resume", str(other), "--total-frames", "192"])
     with open_trainer(Run(other, plain)) as trainer:

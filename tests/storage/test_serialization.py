@@ -1,4 +1,4 @@
-"""Configurations as plain values: what comes back, and what is refused by name."""
+"""Configurations as plain values: round trips, and errors that name the field."""
 
 from __future__ import annotations
 

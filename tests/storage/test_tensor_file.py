@@ -1,4 +1,4 @@
-"""Checkpoint files: exact, atomic, honest about what they are not."""
+"""Checkpoint files: exact, written atomically; other files are refused."""
 
 from __future__ import annotations
 
@@ -62,6 +62,6 @@ def test_a_pickle_is_refused_and_not_run(tmp_path: Path):
             return (os.mkdir, (str(tmp_path / "ran"),))
 
     torch.save(Trap(), path)
-    with pytest.raises(ValueError, match="no checkpoint"):
+    with pytest.raises(ValueError, match="not an egoskin checkpoint"):
         load_tensors(path)
     assert not (tmp_path / "ran").exists()

@@ -1,4 +1,4 @@
-"""Claims: one worker at a time, whatever dies, on one host or many."""
+"""Claims: one worker at a time, also after crashes, on one host or several."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def hold(folder: Path) -> subprocess.Popen[str]:
 
 
 def elsewhere(folder: Path, age: float, number: int = 1) -> Path:
-    """Leave the owner file of a process on another host, of an age [s]."""
+    """Write the owner file of a process on another host, with an age [s]."""
     folder.mkdir(exist_ok=True)
     path = folder / f"run.owner.{number}"
     path.write_text(json.dumps({"host": "other", "name": "other", "pid": 1}))
@@ -76,7 +76,7 @@ def test_a_claim_is_held_by_one_process_and_freed_by_its_death(tmp_path: Path):
         assert not mine
     process.send_signal(signal.SIGKILL)
     process.communicate()
-    # What it left behind is nobody's.
+    # The owner file that it left behind does not count.
     assert list(folder.glob("run.owner.*"))
     assert not is_claimed(folder, "run")
     with claimed(folder, "run") as mine:
@@ -157,8 +157,7 @@ def test_a_heart_beats_on_after_an_error_of_the_file_system(
 def test_of_many_hosts_that_see_a_dead_owner_one_takes_its_claim(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    # Hosts among which locks are not shared: here each has a name of its own, and all
-    # get the lock.
+    # Hosts that do not share locks: here each has its own name, and all get the lock.
     monkeypatch.setattr("fcntl.flock", lambda file, operation: None)
     local = threading.local()
     monkeypatch.setattr("egoskin.study.claims.this_host", lambda: local.name)

@@ -1,4 +1,4 @@
-"""Studies and their manifests: what is fixed, what may be added, what cannot be."""
+"""Studies and their manifests: what is fixed, what may be added, what is refused."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_the_findings_are_decided_by_29_cells_of_the_default_recipe(resolved):
     assert (len(findings.cells), findings.not_default()) == (29, {})
     names = {cell.name for cell in findings.cells}
     asked = {name for f in FINDINGS for c in f.claims for name in c.weights}
-    # All of them but the blind robot, which is what they are compared with by eye.
+    # All but the blind robot, which is only the visual baseline of the figures.
     assert asked == names - {"blind"}
     assert {f.metric for f in FINDINGS} <= {m.name for m in METRICS}
 
@@ -114,10 +114,10 @@ def test_a_cell_is_named_by_what_differs():
         ({"sensor.range": "far"}, "range"),
         ({"sensor.range": -1.0}, "sensor.range=-1.0.*must be at least 0.001"),
         ({"sensor.reduce": "min"}, "is for ray sensors"),
-        ({"seed": 1}, "seed cannot be chosen here"),
-        ({"total_frames": 1}, "total_frames cannot be chosen here"),
-        ({"checkpoint_interval": 1.0}, "checkpoint_interval cannot be chosen here"),
-        ({"sensor.coverage": "none"}, "blind is there twice"),
+        ({"seed": 1}, "seed cannot be set here"),
+        ({"total_frames": 1}, "total_frames cannot be set here"),
+        ({"checkpoint_interval": 1.0}, "checkpoint_interval cannot be set here"),
+        ({"sensor.coverage": "none"}, "cell blind is defined twice"),
         ({"skin.path": "no.json"}, r"no\.json"),
     ],
 )
@@ -129,7 +129,7 @@ def test_a_cell_that_cannot_exist_is_named(cell, text):
 @pytest.mark.parametrize(
     ("fields", "text"),
     [
-        ({"cells": ()}, "at least a cell"),
+        ({"cells": ()}, "at least one cell"),
         ({"seeds": (-1,)}, "seed must be"),
         ({"frames": 0}, "frames must be"),
         ({"name": "a/b"}, "name"),
@@ -163,7 +163,7 @@ def test_cells_and_seeds_may_be_added():
     both = resolve(STUDY).extended(more)
     assert both == more
     assert len(both.runs) == 9
-    # What is not named again stays.
+    # Seeds that are not named again stay.
     assert both.extended(changed(seeds=(5,))).seeds == (0, 1, 2, 5)
 
 
@@ -193,7 +193,7 @@ def test_a_manifest_that_was_edited_is_refused(tmp_path: Path):
     folder.manifest_path.write_text(text.replace('"num_envs": 32', '"num_envs": 64'))
     with pytest.raises(ValueError, match=r"manifest\.json is damaged or was edited"):
         folder.manifest()
-    with pytest.raises(ValueError, match="is no folder of a study"):
+    with pytest.raises(ValueError, match="is not a study folder"):
         StudyFolder(tmp_path / "none").manifest()
 
 
@@ -205,7 +205,7 @@ def test_a_study_begun_before_options_changed_goes_on_as_it_was(tmp_path: Path):
     manifest = folder.manifest()
     assert manifest == resolve(study)
     assert {run.config.env.standard for run in manifest.runs} == {"1"}
-    # Cells are added to it, and it is written in the present format.
+    # After seeds are added, it is written in the current format.
     more = dataclasses.replace(study, seeds=(0, 1, 2))
     assert folder.plan(resolve(more)) == folder.manifest() == resolve(more)
     assert "compile_kernels" not in folder.manifest_path.read_text()
@@ -214,14 +214,14 @@ def test_a_study_begun_before_options_changed_goes_on_as_it_was(tmp_path: Path):
 def test_a_default_that_changes_changes_no_study_that_has_begun(tmp_path: Path):
     folder = StudyFolder(tmp_path)
     folder.plan(resolve(STUDY))
-    # As if the default of the discount had been another one on that day.
+    # As if the discount's default had been different at that time.
     content, _ = read_sealed(folder.manifest_path)
     content["base"]["ppo"]["gamma"] = 0.9
     folder.manifest_path.write_bytes(sealed_json(content))
     manifest = folder.manifest()
     assert {run.config.ppo.gamma for run in manifest.runs} == {0.9}
     assert TrainConfig().ppo.gamma != 0.9
-    with pytest.raises(ValueError, match=r"another is: ppo\.gamma"):
+    with pytest.raises(ValueError, match=r"it differs in ppo\.gamma"):
         folder.plan(resolve(STUDY))
 
 

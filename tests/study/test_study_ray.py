@@ -1,4 +1,4 @@
-"""A study on a Ray cluster of two nodes, and faults done to it for real."""
+"""A study on a Ray cluster of two nodes, with real faults."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from egoskin.study.store import StudyFolder
 ray = pytest.importorskip("ray", reason="extra ray")
 pytestmark = [
     pytest.mark.slow,
-    # Of Ray, while it is imported.
+    # Ray's own warnings while it is imported.
     pytest.mark.filterwarnings("ignore"),
 ]
 __all__ = ["start", "study", "undisturbed"]
@@ -38,7 +38,7 @@ __all__ = ["start", "study", "undisturbed"]
 
 @pytest.fixture(scope="module")
 def tiny() -> Manifest:
-    """A study of two runs, without a checkpoint on the way: each is that of a stop."""
+    """A study of two runs that write checkpoints only when they are stopped."""
     base = {**STUDY.base, "checkpoint_interval": 3600.0}
     return resolve(dataclasses.replace(STUDY, seeds=(0,), frames=16 * BATCH, base=base))
 
@@ -61,7 +61,7 @@ def on(cluster: Any) -> tuple[str, ...]:
 
 
 def claimed_runs(folder: StudyFolder) -> list[str]:
-    """Return the names of the runs that a process holds."""
+    """Return the names of the runs that a process has claimed."""
     status = folder.status(folder.manifest())
     return [s.run.name for s in status if s.state == "running"]
 
@@ -69,7 +69,7 @@ def claimed_runs(folder: StudyFolder) -> list[str]:
 def kept(folder: StudyFolder) -> dict[str, int]:
     """Return the frames of the checkpoints of runs that have stopped, by name.
 
-    No process has them, and nothing they have trained is lost.
+    No process works on them, and none of their training is lost.
     """
     assert not jobs(folder)
     stopped = {}
@@ -89,7 +89,7 @@ def test_a_node_that_is_lost_costs_no_run(cluster, study, start, undisturbed):
     wait_for(lambda: in_the_middle(study))
     cluster.remove_node(cluster.list_all_nodes()[-1], allow_graceful=False)
     assert runner.end() == 0, runner.text()
-    # Ray says that it moved the task; nothing is counted as a failure of the run.
+    # Ray moves the task to another node; the run does not count as failed.
     assert "failed, try" not in runner.text()
     assert table(study) == undisturbed
 
@@ -99,7 +99,7 @@ def test_a_runner_that_is_killed_ends_its_tasks(cluster, study, start, undisturb
     wait_for(lambda: in_the_middle(study))
     runner.process.send_signal(signal.SIGKILL)
     runner.end()
-    # Of a process that ends, the last thread frees the locks.
+    # The locks of a process are freed by its last thread.
     wait_for(lambda: not (jobs(study) or claimed_runs(study)))
     assert kept(study)
     again = start(study.path, *on(cluster))
@@ -117,7 +117,7 @@ def test_ctrl_c_ends_all_tasks_with_checkpoints(cluster, study, start, undisturb
     assert "Traceback" not in runner.text()
     before = kept(study)
     assert before
-    # A batch system says so otherwise, here before anything has begun.
+    # A batch system sends SIGTERM instead, here before anything has started.
     ended = start(study.path, *on(cluster))
     wait_for(ended.text)
     ended.process.send_signal(signal.SIGTERM)

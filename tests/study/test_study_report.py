@@ -1,4 +1,4 @@
-"""The report of a study, from runs that nobody has trained."""
+"""The report of a study, from made-up runs."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def manifest() -> Manifest:
 
 @pytest.fixture(scope="module")
 def folder(manifest: Manifest, tmp_path_factory) -> StudyFolder:
-    """A study of which the rays have one seed, all else three; and its report."""
+    """A study with one seed for the ray cells and three for the others; its report."""
     folder = StudyFolder(tmp_path_factory.mktemp("study"))
     folder.plan(manifest)
     store_all(folder, manifest, keep=lambda r: r.seed == 0 or "ray" not in r.name)
@@ -51,7 +51,7 @@ def test_a_report_needs_nothing_else(folder: StudyFolder):
     text = (out / "report.md").read_text()
     assert set(re.findall(r"!\[.*?\]\((.*?)\)", text)) == {f"{n}.png" for n in FIGURES}
     html = (out / "index.html").read_text()
-    # The page holds its pictures, and refers to nothing.
+    # The page embeds its pictures and has no external links.
     assert html.count('src="data:image/svg+xml;base64,') == len(FIGURES)
     assert not re.search(r'(src|href)="(?!data:)', html)
 
@@ -63,7 +63,7 @@ def test_the_answer_comes_first_and_what_is_missing_is_told(folder: StudyFolder)
     assert re.fullmatch(
         r"\*\*Of the paper's findings (\w+: [\w, ]+(; )?)+\.\*\*", first[4]
     )
-    missing = text.split("## What is missing")[1].split("##")[0]
+    missing = text.split("## Missing runs")[1].split("##")[0]
     assert missing.count("-seed1") == missing.count("-seed2") == 16
     assert "blind" not in missing
 
@@ -87,7 +87,7 @@ def test_the_table_has_a_row_for_each_run_in_full_precision(
         "proximity",
         str(result.run.end),
     )
-    # A blind robot has no signal, and nothing to mask.
+    # A blind robot has no signal and no sensors to mask.
     blind = by_run["blind-seed0"]
     assert blind["signal"] == blind["range_m"] == blind["masked_success_3s"] == ""
 
@@ -135,7 +135,7 @@ def test_cells_of_other_kinds_are_reported_too(tmp_path: Path):
     folder, manifest = StudyFolder(tmp_path), resolve(study)
     folder.plan(manifest)
     store_all(folder, manifest)
-    # Nothing but the first stands in the paper's grid.
+    # Only the first is in the paper's grid.
     assert list(places(manifest)) == ["field-proximity-2m"]
     write_report(folder, tmp_path / "report")
     text = (tmp_path / "report" / "report.md").read_text()
@@ -148,7 +148,7 @@ def test_frames_to_a_share_are_read_off_the_curve(
 ):
     result = folder.result(manifest.run("field-proximity-2m-seed0"))
     end = result.run.end
-    # 1 - exp(-t / 0.2) is its own end times a half at t = 0.2 ln 2 = 0.1386; the end
+    # 1 - exp(-t / 0.2) is half of its end value at t = 0.2 ln 2 = 0.1386; the end
     # is the mean of the last twentieth, 0.9924.
     own = -0.2 * np.log(1 - 0.5 * 0.9924)
     assert frames_to(result, 0.5) == pytest.approx(own * end, rel=2e-3)

@@ -1,4 +1,4 @@
-"""Studies run for real: what is kept, shared and repeated, whatever happens."""
+"""Studies with real runs: results are kept, shared and repeated despite faults."""
 
 from __future__ import annotations
 
@@ -49,14 +49,14 @@ NAME = "blind-seed0"
 
 
 class Never(Stop):
-    """What no signal stops: pytest keeps its handlers."""
+    """A stop without signal handlers: pytest keeps its own."""
 
     def __init__(self, requested: bool = False) -> None:
         self.requested = requested
 
 
 def table(folder: StudyFolder) -> list[dict[str, str]]:
-    """Return the table of all runs, but for wall times."""
+    """Return the table of all runs, without wall times."""
     manifest = folder.manifest()
     text = runs_csv(manifest, folder.results(manifest))
     rows = list(csv.DictReader(io.StringIO(text)))
@@ -70,7 +70,7 @@ def table(folder: StudyFolder) -> list[dict[str, str]]:
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory) -> Path:
-    """A study of one short run, which is finished; tests copy it."""
+    """A study of one short, finished run; tests copy it."""
     folder = StudyFolder(tmp_path_factory.mktemp("study") / "study")
     folder.plan(resolve(SHORT))
     assert work(folder, NAME, Never()) == 0
@@ -121,7 +121,7 @@ def test_a_run_that_was_trained_is_only_judged(folder: StudyFolder):
 def test_a_policy_without_the_last_checkpoint_is_not_trained_to_its_end(
     folder: StudyFolder,
 ):
-    # Killed between the two, a run lacks the last lines of its metrics.
+    # A run killed between the two lacks the last lines of its metrics.
     run = Run.open(folder.run_path(NAME))
     _, header = run.load_checkpoint()
     assert header["frames"] == 2 * BATCH
@@ -134,7 +134,7 @@ def test_a_policy_without_the_last_checkpoint_is_not_trained_to_its_end(
 def test_a_stop_leaves_a_checkpoint_and_no_result(tmp_path: Path):
     folder = StudyFolder(tmp_path / "study")
     folder.plan(resolve(SHORT))
-    # With other workers and threads than it may be gone on with.
+    # With other numbers of workers and threads than when it is resumed.
     assert work(folder, NAME, Never(requested=True), cores=2) == STOPPED
     assert (folder.run_path(NAME) / "checkpoint.safetensors").is_file()
     assert not folder.is_finished(NAME)
@@ -163,7 +163,7 @@ def test_a_run_made_before_is_adopted(folder: StudyFolder, tmp_path: Path):
     made = tmp_path / "made"
     shutil.move(folder.run_path(NAME), made)
     shutil.rmtree(folder.result_path(NAME))
-    # It says nothing of workers and threads that are the study's.
+    # Its numbers of workers and threads differ from the study's.
     content, _ = read_sealed(made / "config.json")
     content.update(num_workers=2, learner_threads=None)
     (made / "config.json").write_bytes(sealed_json(content))
@@ -172,7 +172,7 @@ def test_a_run_made_before_is_adopted(folder: StudyFolder, tmp_path: Path):
     assert work(folder, NAME, Never()) == 0
     assert files(made) == before
     assert table(folder) == expected
-    with pytest.raises(ValueError, match="is there already"):
+    with pytest.raises(ValueError, match="already exists"):
         folder.adopt(folder.manifest(), made)
 
 
@@ -182,12 +182,16 @@ def test_a_run_of_another_study_is_not_adopted(folder: StudyFolder, tmp_path: Pa
     other.plan(manifest)
     with pytest.raises(ValueError, match="blind-seed0, differs in num_envs"):
         other.adopt(manifest, folder.run_path(NAME))
-    # Nor is its folder taken for one, or its result.
+    # Its folder and its result are not accepted either.
     shutil.copytree(folder.run_path(NAME), other.run_path(NAME))
-    with pytest.raises(ValueError, match=r"another run .*: it differs in num_envs"):
+    with pytest.raises(
+        ValueError, match=r"does not match the manifest: it differs in num_envs"
+    ):
         work(other, NAME, Never())
     shutil.copytree(folder.result_path(NAME), other.result_path(NAME))
-    with pytest.raises(ValueError, match=r"another run .*: it differs in num_envs"):
+    with pytest.raises(
+        ValueError, match=r"does not match the manifest: it differs in num_envs"
+    ):
         other.results(manifest)
 
 
@@ -197,7 +201,7 @@ def test_an_adopted_run_that_is_gone_is_named(folder: StudyFolder, tmp_path: Pat
     shutil.rmtree(folder.result_path(NAME))
     folder.adopt(folder.manifest(), made)
     made.rename(tmp_path / "elsewhere")
-    with pytest.raises(ValueError, match=f"blind-seed0 is a link to {made}, which is"):
+    with pytest.raises(ValueError, match=f"blind-seed0 is a link to {made}, which d"):
         work(folder, NAME, Never())
 
 
@@ -222,7 +226,7 @@ def test_a_result_that_was_edited_or_exchanged_is_refused(folder: StudyFolder):
     policies = folder.run_path(NAME) / "policies"
     (policy,) = (folder.result_path(NAME) / "policies").iterdir()
     shutil.copy(policies / "000000000000.safetensors", policy)
-    with pytest.raises(ValueError, match="of another policy"):
+    with pytest.raises(ValueError, match="does not belong to the policy"):
         table(folder)
 
 
@@ -238,7 +242,7 @@ def test_a_study_begun_before_options_changed_goes_on(tmp_path: Path):
     assert len(configs) == 3
     for path in (folder.manifest_path, *configs):
         as_format_1(path)
-    # What is done is done, and what was begun is gone on with.
+    # Finished runs stay as they are, and a stopped one is resumed.
     (done,) = table(folder)
     before = files(folder.result_path(NAME))
     for run in folder.plan(resolve(old)).runs:
@@ -248,7 +252,7 @@ def test_a_study_begun_before_options_changed_goes_on(tmp_path: Path):
     assert [row["trained_on"] for row in table(folder)] == ["1"] * 2
 
 
-# --- how far it is ------------------------------------------------------------------
+# --- progress -----------------------------------------------------------------------
 
 
 def test_status_tells_failures_and_what_is_left(folder: StudyFolder):
@@ -273,7 +277,7 @@ def test_status_tells_failures_and_what_is_left(folder: StudyFolder):
 def test_a_failure_that_is_forgotten_meanwhile_is_none(
     folder: StudyFolder, monkeypatch: pytest.MonkeyPatch
 ):
-    # Another runner's job finishes the run while this one asks.
+    # Another runner's job finishes the run while this one reads.
     folder.note_failure(NAME, "error")
     (path,) = folder.path.glob("failed/*.json")
     path.unlink()
@@ -285,7 +289,7 @@ def test_a_failure_that_is_forgotten_meanwhile_is_none(
 
 def test_a_study_costs_whole_runs_on_whole_cores(tiny: Manifest):
     total = cost(tiny, per_s=1000)
-    # 4 runs of 3.072 s: on three cores the fourth has to wait.
+    # 4 runs of 3.072 s each: on three cores the fourth has to wait.
     assert (total.runs, total.frames) == (4, 4 * 12 * BATCH)
     assert total.core_s == pytest.approx(12.288)
     assert total.wall_s(3) == pytest.approx(2 * 3.072)
@@ -323,11 +327,11 @@ def test_the_slurm_script_shares_the_folder_among_its_elements():
     assert "#SBATCH --output='/a/b c/logs/slurm-%A-%a.log'" in text
 
 
-# --- the runner, and faults done to it for real -------------------------------------
+# --- the runner, with real faults ---------------------------------------------------
 
 
 class Asked(LocalRunner):
-    """Ends when it would begin a run."""
+    """A runner that raises InterruptedError when it would start a run."""
 
     def _begin(self, run: PlannedRun) -> None:
         raise InterruptedError(run.name)
@@ -338,14 +342,14 @@ def test_no_process_is_begun_for_a_run_that_ppo_trains(folder: StudyFolder):
     runner = Asked(folder, parallel=1)
     (planned,) = folder.manifest().runs
     with Run.open(folder.run_path(NAME)).locked():
-        # Each would import for seconds, and leave it to it.
+        # A job would only spend seconds on imports and then leave the run alone.
         runner._start([planned])
     with pytest.raises(InterruptedError, match=NAME):
         Asked(folder, parallel=1)._start([planned])
 
 
 class Runner:
-    """`egoskin study run` in a process of its own."""
+    """`egoskin study run` in a separate process."""
 
     def __init__(self, folder: Path, *args: str, **options) -> None:
         self.log = folder.with_name(f"{folder.name}-{time.monotonic_ns()}.log")
@@ -396,7 +400,7 @@ def study(tiny: Manifest, tmp_path: Path) -> StudyFolder:
 
 @pytest.fixture(scope="module")
 def undisturbed(tiny: Manifest, tmp_path_factory) -> list[dict[str, str]]:
-    """The table of a study to which nothing happened."""
+    """The table of a study that ran without faults."""
     folder = StudyFolder(tmp_path_factory.mktemp("undisturbed") / "study")
     folder.plan(tiny)
     runner = Runner(folder.path)
@@ -414,7 +418,7 @@ def wait_for(condition: Callable[[], object], seconds: float = 300) -> None:
 
 
 def in_the_middle(folder: StudyFolder) -> list[str]:
-    """Return the runs that have done a third, and not all."""
+    """Return the runs that are between a quarter and the end of their frames."""
     status = folder.status(folder.manifest())
     return [s.run.name for s in status if 3 * BATCH < s.frames < s.run.end]
 
@@ -449,7 +453,7 @@ def test_a_runner_that_is_killed_ends_its_runs_and_is_started_again(
     assert jobs(study)
     runner.process.send_signal(signal.SIGKILL)
     runner.end()
-    # Orphans notice, and stop with a checkpoint.
+    # Orphaned jobs notice it and stop with a checkpoint.
     wait_for(lambda: not jobs(study))
     before = study.status(study.manifest())
     assert any(s.state == "begun" and s.frames for s in before)
@@ -523,7 +527,7 @@ def test_a_full_disk_is_told_and_what_was_missing_is_made_up_for(
         assert failure is not None
         assert "File too large" in failure.error
         assert failure.error in full.text()
-    # It is not tried for ever.
+    # It is not tried again forever.
     assert start(study.path, "--tries", "1").end() == 1
     again = start(study.path, "--again")
     assert again.end() == 0, again.text()
@@ -553,13 +557,13 @@ def test_the_command_plans_tells_and_reports(finished: Path, tmp_path: Path):
 @pytest.mark.parametrize(
     ("args", "text"),
     [
-        (("plan", "papr"), "no study 'papr'; there are paper"),
+        (("plan", "papr"), "no study 'papr' (valid: paper"),
         (("run", "smoke", "--dir", "{0}/no/where"), "there is no folder {0}/no"),
         (("plan", "smoke", "--dir", "{0}/no/where"), "there is no folder {0}/no"),
-        (("status", "{0}"), "is no folder of a study"),
-        (("run", "--dir", "{0}"), "is no folder of a study"),
-        (("report", "{0}"), "is no folder of a study"),
-        (("adopt", "{0}", "{0}"), "is no folder of a study"),
+        (("status", "{0}"), "is not a study folder"),
+        (("run", "--dir", "{0}"), "is not a study folder"),
+        (("report", "{0}"), "is not a study folder"),
+        (("adopt", "{0}", "{0}"), "is not a study folder"),
     ],
 )
 def test_bad_input_is_one_line(args, text, tmp_path: Path):

@@ -1,4 +1,4 @@
-"""Statistics of studies, against scipy and numbers worked out by hand."""
+"""Statistics of studies, against scipy and numbers computed by hand."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ DIFFERENCE = {"a": 1.0, "b": -1.0}
 
 
 def test_the_spread_is_the_papers():
-    # Of eight: the middle four, 3 to 6; quartiles at 2.75 and 6.25.
+    # For eight values: the middle four, 3 to 6; quartiles at 2.75 and 6.25.
     own = spread([8, 1, 7, 2, 6, 3, 5, 4])
     assert (own.iqm, own.low, own.high, own.seeds) == (4.5, 2.75, 6.25, 8)
     assert own.iqm == stats.trim_mean(range(1, 9), 0.25)
@@ -39,9 +39,9 @@ def test_the_spread_is_the_papers():
 def test_interquartile_statistics_by_hand():
     assert interquartile_mean([7.0]) == 7.0
     assert interquartile_mean([3.0, 1.0]) == 2.0
-    # Of three, the outer count a quarter each: (0.25 * 0 + 3 + 0.25 * 9) / 1.5.
+    # For three, the outer two count a quarter: (0.25 * 0 + 3 + 0.25 * 9) / 1.5.
     assert interquartile_mean([9.0, 0.0, 3.0]) == pytest.approx(3.5)
-    # Of four, two are left; of ten, the third and the eighth count half.
+    # For four, two are left; for ten, the third and the eighth count half.
     assert interquartile_mean([100.0, 1.0, 2.0, -50.0]) == 1.5
     ten = [0.0, 0, 2, 4, 4, 4, 4, 8, 99, 99]
     assert interquartile_mean(ten) == pytest.approx((1 + 16 + 4) / 5)
@@ -66,7 +66,7 @@ def test_shared_seeds_are_compared_in_pairs():
     own = stats.ttest_rel(A, B, alternative="greater")
     assert effect.p_above(0) == pytest.approx(own.pvalue)
     assert effect.p_below(0) == pytest.approx(1 - own.pvalue)
-    # The order in which the seeds were stored is none of theirs.
+    # The order in which the seeds were stored does not matter.
     turned = {"a": TABLE["a"], "b": dict(reversed(TABLE["b"].items()))}
     assert contrast(DIFFERENCE, turned) == effect
 
@@ -111,14 +111,14 @@ def test_equivalence_is_two_one_sided_tests():
     other = stats.ttest_1samp(values, 5, alternative="less").pvalue
     assert SAME.p_inside(effect) == pytest.approx(max(one, other))
     assert SAME.p_outside(effect) == pytest.approx(min(1, 2 * min(1 - one, 1 - other)))
-    # It is the 90 % interval that lies within the margin or does not.
+    # The test is whether the 90 % interval lies within the margin.
     low, high = mean_effect([0.5, -1, 1, -0.5, 0.2]).interval(0.9)
     assert low > -5
     assert high < 5
 
 
 def test_holm_is_that_of_his_paper():
-    # Sorted 0.005, 0.01, 0.03, 0.04: x 4, 3, 2, 1, and never falling.
+    # Sorted 0.005, 0.01, 0.03, 0.04: x 4, 3, 2, 1, and never decreasing.
     assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
     assert holm([0.9, 0.8]) == [1.0, 1.0]
     assert holm([]) == []
@@ -128,15 +128,15 @@ def test_the_seeds_needed_have_the_power_that_is_asked():
     # An effect of one standard deviation, one-sided at 5 %: 8 pairs (tables of Cohen).
     effect = Effect(mean=1.0, error=1 / math.sqrt(5), df=4, seeds=5)
     assert seeds_needed(effect, ABOVE) == 8
-    # On the other side the same.
+    # The same on the other side.
     below = Effect(mean=-1.0, error=1 / math.sqrt(5), df=4, seeds=5)
     assert seeds_needed(below, ABOVE) == 8
-    # In the middle of the margin each of two tests must not miss: one of 5 sd.
+    # In the middle of the margin both tests must succeed: a distance of 1 sd.
     middle = Effect(mean=0.0, error=5 / math.sqrt(5), df=4, seeds=5)
     needed = seeds_needed(middle, SAME)
     assert needed is not None
     assert 8 < needed < 12
-    # An effect on the bound is decided by no number; and one seed borrows a spread.
+    # No number decides an effect on the bound; one seed uses the given sd.
     assert seeds_needed(Effect(mean=0.0, error=1.0, df=4, seeds=5), ABOVE) is None
     alone = Effect(mean=1.0, error=math.nan, df=1, seeds=1)
     assert seeds_needed(alone, ABOVE, sd=1.0) == 8
@@ -156,7 +156,7 @@ def test_a_metric_that_sets_cells_apart_is_told_from_one_that_does_not():
 
 
 def world(noise: float = 0.3, seeds: int = 5, **changes: float) -> dict:
-    """Return tables of a world in which every finding of the paper holds."""
+    """Return tables in which every finding of the paper holds."""
     # In a fixed order: each draws in turn.
     names = sorted({n for f in FINDINGS for c in f.claims for n in c.weights})
     draw = np.random.default_rng(0)

@@ -1,4 +1,4 @@
-"""What is stored of a run: thinned metrics, how it was made, and that it is whole."""
+"""Stored runs: thinned metrics, the record of how they were made, completeness."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def test_thinned_metrics_keep_a_line_for_each_block_and_the_last():
     assert kept[0] == "frames,x"
     assert [int(line.split(",")[0]) // 65536 for line in kept[1:]] == [1, 4, 8, 10]
     assert kept[1].endswith(",0.333333")
-    # What is thin stays as it is.
+    # Thinned metrics are not changed again.
     assert thin("\n".join(kept), 2**18).splitlines() == kept
     assert thin("frames,x\n", 2**18) == "frames,x\n"
 
@@ -60,7 +60,7 @@ def test_a_folder_that_is_not_whole_is_named(missing, tmp_path: Path):
     shutil.copytree(ARCHIVE / "results" / "blind-seed0", half)
     for path in half.glob(f"{missing}*"):
         path.unlink()
-    with pytest.raises(ValueError, match=rf"half is not whole: .*{missing}"):
+    with pytest.raises(ValueError, match=rf"half is incomplete: .*{missing}"):
         load_run(half)
 
 

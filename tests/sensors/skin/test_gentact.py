@@ -803,7 +803,7 @@ def test_only_files_are_imported(kind, tmp_path):
     path = Path("/dev/zero") if kind == "a device" else tmp_path / "pipe"
     if kind != "a device":
         os.mkfifo(path)
-    with pytest.raises(ValueError, match=f"must be a file, and is {kind}"):
+    with pytest.raises(ValueError, match=f"must be a file, but is {kind}"):
         load_gentact(path, robot_name="h1_2", links=H1_2.links)
 
 

@@ -220,11 +220,11 @@ def test_a_folder_gives_the_meshes_named_after_links(tmp_path):
 def test_meshes_are_read_from_regular_files_alone(tmp_path):
     os.mkfifo(tmp_path / "pelvis.stl")
     with pytest.raises(
-        ValueError, match=r"pelvis.stl must be a file, and is a named p"
+        ValueError, match=r"pelvis.stl must be a file, but is a named p"
     ):
         meshes_in_folder(tmp_path, ["pelvis"])
     with pytest.raises(
-        ValueError, match=r"pelvis.stl must be a file, and is a named p"
+        ValueError, match=r"pelvis.stl must be a file, but is a named p"
     ):
         meshes_of_mjcf(tmp_path / "pelvis.stl")
 
