@@ -90,8 +90,8 @@ class _Rows:
     def info(self, td: TensorDictBase) -> dict[str, np.ndarray]:
         """Return the infos of all rows, ``[B, ...]`` each."""
         flags = {key: _column(td, key) for key in _FLAGS}
-        told = "privileged_observation"
-        return {**flags, told: _rows(td, told).copy()}
+        key = "privileged_observation"
+        return {**flags, key: _rows(td, key).copy()}
 
 
 def _bound(spec: TensorSpec, side: Literal["low", "high"]) -> np.ndarray:

@@ -48,13 +48,13 @@ class Robots(VecEnv):
 
     def step_wait(self) -> Any:
         """Return observations, rewards, ends and infos of the step."""
-        observations, rewards, terminated, truncated, told = self._envs.step(
+        observations, rewards, terminated, truncated, last_infos = self._envs.step(
             self._actions
         )
         done, infos = terminated | truncated, [{} for _ in range(self.num_envs)]
         for row in done.nonzero()[0]:
             infos[row] = {
-                "terminal_observation": told["final_obs"][row],
+                "terminal_observation": last_infos["final_obs"][row],
                 "TimeLimit.truncated": bool(truncated[row] and not terminated[row]),
             }
         return observations, rewards, done, infos

@@ -278,13 +278,13 @@ class Status:
 
 def print_status(manifest: Manifest, status: list[RunStatus]) -> None:
     """Print the progress of each run, by cell and seed, and the failures."""
-    told = {(each.run.cell.name, each.run.seed): entry(each) for each in status}
+    entries = {(each.run.cell.name, each.run.seed): entry(each) for each in status}
     width = max(len(cell.name) for cell in manifest.cells)
-    wide = max(map(len, told.values())) + 2
+    wide = max(map(len, entries.values())) + 2
     seeds = "".join(f"{f'seed {seed}':<{wide}}" for seed in manifest.seeds)
     print(f"{'':{width}}  {seeds.rstrip()}")
     for cell in manifest.cells:
-        row = "".join(f"{told[cell.name, seed]:<{wide}}" for seed in manifest.seeds)
+        row = "".join(f"{entries[cell.name, seed]:<{wide}}" for seed in manifest.seeds)
         print(f"{cell.name:{width}}  {row.rstrip()}")
     for each in status:
         if each.failure is not None:

@@ -98,15 +98,15 @@ def what_came_out(trainer: Trainer, metrics: Mapping[str, float]) -> str:
         metrics: Metrics of its last rollout; empty if no rollout was left to do.
     """
     path, task = trainer.run.path, trainer.config.env.task
-    told = f"done: {trainer.frames:,} frames"
+    summary = f"done: {trainer.frames:,} frames"
     if metrics:
-        told += f" in {clock(metrics['time/wall_s'])}; with exploration "
+        summary += f" in {clock(metrics['time/wall_s'])}; with exploration "
         # NaN if no episode could last long enough.
         if not math.isnan(success := metrics["episode/success"]):
-            told += f"{success:.1%} untouched for {task.success_s:g} s, "
-        told += f"survival {metrics['episode/survival_s']:.2f} s"
+            summary += f"{success:.1%} untouched for {task.success_s:g} s, "
+        summary += f"survival {metrics['episode/survival_s']:.2f} s"
     return (
-        f"{told}\n"
+        f"{summary}\n"
         f"evaluate it with: egoskin evaluate {path}\n"
         f"film it with:     egoskin film {path} --longest-of 16\n"
         f"view it with:     egoskin view {path}"

@@ -338,7 +338,7 @@ def _seen_rows(seen: dict) -> Rows:
     return Rows(head, rows)
 
 
-# --- two ways to write the blocks ---------------------------------------------------
+# --- Markdown and HTML --------------------------------------------------------------
 
 
 def markdown(blocks: Iterable[Block]) -> str:

@@ -334,7 +334,7 @@ class StudyFolder:
             return (errors or said or [""])[-1].removeprefix("error: ")
         return ""
 
-    # --- how far it is --------------------------------------------------------------
+    # --- progress -------------------------------------------------------------
 
     def status(self, manifest: Manifest) -> list[RunStatus]:
         """Return the status of each run, in the manifest's order."""

@@ -272,7 +272,7 @@ class Page:
         camera.position = (0.92 * away, beside - 0.35 * away, 0.92 + 0.17 * away)
         camera.look_at = (0.0, beside, 0.92)
 
-    # --- what visitors ask for --------------------------------------------------
+    # --- requests of visitors -------------------------------------------------
 
     def _welcome(self, client: viser.ClientHandle) -> None:
         """Show all robots to a new visitor, for any window width."""
@@ -432,7 +432,7 @@ class Page:
         self.error = ""
         self.panel.show_error("")
 
-    # --- what is told -----------------------------------------------------------
+    # --- display --------------------------------------------------------------
 
     def _show(self) -> None:
         """Update the panel."""

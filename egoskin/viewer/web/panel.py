@@ -105,7 +105,7 @@ class Panel:
             self._add_policies(sessions, policies)
         self.show_sensors(sessions)
 
-    # --- what can be pressed ----------------------------------------------------
+    # --- controls -------------------------------------------------------------
 
     def _add_play(self) -> None:
         gui, wishes = self._gui, self._wishes
@@ -207,7 +207,7 @@ class Panel:
             self._policies.append(handle)
         self._about = gui.add_markdown("")
 
-    # --- what is asked for ------------------------------------------------------
+    # --- requested settings ---------------------------------------------------
 
     @property
     def sensor_changes(self) -> dict:
@@ -219,7 +219,7 @@ class Panel:
             "corruption": self._corruption.value,
         }
 
-    # --- what is told -----------------------------------------------------------
+    # --- display --------------------------------------------------------------
 
     def show_error(self, text: str) -> None:
         """Show an error text; "" hides it."""

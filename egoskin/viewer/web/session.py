@@ -279,7 +279,7 @@ class Session:
         counted = self.task.balls.state
         return int(counted["avoided"].sum()), int(counted["arrived"].sum())
 
-    # --- what a click means -----------------------------------------------------
+    # --- clicks ---------------------------------------------------------------
 
     def azimuth_of(self, point: np.ndarray) -> float:
         """Return the direction of a point from the base, relative to the heading [rad].
@@ -337,7 +337,7 @@ class Session:
         away = (points - torch.from_numpy(point).float()).square().sum(-1)
         return (int(away.argmin()) + 0.5) / len(points)
 
-    # --- what is seen -----------------------------------------------------------
+    # --- readings and lines ---------------------------------------------------
 
     def _look(self, state: TensorDictBase, ending: str | None) -> Frame:
         """Return the frame of a state, ``[1]``, after all transforms."""

@@ -155,7 +155,7 @@ class SkinPage:
         slider.on_update(move)
         self._sliders[i] = slider
 
-    # --- what visitors ask for --------------------------------------------------
+    # --- requests of visitors -------------------------------------------------
 
     def run(self) -> None:
         """Handle the requests of visitors until the process ends."""
