@@ -7,6 +7,7 @@ shown at once: nothing heavy is imported before the arguments are checked for it
 from __future__ import annotations
 
 import difflib
+import os
 import resource
 import signal
 import sys
@@ -96,9 +97,13 @@ def run(name: str) -> None:
 
 
 def _show(text: str) -> None:
-    """Print a text; exit silently if the output pipe is closed, as in `| head -1`."""
-    signal.signal(signal.SIGPIPE, signal.SIG_DFL)
-    print(text, flush=True)
+    """Print help; end without a message if the reader has left, as in `| head -1`."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        # Python flushes what is left at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(128 + signal.SIGPIPE) from None
 
 
 def _check_address_space() -> None:

@@ -455,7 +455,7 @@ def test_rates_that_are_not_positive_are_refused(name, value):
 @pytest.mark.parametrize("name", ["control_hz", "substeps"])
 @pytest.mark.parametrize("value", [2**31, 10**400])
 def test_rates_and_counts_that_mujoco_cannot_hold_are_refused(name, value):
-    with pytest.raises(ValueError, match=f"{name} must be .*, got {value}"):
+    with pytest.raises(ValueError, match=f"{name} must .*, got {value}"):
         PhysicsConfig(**{name: value})
 
 

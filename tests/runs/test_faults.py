@@ -418,7 +418,9 @@ def test_an_infinite_observation_is_met_in_the_normaliser():
 
 
 def test_a_dump_that_is_none_is_refused(trained):
-    assert "no dump" in fail("replay", trained / "checkpoint.safetensors")
+    assert "is not a dump of an update" in fail(
+        "replay", trained / "checkpoint.safetensors"
+    )
 
 
 # --- the disk ---------------------------------------------------------------------

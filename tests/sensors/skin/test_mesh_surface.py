@@ -197,7 +197,7 @@ def test_triangles_are_sampled_uniformly():
 def test_meshes_in_millimetres_are_told_of_before_a_file_is_written():
     torso = box((300, 200, 500))
     with pytest.raises(
-        ValueError, match=r"lie \d+ m from .*meshes of torso_link in me"
+        ValueError, match=r"sensor would be \d+ m from .*meshes of torso_link in me"
     ):
         place_sensors(H1_2, 8, links=["torso_link"], meshes={"torso_link": [torso]})
 
