@@ -85,7 +85,8 @@ class RayRunner(Runner):
     def __init__(self, folder: StudyFolder, **options: Any) -> None:
         # Nodes have other working directories: the path must be absolute.
         super().__init__(StudyFolder(folder.path.resolve()), **options)
-        cores = [int(n["Resources"].get("CPU", 0)) for n in ray.nodes() if n["Alive"]]
+        nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+        cores = sorted(int(resources.get("CPU", 0)) for resources in nodes)
         if self._cores > max(cores, default=0):
             raise ValueError(
                 f"--cores-per-run {self._cores}: the nodes of the cluster have "
