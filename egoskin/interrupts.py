@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import os
 import signal
+import sys
 from contextlib import suppress
 from types import FrameType
 
@@ -44,6 +45,13 @@ def end_next_time() -> None:
     """
     take(end_now, signal.SIGINT, signal.SIGTERM)
     take(signal.SIG_IGN, signal.SIGHUP)
+
+
+def unread_output() -> SystemExit:
+    """Return the exit for output that is no longer read, as in `| head -1`."""
+    # Python flushes the remaining output at exit: it must not fail again.
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return SystemExit(128 + signal.SIGPIPE)
 
 
 @functools.cache

@@ -7,16 +7,14 @@ shown at once: nothing heavy is imported before the arguments are checked for it
 from __future__ import annotations
 
 import difflib
-import os
 import resource
-import signal
 import sys
 from collections.abc import Iterable, Mapping
 from importlib import import_module
 
 from egoskin import __version__
 from egoskin.commands import pages
-from egoskin.interrupts import end_quietly
+from egoskin.interrupts import end_quietly, unread_output
 from egoskin.viewer import draw_without_display
 
 COMMANDS = {
@@ -101,9 +99,7 @@ def _show(text: str) -> None:
     try:
         print(text, flush=True)
     except BrokenPipeError:
-        # Python flushes what is left at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        raise SystemExit(128 + signal.SIGPIPE) from None
+        raise unread_output() from None
 
 
 def _check_address_space() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import os
 import select
 import signal
 import sys
@@ -20,7 +19,14 @@ from tyro.constructors import (
 )
 
 from egoskin.commands import unknown
-from egoskin.interrupts import ENDING, end_next_time, end_now, say, take
+from egoskin.interrupts import (
+    ENDING,
+    end_next_time,
+    end_now,
+    say,
+    take,
+    unread_output,
+)
 from egoskin.memory import is_out_of_memory
 from egoskin.parallel import WorkerError
 
@@ -97,9 +103,7 @@ def clear_errors() -> Iterator[None]:
         if not isinstance(error, (ValueError, OSError, OverflowError, RecursionError)):
             raise
         if isinstance(error, BrokenPipeError) and _nobody_reads():
-            # Do not try to write the remaining output again.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            raise SystemExit(128 + signal.SIGPIPE) from None
+            raise unread_output() from None
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None
     except KeyboardInterrupt as error:

@@ -64,7 +64,7 @@ class Page:
     def __init__(self, sources: Sequence[str], port: int = 0, seed: int = 0) -> None:
         self.sessions: list[Session] = []
         for source in sources:
-            rate = self.sessions[0].hz if self.sessions else None
+            rate = self.hz if self.sessions else None
             self.sessions.append(Session(source, seed, rate))
         self.server = open_server(port)
         set_stage(self.server)
@@ -417,8 +417,9 @@ class Page:
             ValueError: If there is no such policy, or it has another control rate than
                 that of a second robot.
         """
-        others = [s.hz for s in self.sessions if s is not self.sessions[i]]
-        self.sessions[i].load(source, *others)
+        # All robots have the same rate; a single one may change it.
+        rate = self.hz if len(self.sessions) > 1 else None
+        self.sessions[i].load(source, rate)
         self._versions[i], self._notes[i] = _version(source), ""
         self._exchange_scene(i)
         self.reset()
