@@ -31,10 +31,11 @@ from multiprocessing import (
     set_forkserver_preload,
     util,
 )
+from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from threading import Event, Thread
-from typing import NoReturn, TypeVar
+from typing import BinaryIO, NoReturn, TypeVar
 
 import torch
 import torchrl._utils
@@ -45,10 +46,8 @@ from torchrl.envs import EnvBase, ParallelEnv, Transform, TransformedEnv
 from egoskin.interrupts import ENDING
 from egoskin.memory import is_out_of_memory
 
-# Sleep of the parent between polls: first this share of the duration of the last step,
-# then the larger of this time [s] and this share of the time waited so far. Polling
-# delays a step by as much; polling more often takes CPU time from the workers.
-_SURE_SHARE, _POLL, _POLL_SHARE = 0.75, 2e-4, 0.01
+# Interval at which the parent polls a worker that copies its results [s].
+_POLL = 2e-4
 # Interval between checks that the workers are alive [s].
 _LOOK = 0.2
 # A worker that does not answer for this long counts as hanging [s]. The limit is high
@@ -124,20 +123,42 @@ class WorkerEnv(TransformedEnv):
     def __init__(self, env: EnvBase, transform: Transform, report: Path) -> None:
         super().__init__(env, transform)
         self._report = report
+        # Number of calls in progress; a step resets rows.
+        self._depth = 0
+        self._bell: BinaryIO | None = None
+
+    def open_bell(self) -> None:
+        """Write a byte to the pool's pipe at the end of each step and reset."""
+        self._bell = _bell(self._report.parent).open("wb", buffering=0)
+
+    def step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return TorchRL's result of a step."""
+        with self._computing():
+            return super().step(tensordict)
 
     def step_and_maybe_reset(
         self, tensordict: TensorDictBase
     ) -> tuple[TensorDictBase, TensorDictBase]:
         """Return TorchRL's (step, next root) pair."""
-        with _reported(self._report):
+        with self._computing():
             return super().step_and_maybe_reset(tensordict)
 
     def reset(
         self, tensordict: TensorDictBase | None = None, **kwargs: object
     ) -> TensorDictBase:
         """Return the reset tensordict."""
-        with _reported(self._report):
+        with self._computing():
             return super().reset(tensordict, **kwargs)
+
+    @contextmanager
+    def _computing(self) -> Iterator[None]:
+        """Report a failure, or the end of the outermost call."""
+        self._depth += 1
+        with _reported(self._report):
+            yield
+        self._depth -= 1
+        if not self._depth and self._bell is not None:
+            self._bell.write(b".")
 
     def answer(self, method: str, *args: object) -> object:
         """Call a method of the base environment; return its result."""
@@ -181,6 +202,7 @@ class _Build:
             base, transform = env.base_env, env.transform.clone()
             built = WorkerEnv(base, transform, self._report)
         if in_worker:
+            built.open_bell()
             _ready(self._report).touch()
         return built
 
@@ -269,6 +291,11 @@ def _ready(report: Path) -> Path:
     return report.with_suffix(".ready")
 
 
+def _bell(reports: Path) -> Path:
+    """Return the named pipe in which workers report the end of a computation."""
+    return reports / "bell"
+
+
 class WorkerPool(ParallelEnv):
     """A ParallelEnv of batched environments, one process each.
 
@@ -279,7 +306,6 @@ class WorkerPool(ParallelEnv):
     def __init__(self, builders: Sequence[Callable[[], EnvBase]]) -> None:
         _check_guarded()
         self._reports = Path(tempfile.mkdtemp(dir=_temporary_folder()))
-        self._last_step = 0.0
         keep_freed_memory()
         threads = torch.get_num_threads()
         super().__init__(
@@ -322,7 +348,11 @@ class WorkerPool(ParallelEnv):
             # Tensors are sent in shared memory, so a message never fills the channel.
             for channel in channels:
                 channel.send(("answer", ((method, *args), {})))
-            self._wait(range(len(channels)), lambda worker: channels[worker].poll())
+            self._wait(
+                range(len(channels)),
+                lambda worker: channels[worker].poll(),
+                lambda waiting: wait([channels[i] for i in waiting], _LOOK),
+            )
             return [channel.recv()[1] for channel in channels]
 
     def _report(self, worker: int) -> Path:
@@ -332,6 +362,9 @@ class WorkerPool(ParallelEnv):
         """Start the workers; raise WorkerError if one cannot."""
         start_server()
         self._reports.mkdir(exist_ok=True)
+        os.mkfifo(_bell(self._reports))
+        # Also opened for writing, which does not wait for the workers.
+        self._bell = _bell(self._reports).open("r+b", buffering=0)
         started = Event()
         self._workers, self._hung = [], set[int]()
         others = set(active_children())
@@ -371,17 +404,37 @@ class WorkerPool(ParallelEnv):
     def _wait_for_workers(self, workers_range: Iterable[int]) -> None:
         """Sleep until the workers have set their flags; raise if one fails."""
         workers, flags = list(workers_range), self._shm_done_flags
-        begin = time.monotonic()
-        time.sleep(min(_SURE_SHARE * self._last_step, _LOOK))
-        self._wait(workers, lambda worker: bool(flags[worker]))
-        self._last_step = time.monotonic() - begin
+        computing = len(workers)
+
+        def sleep(_: object) -> None:
+            nonlocal computing
+            if computing > 0:
+                if wait([self._bell.fileno()], _LOOK):
+                    computing -= len(self._bell.read(computing))
+            else:
+                # All copy their results to shared memory and set their flags.
+                time.sleep(_POLL)
+
+        self._wait(workers, lambda worker: bool(flags[worker]), sleep)
         for worker in workers:
             flags[worker] = 0
 
-    def _wait(self, workers: Iterable[int], answered: Callable[[int], bool]) -> None:
-        """Sleep until the workers have answered a command; raise if one fails."""
+    def _wait(
+        self,
+        workers: Iterable[int],
+        answered: Callable[[int], bool],
+        sleep: Callable[[Sequence[int]], object],
+    ) -> None:
+        """Wait until the workers have answered a command; raise if one fails.
+
+        Args:
+            workers: The workers that received it.
+            answered: Returns whether a worker has answered.
+            sleep: Sleeps until one of the given workers may have answered, at most
+                for the interval of the checks.
+        """
         waiting, looks = list(workers), 0
-        begin = looked = time.monotonic()
+        looked = time.monotonic()
         while waiting := [worker for worker in waiting if not answered(worker)]:
             now = time.monotonic()
             if now - looked > _LOOK:
@@ -391,7 +444,7 @@ class WorkerPool(ParallelEnv):
                         self._fail(worker, self._death(worker))
                 if looks * _LOOK > HANG_LIMIT:
                     self._fail(waiting[0], f"hung: no answer in {HANG_LIMIT:g} s")
-            time.sleep(min(max(_POLL, _POLL_SHARE * (now - begin)), _LOOK))
+            sleep(waiting)
 
     @contextmanager
     def _death_explained(self) -> Iterator[None]:
@@ -449,6 +502,7 @@ class WorkerPool(ParallelEnv):
             channel.close()
         # Nothing is left to close; TorchRL would wait for answers from killed workers.
         self.is_closed = True
+        self._bell.close()
         if self._owns_workers:
             shutil.rmtree(self._reports, ignore_errors=True)
 
@@ -459,4 +513,5 @@ class WorkerPool(ParallelEnv):
                 super().close(raise_if_closed=raise_if_closed)
             else:
                 self._end()
+            self._bell.close()
         shutil.rmtree(self._reports, ignore_errors=True)

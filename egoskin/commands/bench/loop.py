@@ -30,7 +30,7 @@ from egoskin.make import (
     make_env,
     save_env_state,
 )
-from egoskin.parallel import WorkerPool
+from egoskin.parallel import WorkerPool, available_cores
 from egoskin.policies.policy import PolicySpec, sparse_sources
 from egoskin.storage.tensor_file import part
 
@@ -182,7 +182,8 @@ class _Loop:
         network, sources = config.ppo.network, self._sources
         spec = PolicySpec.of(config.env, self._skin, network, env, sources)
         self._agent = spec.build_agent(sources)
-        self._ppo = PPO(self._agent, config.ppo)
+        # As many threads as a training uses.
+        self._ppo = PPO(self._agent, config.ppo, available_cores())
         root = env.reset()
         with PeakMemory() as memory:
             for i in range(max(config.warmup, 1)):
