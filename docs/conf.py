@@ -1,6 +1,6 @@
 """Configuration of the documentation site; `make docs` builds it.
 
-Contract: it is built and read without the network.
+Contract: neither building nor reading the site needs the network.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ myst_heading_anchors = 3
 
 autodoc_default_options = {
     "members": True,
-    # What every transform has for TorchRL.
+    # Methods that TorchRL calls; every transform has them.
     "exclude-members": "compute, out_specs, start, advance, signal, measure",
 }
 autodoc_member_order = "bysource"
@@ -41,12 +41,12 @@ autodoc_typehints_format = "short"
 autodoc_preserve_defaults = True
 napoleon_numpy_docstring = False
 napoleon_custom_sections = ["Source"]
-# Names of other packages: their sites would be asked for them.
+# Names of other packages are not resolved: that would need the network.
 nitpick_ignore_regex = [("py:.*", r"(?!egoskin).*")]
 
-# Else what stands before a colon is taken for the type of a field.
+# Otherwise the text before a colon in the docstring of a field is taken as its type.
 GoogleDocstring._parse_attribute_docstring = GoogleDocstring._consume_to_end
-# What tyro is told of a field is none of a reader's business.
+# Hide tyro's annotation of this field.
 TrainConfig.__annotations__["env"] = "EnvConfig"
 
 html_theme = "furo"
@@ -60,7 +60,7 @@ _BOUNDED = re.compile(
 
 
 def _interval(match: re.Match[str]) -> str:
-    """Return a type with the interval of its numbers, as mathematics writes it."""
+    """Return a type with the interval of its values, as "float in [0, 1]"."""
     kind, gt, ge, lt, le = match.groups()
     low = f"[{ge}" if ge != "None" else f"({gt}" if gt != "None" else "(-inf"
     high = f"{le}]" if le != "None" else f"{lt})" if lt != "None" else "inf)"
@@ -68,7 +68,7 @@ def _interval(match: re.Match[str]) -> str:
 
 
 def shorten_types(app: Sphinx, doctree: nodes.document) -> None:
-    """Write fields with bounds as ``float in [0, 1]``."""
+    """Show the types of bounded fields as "float in [0, 1]"."""
     for node in doctree.findall(addnodes.desc_annotation):
         text = node.astext()
         if "Annotated[" in text:
@@ -79,7 +79,11 @@ def shorten_types(app: Sphinx, doctree: nodes.document) -> None:
 def mend_signature(
     app: Sphinx, what: str, name: str, obj: Any, options: Any, signature: str, *_: Any
 ) -> Any:
-    """Leave out fields, which follow one by one; look through TorchRL's metaclass."""
+    """Return the signature to show for a class, or None to keep it.
+
+    That of a dataclass is left out, because its fields are documented one by one.
+    TorchRL's metaclass hides the signature of a transform: take that of ``__init__``.
+    """
     if what == "class" and dataclasses.is_dataclass(obj):
         return ("", None)
     if what == "class" and signature == "(*args, **kwargs)":
@@ -90,7 +94,7 @@ def mend_signature(
 
 
 def find_alias(app: Sphinx, env: Any, node: Any, content: nodes.Element) -> Any:
-    """Link a name of a package to where its module documents it."""
+    """Resolve a name that a package re-exports to the module that documents it."""
     target = node.get("reftarget", "")
     package, _, name = target.rpartition(".")
     domain = env.domains.python_domain
@@ -107,7 +111,7 @@ def find_alias(app: Sphinx, env: Any, node: Any, content: nodes.Element) -> Any:
 
 
 def setup(app: Sphinx) -> None:
-    """Connect what is above."""
+    """Register the functions above with Sphinx."""
     app.connect("doctree-read", shorten_types)
     app.connect("autodoc-process-signature", mend_signature)
     app.connect("missing-reference", find_alias)

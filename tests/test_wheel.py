@@ -348,17 +348,19 @@ def test_it_measures(egoskin: Installed):
 
 
 def test_it_trains_and_draws_a_robot_of_ones_own(egoskin: Installed):
-    write_robot(egoskin.folder / "pip")
-    said = egoskin("robot", "check", "pip", "--out", "pip.png")
+    write_robot(egoskin.folder / "walker")
+    said = egoskin("robot", "check", "walker", "--out", "walker.png")
     assert "stands" in said
-    assert np.ptp(np.asarray(Image.open(egoskin.folder / "pip.png"))) > 100
+    assert np.ptp(np.asarray(Image.open(egoskin.folder / "walker.png"))) > 100
     egoskin(
-        *("train", *SMALL, "--robot", "pip", "--skin.num-sensors", "4"),
-        *("--total-frames", BATCH, "--run-dir", "runs/pip"),
+        *("train", *SMALL, "--robot", "walker", "--skin.num-sensors", "4"),
+        *("--total-frames", BATCH, "--run-dir", "runs/walker"),
     )
     # Its policy no longer needs the folder.
-    shutil.rmtree(egoskin.folder / "pip")
-    assert "runs/pip: 256 frames" in egoskin("evaluate", "runs/pip", "--episodes", "4")
+    shutil.rmtree(egoskin.folder / "walker")
+    assert "runs/walker: 256 frames" in egoskin(
+        "evaluate", "runs/walker", "--episodes", "4"
+    )
 
 
 @pytest.mark.parametrize(

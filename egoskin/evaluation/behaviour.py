@@ -85,7 +85,7 @@ class Motion:
     """Motion: means over all steps except those that terminate an episode."""
 
     power: float
-    """Mechanical power of the joints, sum |torque x velocity| [W]."""
+    """Mechanical power of the joints, sum of ``|torque x velocity|`` [W]."""
     joint_acceleration: float
     """Root mean square joint acceleration, by differences of steps [rad/s^2]."""
     torque_saturation: float

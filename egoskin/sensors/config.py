@@ -76,7 +76,7 @@ class SensorConfig:
 
     coverage: Literal["field", "ray", "none", "oracle"] = "field"
     """Spherical field, grid of beams, none (a blind robot), or oracle: the true
-    position and velocity of every ball instead of sensors, an upper bound."""
+    position and velocity of every ball instead of sensors, for comparison."""
     signal: Literal["localization", "proximity", "closeness", "binary"] = "proximity"
     """Position of nearest detected ball; distance / range; 1 - that; 1 if in range."""
     range: Annotated[float, Interval(ge=1e-3, le=math.inf)] = 2.0

@@ -63,7 +63,7 @@ class Finding:
     claims: tuple[Claim, ...]
     """Its testable claims; all must hold."""
     metric: str = "success_3s"
-    """Metric of the contrasts, see `egoskin.study.report.METRICS`."""
+    """Metric of the contrasts: a name in ``egoskin.study.metrics``."""
     stand_in: str = ""
     """Statement tested instead, if the paper's is about another budget; else ""."""
 

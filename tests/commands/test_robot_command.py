@@ -14,10 +14,10 @@ from owning import MODEL, TOML, write_robot
 
 @pytest.mark.parametrize("script", ["robot", "robot.py"])
 def test_a_robot_that_stands_is_told_so_and_drawn(script, tmp_path):
-    picture = tmp_path / "pip.png"
-    out = succeed(script, "check", write_robot(tmp_path / "pip"), "--out", picture)
+    picture = tmp_path / "walker.png"
+    out = succeed(script, "check", write_robot(tmp_path / "walker"), "--out", picture)
     # 10 + 2 x (1 + 2 + 0.5) kg; 0.69 + 0.4 m.
-    assert out.startswith("pip: 6 joints, 7 links, 17.00 kg\n")
+    assert out.startswith("walker: 6 joints, 7 links, 17.00 kg\n")
     assert "1.09 m tall, its base 0.69 m up" in out
     assert "skin: 64 sensors on 3 links" in out
     # 0.3 x 60 / 150 rad.
@@ -49,7 +49,7 @@ def test_a_robot_that_falls_must_learn_to_stand():
 )
 def test_what_is_wrong_with_a_robot_is_told(old, new, told, tmp_path):
     folder = write_robot(
-        tmp_path / "pip", TOML.replace(old, new), MODEL.replace(old, new)
+        tmp_path / "walker", TOML.replace(old, new), MODEL.replace(old, new)
     )
     done = call("robot", "check", folder)
     if told is None:
@@ -57,18 +57,18 @@ def test_what_is_wrong_with_a_robot_is_told(old, new, told, tmp_path):
         return
     assert done.returncode == 2
     assert told in done.stdout
-    assert "error: pip cannot be trained" in done.stderr
+    assert "error: walker cannot be trained" in done.stderr
 
 
 def test_a_model_alone_cannot_be_trained(tmp_path: Path):
-    done = call("robot", "check", write_robot(tmp_path) / "pip.xml")
-    assert "pip has no gains" in done.stdout
+    done = call("robot", "check", write_robot(tmp_path) / "walker.xml")
+    assert "walker has no gains" in done.stdout
     assert done.returncode == 2
 
 
 def test_a_joint_without_a_range_and_a_weak_one_are_notes(tmp_path):
     model = MODEL.replace(' range="-1.5 1.5"', "")
     toml = TOML.replace("kp = 20, kd", "kp = 500, kd")
-    out = succeed("robot", "check", write_robot(tmp_path / "pip", toml, model))
+    out = succeed("robot", "check", write_robot(tmp_path / "walker", toml, model))
     assert "no range: left_shoulder, right_shoulder, left_hip" in out
     assert "by less than 0.1 rad: left_shoulder, right_shoulder;" in out

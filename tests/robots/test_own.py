@@ -45,32 +45,33 @@ URDF = """<robot name="stump">
 
 
 @pytest.fixture(scope="module")
-def pip(tmp_path_factory) -> RobotConfig:
+def walker(tmp_path_factory) -> RobotConfig:
     """The small robot, as data."""
-    return portable(read_folder(write_robot(tmp_path_factory.mktemp("own") / "pip")))
+    return portable(read_folder(write_robot(tmp_path_factory.mktemp("own") / "walker")))
 
 
 # --- from a folder, from a file ---------------------------------------------------
 
 
 def test_a_folder_is_a_robot(tmp_path):
-    robot = find_robot(str(write_robot(tmp_path / "pip")))
-    assert robot.name == "pip"
+    robot = find_robot(str(write_robot(tmp_path / "walker")))
+    assert robot.name == "walker"
     assert robot.feet == ("left_foot", "right_foot")
     assert robot.skin_links == ("trunk", "left_arm", "right_arm")
     assert robot.default_joint_pos.tolist() == [0.1, 0, 0, 0, 0, 0]
     kp, kd = robot.joint_gains(None)
     assert kp.tolist() == [20, 20, 150, 150, 150, 150]
     assert kd.tolist() == [1, 1, 5, 5, 5, 5]
-    assert find_robot(str(tmp_path / "pip" / "robot.toml")).links == robot.links
+    assert find_robot(str(tmp_path / "walker" / "robot.toml")).links == robot.links
 
 
 def test_a_variable_of_a_python_file_is_a_robot(tmp_path):
-    folder = write_robot(tmp_path / "pip")
+    folder = write_robot(tmp_path / "walker")
     (tmp_path / "mine.py").write_text(
         "from pathlib import Path\n"
         "from egoskin.robots.config import Gain, RobotConfig\n"
-        f"ROBOT = RobotConfig(name='pip', model_path=Path({str(folder)!r}, 'pip.xml'),"
+        "ROBOT = RobotConfig(name='walker',"
+        f" model_path=Path({str(folder)!r}, 'walker.xml'),"
         " base='trunk', skin_links=('trunk',), feet=('left_foot', 'right_foot'),"
         " gains={'one': {'*': Gain(kp=50, kd=2)}})\n"
     )
@@ -89,7 +90,7 @@ def test_a_variable_of_a_python_file_is_a_robot(tmp_path):
         ('base = "trunk"', 'base = "chest"', 2, "chest"),
         ('base = "trunk"', "", 1, "base is missing"),
         ('base = "trunk"', 'bas = "trunk"', 2, "did you mean 'base'"),
-        ('"pip.xml"', '"no.xml"', 1, "no file"),
+        ('"walker.xml"', '"no.xml"', 1, "no file"),
         ('["*_foot"]', '["left_fot"]', 3, "did you mean 'left_foot'"),
         ('["*_foot"]', '"left_foot"', 3, "feet must be a list of links"),
         ('    "*_arm",', '    "*_hand",', 6, "no link '*_hand'"),
@@ -107,7 +108,7 @@ def test_a_variable_of_a_python_file_is_a_robot(tmp_path):
     ],
 )
 def test_what_is_wrong_is_told_with_its_line(old, new, line, text, tmp_path):
-    folder = write_robot(tmp_path / "pip", TOML.replace(old, new))
+    folder = write_robot(tmp_path / "walker", TOML.replace(old, new))
     with pytest.raises(ValueError, match=r"robot\.toml:\d+: ") as error:
         read_folder(folder)
     assert f"robot.toml:{line}: " in str(error.value)
@@ -127,21 +128,21 @@ def test_what_is_no_robot_is_told(tmp_path):
 # --- as data ----------------------------------------------------------------------
 
 
-def test_a_robot_as_data_is_the_same_robot(pip, tmp_path):
-    before = read_folder(write_robot(tmp_path / "pip"))
-    assert (pip.links, pip.joints) == (before.links, before.joints)
+def test_a_robot_as_data_is_the_same_robot(walker, tmp_path):
+    before = read_folder(write_robot(tmp_path / "walker"))
+    assert (walker.links, walker.joints) == (before.links, before.joints)
     for name in ("body_mass", "body_inertia", "jnt_range", "jnt_actfrcrange"):
         own = getattr(before.model, name)
-        np.testing.assert_allclose(getattr(pip.model, name), own, atol=1e-5)
+        np.testing.assert_allclose(getattr(walker.model, name), own, atol=1e-5)
     # The ground, the light and the motor are left out.
-    assert (pip.model.nu, pip.model.nlight) == (0, 0)
-    assert "ground" not in pip.model_xml
+    assert (walker.model.nu, walker.model.nlight) == (0, 0)
+    assert "ground" not in walker.model_xml
     # 0.05 + 0.62 + 0.02: hip, leg, half a sole.
-    assert pip.default_base_height == pytest.approx(0.69)
+    assert walker.default_base_height == pytest.approx(0.69)
 
 
-def test_cylinders_become_capsules_as_long_and_as_wide(pip):
-    (leg,) = (shape for shape in pip.primitives if shape.link == "left_leg")
+def test_cylinders_become_capsules_as_long_and_as_wide(walker):
+    (leg,) = (shape for shape in walker.primitives if shape.link == "left_leg")
     assert (leg.kind, *leg.size[:2]) == ("capsule", 0.05, pytest.approx(0.23))
 
 
@@ -158,9 +159,9 @@ def test_links_and_joints_may_go_without_a_name(tmp_path):
     DodgeballEnv(robot, DodgeballConfig(), num_envs=1, seed=0).check_env_specs()
 
 
-def test_balls_and_floor_meet_a_robot_that_was_not_made_for_them(pip):
+def test_balls_and_floor_meet_a_robot_that_was_not_made_for_them(walker):
     task = DodgeballConfig()
-    env = DodgeballEnv(pip, task, num_envs=8, seed=0)
+    env = DodgeballEnv(walker, task, num_envs=8, seed=0)
     td = env.reset()
     heights = []
     for _ in range(120):
@@ -169,11 +170,11 @@ def test_balls_and_floor_meet_a_robot_that_was_not_made_for_them(pip):
         heights.append(td["base_pose"][:, 2])
     assert torch.stack(heights).min() > 0
     assert td["balls_arrived"].sum() + td["hit"].sum() > 0
-    both = pip.model.geom_conaffinity & 3
+    both = walker.model.geom_conaffinity & 3
     assert np.all(both == 3)
-    assert not np.any(pip.model.geom_contype & 3)
+    assert not np.any(walker.model.geom_contype & 3)
     # Its own shapes collide as before: by MuJoCo's default all of them do.
-    assert np.all(pip.model.geom_contype & pip.model.geom_conaffinity)
+    assert np.all(walker.model.geom_contype & walker.model.geom_conaffinity)
 
 
 def test_shapes_that_only_look_are_dropped_and_their_masses_stay(tmp_path):
@@ -215,15 +216,15 @@ def test_the_base_of_a_urdf_floats(tmp_path):
     assert [s.kind for s in robot.primitives] == ["box", "box"]
 
 
-def test_a_robot_as_data_comes_back_as_it_was(pip):
-    config = EnvConfig(robot=pip)
+def test_a_robot_as_data_comes_back_as_it_was(walker):
+    config = EnvConfig(robot=walker)
     content = json.loads(json.dumps(to_plain(config)))
     again = from_plain(EnvConfig, content, "it")
     assert again == config
-    assert hash(again.robot) == hash(pip)
-    _ = pip.model
-    assert pickle.loads(pickle.dumps(pip)) == pip
-    assert "model" not in vars(pickle.loads(pickle.dumps(pip)))
+    assert hash(again.robot) == hash(walker)
+    _ = walker.model
+    assert pickle.loads(pickle.dumps(walker)) == walker
+    assert "model" not in vars(pickle.loads(pickle.dumps(walker)))
 
 
 def test_names_of_the_package_stay_names():
@@ -246,7 +247,7 @@ def test_a_robot_has_one_model():
 def trained(tmp_path_factory) -> Path:
     """A run of one rollout with a robot whose folder is gone."""
     root = tmp_path_factory.mktemp("trained")
-    folder = write_robot(root / "pip")
+    folder = write_robot(root / "walker")
     succeed(
         *("train", *SMALL, "--robot", folder, "--skin.num-sensors", "8"),
         *("--total-frames", "512", "--run-dir", root / "run"),
@@ -255,13 +256,13 @@ def trained(tmp_path_factory) -> Path:
     return root / "run"
 
 
-def test_a_trained_policy_is_loaded_where_its_robot_is_not(trained, pip, tmp_path):
+def test_a_trained_policy_is_loaded_where_its_robot_is_not(trained, walker, tmp_path):
     (file,) = (p for p in (trained / "policies").iterdir() if "512" in p.name)
     alone = tmp_path / "policy.safetensors"
     shutil.copy(file, alone)
     for path in (trained, alone):
         policy = egoskin.load_policy(path)
-        assert policy.env_config.robot == pip
+        assert policy.env_config.robot == walker
         env = egoskin.make_worker_env(
             policy.env_config, policy.skin, num_envs=2, seed=0
         )
@@ -336,7 +337,7 @@ def watch_opens(names: list[str], folder: Path) -> None:
 
 def test_mistakes_of_the_command_line_are_told(tmp_path):
     toml = TOML.replace('["*_foot"]', '["left_fot"]')
-    told = call("train", "--robot", write_robot(tmp_path / "pip", toml))
+    told = call("train", "--robot", write_robot(tmp_path / "walker", toml))
     assert told.returncode == 2
     assert "did you mean 'left_foot'" in " ".join(told.stderr.split())
     bare = tmp_path / "bare.xml"
