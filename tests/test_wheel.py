@@ -190,26 +190,6 @@ def test_it_is_called_by_its_name_or_as_a_module(egoskin: Installed):
         assert egoskin(name, "--help").startswith(f"usage: egoskin {name} ")
 
 
-def test_help_takes_less_than_a_second(egoskin: Installed):
-    before = os.times()
-    egoskin("train", "--help")
-    after = os.times()
-    used = after.children_user + after.children_system
-    assert used - before.children_user - before.children_system < 1
-
-
-@pytest.mark.parametrize(
-    ("args", "nearest"),
-    [
-        (("trian",), "'train'"),
-        (("train", "--sensor.rang", "1"), "--sensor.range"),
-        (("evaluate", "blind", "--epsiodes", "3"), "--episodes"),
-    ],
-)
-def test_a_mistyped_name_is_answered_with_the_nearest(egoskin, args, nearest):
-    assert nearest in egoskin.run("egoskin", *args, status=2)
-
-
 # --- every command ------------------------------------------------------------------
 
 

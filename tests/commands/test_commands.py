@@ -378,17 +378,3 @@ def test_bad_input_to_training_is_one_clear_message(
     assert expected in fail("train", *args)
     assert sorted(os.listdir(tmp_path)) == ["full", "skin.json"]
     assert (tmp_path / "full" / "notes.txt").read_text() == "mine"
-
-
-def test_a_changed_field_is_refused_by_name_on_resume(trained: Path):
-    before = (trained / "checkpoint.safetensors").read_bytes()
-    text = fail("train", "--resume", trained, "--seed", "1", "--sensor.range", "1")
-    assert "changed: sensor.range, seed" in text
-    assert (trained / "checkpoint.safetensors").read_bytes() == before
-
-
-def test_a_truncated_checkpoint_is_refused(trained: Path, tmp_path: Path):
-    content = (trained / "checkpoint.safetensors").read_bytes()
-    (tmp_path / "cut.safetensors").write_bytes(content[: len(content) // 2])
-    text = fail("evaluate", tmp_path / "cut.safetensors")
-    assert "cut.safetensors is truncated" in text

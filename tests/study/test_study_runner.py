@@ -31,7 +31,6 @@ from egoskin.study.manifest import EvaluationPlan, Manifest, PlannedRun, Study, 
 from egoskin.study.metrics import runs_csv
 from egoskin.study.runner import LocalRunner, Progress, slurm_script
 from egoskin.study.store import Failure, StudyFolder, duration
-from studies import as_format_1
 
 # 16 agents x 16 steps are 256 frames a rollout.
 BATCH = 256
@@ -228,28 +227,6 @@ def test_a_result_that_was_edited_or_exchanged_is_refused(folder: StudyFolder):
     shutil.copy(policies / "000000000000.safetensors", policy)
     with pytest.raises(ValueError, match="does not belong to the policy"):
         table(folder)
-
-
-@pytest.mark.slow
-def test_a_study_begun_before_options_changed_goes_on(tmp_path: Path):
-    folder = StudyFolder(tmp_path / "study")
-    old = dataclasses.replace(SHORT, standard="1", seeds=(0, 1))
-    folder.plan(resolve(old))
-    assert work(folder, NAME, Never()) == 0
-    assert work(folder, "blind-seed1", Never(requested=True)) == STOPPED
-    configs = [*folder.path.glob("runs/*/config.json")]
-    configs += folder.path.glob("results/*/config.json")
-    assert len(configs) == 3
-    for path in (folder.manifest_path, *configs):
-        as_format_1(path)
-    # Finished runs stay as they are, and a stopped one is resumed.
-    (done,) = table(folder)
-    before = files(folder.result_path(NAME))
-    for run in folder.plan(resolve(old)).runs:
-        assert work(folder, run.name, Never()) == 0
-    assert table(folder)[0] == done
-    assert files(folder.result_path(NAME)) == before
-    assert [row["trained_on"] for row in table(folder)] == ["1"] * 2
 
 
 # --- progress -----------------------------------------------------------------------
