@@ -17,6 +17,7 @@ import pytest
 import torch
 from torchrl.envs import Compose, Transform, TransformedEnv
 
+from calling import wait_for
 from egoskin import parallel as workers
 from egoskin.envs.dodgeball import DodgeballEnv
 from egoskin.make import (
@@ -34,7 +35,7 @@ from egoskin.parallel import (
 from egoskin.robots.config import H1_2
 from egoskin.sensors import place_sensors
 from egoskin.sensors.kernels.compilation import SETTING
-from throwing import TASK
+from throwing import TASK, assert_same
 
 NUM_ENVS = 32
 CONFIG = EnvConfig(task=TASK)
@@ -59,12 +60,6 @@ def steps(pool: WorkerPool, root, count: int, seed: int):
         data, root = pool.step_and_maybe_reset(root)
         seen.append(data["next"].reshape(-1))
     return torch.stack(seen), root
-
-
-def assert_same(one, other) -> None:
-    assert one.keys() == other.keys()
-    for key in one.keys():
-        assert torch.equal(one[key], other[key]), key
 
 
 def test_results_do_not_depend_on_the_number_of_workers(skin):
@@ -296,11 +291,8 @@ pool.step_and_maybe_reset(root)
         time.sleep(0.5)
         assert worker.exists()
         parent.kill()
-    deadline = time.monotonic() + 5
     # An ended process is gone, or a zombie until its new parent has noticed.
-    while worker.exists() and worker.read_text().rpartition(")")[2].split()[0] != "Z":
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    wait_for(lambda: not worker.exists() or ") Z " in worker.read_text(), 5)
 
 
 UNGUARDED = """

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from typing import Any
 
@@ -13,7 +12,7 @@ import pytest
 import torch
 
 import egoskin
-from calling import fail, succeed
+from calling import fail, hide, succeed
 from egoskin.agents.networks import NetworkConfig, input_keys
 from egoskin.envs.physics.contract import Scene
 from egoskin.envs.physics.model import build_scene
@@ -215,10 +214,7 @@ def test_the_command_writes_the_file_and_lists_its_input(tmp_path):
 
 
 def test_without_onnx_the_command_names_the_extra(tmp_path, monkeypatch):
-    find = importlib.util.find_spec
-    monkeypatch.setattr(
-        importlib.util, "find_spec", lambda name: None if name == "onnx" else find(name)
-    )
+    hide("onnx", monkeypatch)
     error = fail("export", "blind", "--out", tmp_path / "policy.onnx")
     assert "export needs onnx: `pip install 'egoskin[export]'`" in error
     assert not list(tmp_path.iterdir())

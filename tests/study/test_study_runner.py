@@ -4,23 +4,20 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-import importlib.util
 import io
 import json
 import os
-import resource
 import shutil
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 
 import pytest
 
-from calling import call, succeed
+from calling import call, hide, limit_file_size, succeed, wait_for
 from egoskin.runs.run import Run
 from egoskin.storage.formats import read_sealed, sealed_json
 from egoskin.storage.serialization import to_plain
@@ -387,13 +384,6 @@ def undisturbed(tiny: Manifest, tmp_path_factory) -> list[dict[str, str]]:
     return rows
 
 
-def wait_for(condition: Callable[[], object], seconds: float = 300) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-
-
 def in_the_middle(folder: StudyFolder) -> list[str]:
     """Return the runs that are between a quarter and the end of their frames."""
     status = folder.status(folder.manifest())
@@ -488,16 +478,12 @@ def test_ctrl_c_ends_all_runs_with_checkpoints(study, start, undisturbed):
     assert table(study) == undisturbed
 
 
-def limit_file_size(size: int) -> None:
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
-
-
 @pytest.mark.slow
 def test_a_full_disk_is_told_and_what_was_missing_is_made_up_for(
     study, start, undisturbed
 ):
     # No checkpoint fits any more.
-    full = start(study.path, "--tries", "1", preexec_fn=partial(limit_file_size, 50000))
+    full = start(study.path, "--tries", "1", preexec_fn=lambda: limit_file_size(50000))
     assert full.end() == 1
     for run in study.manifest().runs:
         failure = study.failure(run.name)
@@ -571,11 +557,6 @@ def test_bad_input_is_one_line(args, text, tmp_path: Path):
 def test_a_package_that_is_missing_is_named(
     package, args, error, finished: Path, monkeypatch
 ):
-    find = importlib.util.find_spec
-    monkeypatch.setattr(
-        importlib.util,
-        "find_spec",
-        lambda name: None if name == package else find(name),
-    )
+    hide(package, monkeypatch)
     assert call("study", *args, finished).stderr == f"error: {error}\n"
     assert not (finished / "report").exists()
