@@ -1,12 +1,19 @@
-"""Run commands in this process, because importing takes most of a call."""
+"""Run commands in this process, because importing takes most of a call.
+
+Also what tests of processes share: waiting, a full disk, a missing package.
+"""
 
 from __future__ import annotations
 
+import importlib.util
 import io
+import resource
 import runpy
 import signal
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from importlib import import_module
 from pathlib import Path
@@ -70,3 +77,27 @@ def fail(name: str, *args: object) -> str:
     assert done.returncode == 2, done.stderr
     assert "Traceback" not in done.stderr
     return " ".join(done.stderr.split())
+
+
+def wait_for(condition: Callable[[], object], seconds: float = 300) -> None:
+    """Return as soon as a condition holds."""
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def limit_file_size(size: int) -> None:
+    """Let this process write no file of more bytes, as if the disk were full."""
+    _, most = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, most))
+
+
+def hide(package: str, patch: pytest.MonkeyPatch) -> None:
+    """Let a package seem not to be installed."""
+    find = importlib.util.find_spec
+    patch.setattr(
+        importlib.util,
+        "find_spec",
+        lambda name: None if name == package else find(name),
+    )

@@ -1,12 +1,16 @@
-"""Untrained policies, for tests that apply to every policy."""
+"""Untrained policies, for tests that apply to every policy, and a small run."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import torch
 
 from egoskin.agents.networks import Agent, NetworkConfig
 from egoskin.make import EnvConfig, make_worker_env
 from egoskin.policies.policy import Policy, PolicySpec, sparse_sources
+from egoskin.runs.config import TrainConfig
+from egoskin.sensors.config import SensorConfig
 
 
 def make_agent(
@@ -37,3 +41,14 @@ def make_policy(
 ) -> Policy:
     """Return a policy for an environment, with random weights and statistics."""
     return Policy(*make_agent(config, network or NetworkConfig(), seed))
+
+
+def blind_run(path: Path, total_frames: int) -> TrainConfig:
+    """Return a training without sensors, whose rollouts are 64 frames."""
+    return TrainConfig(
+        env=EnvConfig(sensor=SensorConfig(coverage="none")),
+        run_dir=path,
+        num_envs=4,
+        num_workers=1,
+        total_frames=total_frames,
+    )

@@ -9,6 +9,8 @@ import numpy as np
 import torch
 from hypothesis import strategies as st
 
+from egoskin.robots.config import H1_2
+from egoskin.sensors import Skin
 from egoskin.shapes import Box, Capsule, Ellipsoid, Sphere
 
 KINDS = ("sphere", "box", "capsule", "ellipsoid")
@@ -28,6 +30,31 @@ def along_axes(angle: float) -> float:
     """A square view's angle from corner to corner, from that along an axis [deg]."""
     tangent = math.tan(math.radians(angle) / 2)
     return 2 * math.degrees(math.atan(math.sqrt(2) * tangent))
+
+
+def looking_up(roll_deg: float = 0.0) -> Skin:
+    """One sensor, at the origin of the base."""
+    return Skin(
+        robot="h1_2",
+        links=("pelvis",),
+        position=np.zeros((1, 3)),
+        normal=np.array([[0.0, 0, 1]]),
+        roll_deg=np.array([roll_deg]),
+    )
+
+
+def look(sensor, *centres, active=None, quat=(1, 0, 0, 0)):
+    """(distance ``[K]``, detected) for objects at places, base at the origin."""
+    pose = torch.zeros(1, len(centres), 7, dtype=torch.float64)
+    pose[0, :, :3] = torch.tensor(centres, dtype=torch.float64)
+    pose[0, :, 3:] = torch.tensor(quat, dtype=torch.float64)
+    distance, detected = sensor.compute(
+        torch.tensor([[0, 0, 0, 1, 0, 0, 0]], dtype=torch.float64),
+        torch.zeros(1, len(H1_2.joints), dtype=torch.float64),
+        pose,
+        torch.tensor([active or [True] * len(centres)]),
+    )
+    return distance[0, 0].tolist(), detected[0].tolist()
 
 
 def measure(sensor, state):

@@ -302,7 +302,7 @@ def test_learning_has_the_numbers_they_say():
         [net.init_std, *net.std_bounds],
         [ppo.noise_correlation, ppo.noise_correlation_start],
     ]
-    assert len(net.hidden) == 2
+    assert net.hidden == (32, 32)
 
 
 def test_every_column_of_the_metrics_is_explained(trained):

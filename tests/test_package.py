@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pydoc
 import re
 import runpy
 import shutil
@@ -18,7 +17,7 @@ from setuptools.config.pyprojecttoml import read_configuration
 from tensordict import TensorDict
 
 import egoskin
-from egoskin.sensors import FieldSensor, RaySensor, Skin
+from egoskin.sensors import FieldSensor, RaySensor
 from egoskin.shapes import Sphere
 from throwing import TASK
 
@@ -39,17 +38,6 @@ def test_the_package_lists_its_names_and_its_version():
     # The one that setuptools writes into the package.
     built = read_configuration(README.parent / "pyproject.toml")
     assert built["project"]["version"] == egoskin.__version__
-
-
-def test_help_on_a_skin_says_shapes_and_units():
-    text = pydoc.plain(pydoc.render_doc(Skin))
-    for name, shape in {
-        "position": "[S, 3]",
-        "normal": "[S, 3]",
-        "range": "[S]",
-    }.items():
-        assert re.search(rf"{name}: [^:]*{re.escape(shape)}", text), name
-    assert "[m]" in text
 
 
 def test_an_environment_has_the_skin_of_its_configuration_by_default():

@@ -398,8 +398,6 @@ def test_nan_is_passed_on(shape, dtype, coordinate):
     not any(map(shutil.which, (os.environ.get("CXX", "g++"), "clang++"))),
     reason="torch.compile needs a C++ compiler",
 )
-# Torch itself warns so when its compiler is first imported.
-@pytest.mark.filterwarnings("ignore:`torch.jit.script_method` is deprecated")
 @every_shape
 def test_compiled_code_gives_the_same_bits(shape):
     # Not a multiple of any vector length: the rest is computed one by one.

@@ -34,7 +34,7 @@ from egoskin.sensors import (
 )
 from egoskin.sensors.config import SensorConfig
 from egoskin.transform import RowTransform
-from throwing import TASK
+from throwing import TASK, assert_same, wild_actions
 
 SKIN = place_sensors(H1_2, 12, seed=0)
 BALLS = TASK.throws.balls
@@ -88,11 +88,6 @@ def select(state: TensorDict, keys) -> TensorDict:
     return TensorDict({key: state[key] for key in keys}, batch_size=state.batch_size)
 
 
-def assert_same_bits(a, b, keys):
-    for key in keys:
-        assert torch.equal(a[key], b[key]), key
-
-
 # --- offline --------------------------------------------------------------------
 
 
@@ -103,7 +98,7 @@ def test_works_offline_with_a_time_dimension(build, full_state):
     flat = transform(select(state, ins))
     stored = transform(select(state, ins).reshape(5, 32))
     assert stored.batch_size == (5, 32)
-    assert_same_bits(stored.reshape(-1), flat, transform.out_keys)
+    assert_same(stored.reshape(-1), flat)
 
 
 @every_transform
@@ -207,7 +202,7 @@ def test_inputs_are_never_written(build, full_state):
     # Writing to a result must not reach an input either.
     for key in transform.out_keys:
         result[key].fill_(1)
-    assert_same_bits(state, before, transform.in_keys)
+    assert_same(select(state, transform.in_keys), before)
 
 
 @every_transform
@@ -416,17 +411,10 @@ SENSORS = {
 }
 
 
-def actions(steps: int, rows: int) -> torch.Tensor:
-    """Fixed extreme actions: robots fall soon, at different times."""
-    generator = torch.Generator().manual_seed(0)
-    size = 0.7 * torch.rand(rows, 1, generator=generator)
-    return (size * torch.randn(100, rows, JOINTS, generator=generator))[:steps]
-
-
 def run(env, steps: int) -> list[TensorDict]:
     """Outputs of an environment under fixed actions, flat over its rows."""
     out, root = [], env.reset()
-    for action in actions(steps, root.numel()):
+    for action in wild_actions(root.numel(), 100)[:steps]:
         root["action"] = action.reshape(*root.batch_size, JOINTS)
         step, root = env.step_and_maybe_reset(root)
         out += [step["next"].reshape(-1).clone(), root.reshape(-1).clone()]

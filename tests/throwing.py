@@ -1,11 +1,27 @@
-"""Throws for tests that need a ball at once."""
+"""Throws, actions and comparisons for tests of the task."""
 
 from __future__ import annotations
 
+import torch
+from tensordict import TensorDictBase
+
 from egoskin.envs.dodgeball import DodgeballConfig
 from egoskin.envs.throws import ThrowConfig
+from egoskin.robots.config import H1_2
 
 AT_ONCE = ThrowConfig(first_delay=(0.0, 0.0))
 """The default throws, the first ball at the start of the episode."""
 TASK = DodgeballConfig(throws=AT_ONCE)
 """The default task with them."""
+
+
+def wild_actions(rows: int, steps: int = 150) -> torch.Tensor:
+    """Return fixed actions, ``[T, rows, J]``: the robots fall, at different times."""
+    generator = torch.Generator().manual_seed(0)
+    size = 0.7 * torch.rand(rows, 1, generator=generator)
+    return size * torch.randn(steps, rows, len(H1_2.joints), generator=generator)
+
+
+def assert_same(one: TensorDictBase, other: TensorDictBase) -> None:
+    """Assert that the same entries are equal bit for bit, and none is NaN."""
+    torch.testing.assert_close(one.to_dict(), other.to_dict(), rtol=0, atol=0)

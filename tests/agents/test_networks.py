@@ -43,13 +43,6 @@ def test_separate_inputs_equal_one_layer_of_their_concatenation():
     torch.testing.assert_close(net(x, y), net.tail(joined(torch.cat((x, y), 1))))
 
 
-def test_networks_are_two_layers_of_32_by_default():
-    agent = make_agent()
-    shapes = [tuple(p.shape) for n, p in agent.head.body.named_parameters()]
-    expected = [(32, 6), (32,), (32, 5), (32, 32), (32,), (3, 32), (3,)]
-    assert sorted(shapes) == sorted(expected)
-
-
 def test_running_norm_equals_the_statistics_of_all_data():
     norm = RunningNorm(3)
     parts = [torch.randn(n, 3) * 5 + 2 for n in (7, 100, 1)]

@@ -234,9 +234,3 @@ def test_bad_input_is_one_clear_message(args, expected):
     before = sorted(Path().iterdir())
     assert expected in fail("skin", *args)
     assert sorted(Path().iterdir()) == before
-
-
-def test_the_command_says_what_it_can_do():
-    out = run("--help")
-    for command in ("place", "import", "export", "show"):
-        assert command in out

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 import torch
 
 from calling import fail, succeed
 from egoskin.commands.verify import agree, run_hash
-from egoskin.make import EnvConfig
 from egoskin.parallel import WorkerPool
 from egoskin.runs.config import TrainConfig
 from egoskin.runs.run import Run
 from egoskin.runs.trainer import open_trainer, train
-from egoskin.sensors.config import SensorConfig
 from egoskin.sensors.kernels.compilation import SETTING
 from egoskin.storage.tensor_file import load_tensors, save_tensors
+from making import blind_run
 
 
 @pytest.mark.slow
@@ -74,9 +71,7 @@ def test_a_difference_of_one_bit_is_found(exact, monkeypatch, tmp_path, capsys):
 
 
 def test_the_hash_is_of_values_alone(tmp_path):
-    blind = EnvConfig(sensor=SensorConfig(coverage="none"))
-    config = TrainConfig(env=blind, num_envs=16, total_frames=2 * 16 * 16)
-    run = Run.create(replace(config, num_workers=1, run_dir=tmp_path / "run"))
+    run = Run.create(blind_run(tmp_path / "run", 128))
     with open_trainer(run) as trainer:
         train(trainer)
     before = run_hash(run)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from dataclasses import replace
 from typing import Any
 
@@ -18,7 +17,7 @@ from egoskin.envs.rewards import TERMS, RewardConfig, reward_terms
 from egoskin.envs.throws import ThrowConfig
 from egoskin.robots.config import H1_2
 from egoskin.robots.surface import sample_surface
-from throwing import AT_ONCE
+from throwing import AT_ONCE, assert_same, wild_actions
 
 JOINTS = len(H1_2.joints)
 DEFAULT = torch.from_numpy(H1_2.default_joint_pos).float()
@@ -37,13 +36,6 @@ def make(num_envs: int, **options) -> DodgeballEnv:
     return DodgeballEnv(H1_2, DodgeballConfig(**options), num_envs=num_envs, **kwargs)
 
 
-def wild_actions(rows: int) -> torch.Tensor:
-    """Return fixed actions for 150 steps: the robots fall, at different times."""
-    generator = torch.Generator().manual_seed(0)
-    size = 0.7 * torch.rand(rows, 1, generator=generator)
-    return size * torch.randn(150, rows, JOINTS, generator=generator)
-
-
 def advance(env, root: TensorDict, action=None) -> tuple[TensorDict, TensorDict]:
     """Return (output of the step, root of the next step)."""
     if action is None:
@@ -60,11 +52,6 @@ def run(env, actions: torch.Tensor, root: TensorDict | None = None) -> Any:
         step, root = advance(env, root, action)
         out.append(TensorDict({"next": step, "root": root}, env.batch_size).clone())
     return torch.stack(out)
-
-
-def assert_same_bits(a: TensorDict, b: TensorDict) -> None:
-    for key in a.keys(True, True):
-        assert torch.equal(a[key], b[key]), key
 
 
 def throw(env: DodgeballEnv, ball: int, position, velocity=(0.0, 0, 0), rows=None):
@@ -112,12 +99,12 @@ def test_rows_do_not_depend_on_how_they_are_split(whole_run, split):
         env = make(rows, seed=3, row_offset=offset, throws=SOON)
         parts.append(run(env, actions[:, offset : offset + rows]))
         offset += rows
-    assert_same_bits(torch.cat(parts, 1), whole_run)
+    assert_same(torch.cat(parts, 1), whole_run)
 
 
 def test_rows_do_not_depend_on_the_number_of_threads(whole_run):
     again = run(make(32, seed=3, num_threads=2, throws=SOON), wild_actions(32)[:60])
-    assert_same_bits(again, whole_run[:60])
+    assert_same(again, whole_run[:60])
 
 
 def test_another_seed_gives_other_episodes(whole_run):
@@ -138,7 +125,7 @@ def test_set_seed_starts_the_draws_again(whole_run):
     env = make(32, seed=99, throws=SOON)
     run(env, wild_actions(32)[:5])
     env.set_seed(3, static_seed=True)
-    assert_same_bits(run(env, wild_actions(32)[:5]), whole_run[:5])
+    assert_same(run(env, wild_actions(32)[:5]), whole_run[:5])
 
 
 @pytest.mark.parametrize("target_velocity", ["zero", "finite_difference"])
@@ -155,12 +142,12 @@ def test_a_saved_state_continues_bit_for_bit(target_velocity):
 
     second = make(32, **options)
     second.load_simulation_state(saved)
-    assert_same_bits(run(second, actions[40:90], root.clone()), after)
+    assert_same(run(second, actions[40:90], root.clone()), after)
     # A worker takes its own rows from the state of all workers.
     part = make(10, row_offset=7, **options)
     part.load_simulation_state(saved)
     mine = run(part, actions[40:90, 7:17], root[7:17].clone())
-    assert_same_bits(mine, after[:, 7:17])
+    assert_same(mine, after[:, 7:17])
 
 
 def test_partial_reset_keeps_other_rows():
@@ -338,7 +325,7 @@ def test_a_state_saved_during_the_wait_continues_bit_for_bit():
     assert after[-1]["next", "object_active"].any(-1).float().mean() > 0.8
     second = make(32, **options)
     second.load_simulation_state(saved)
-    assert_same_bits(run(second, actions[11:60], root.clone()), after)
+    assert_same(run(second, actions[11:60], root.clone()), after)
 
 
 # --- diverged rows --------------------------------------------------------------
@@ -368,7 +355,7 @@ def test_a_diverged_row_is_reset_alone(value, tmp_path, monkeypatch):
     assert got[0]["root", "episode_step"][row] == 0
     assert not got["next", "diverged"][1:].any()
     assert (env.simulation_state()["episode"] >= ~others).all()
-    assert_same_bits(got[:, others], expected[10:, others])
+    assert_same(got[:, others], expected[10:, others])
 
 
 @pytest.mark.parametrize("value", [np.nan, 1e12, 500.0])
@@ -713,19 +700,6 @@ def test_the_reward_is_the_sum_of_weighted_terms(whole_run):
     )
     change = (wild_actions(32) - before).square().mean(-1)
     torch.testing.assert_close(terms["action_rate"], config.action_rate * change)
-
-
-def test_no_reward_term_reads_a_ball_or_a_sensor():
-    assert set(inspect.signature(reward_terms).parameters) == {
-        "config",
-        "gravity_b",
-        "joint_deviation",
-        "power",
-        "base_lin_vel_w",
-        "displacement_w",
-        "action_change",
-        "terminated",
-    }
 
 
 def test_the_reward_does_not_depend_on_balls_that_do_not_touch():

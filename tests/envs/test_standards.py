@@ -81,14 +81,17 @@ def test_a_version_leaves_the_rest_of_a_task_alone():
         reward=RewardConfig(energy=-1.0),
         action_scale=0.5,
         # What it replaces.
-        throws=ThrowConfig(speed=(1.0, 2.0)),
+        throws=ThrowConfig(lead=0.0, speed=(1.0, 2.0)),
+        start_joint_noise=0.5,
         success_s=1.0,
+        self_contact_ends=True,
     )
     for make in (training_task, evaluation_task):
         task = make("1", own)
         for name in ("physics", "reward", "action_scale"):
             assert getattr(task, name) == getattr(own, name), name
-        assert task.throws.speed == (4.0, 8.0)
+        assert task.throws == make("1", DodgeballConfig()).throws
+        assert {name: getattr(task, name) for name in ENDS} == ENDS
     assert standard_of(training_task("1", own)) == "1"
 
 

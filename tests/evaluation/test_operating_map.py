@@ -43,21 +43,6 @@ def test_the_map_varies_what_it_says_alone_and_two_together():
         assert max(what.values) > high
 
 
-@pytest.mark.parametrize("value", [2.0, 12.0])
-def test_a_ball_has_the_speed_of_its_place(value):
-    throws = maps._speed((value,)).vary(CONFIG.task.throws, value)
-    _, drawn = draws(throws)
-    assert (drawn.speed == value).all()
-    assert throws == replace(CONFIG.task.throws, speed=(value, value))
-
-
-def test_balls_follow_each_other_at_the_time_of_their_place():
-    throws = maps._interval((0.5,)).vary(CONFIG.task.throws, 0.5)
-    _, drawn = draws(throws)
-    assert (drawn.interval == 0.5).all()
-    assert throws == replace(CONFIG.task.throws, interval=(0.5, 0.5))
-
-
 @pytest.mark.parametrize("value", [0.3, 1.5])
 def test_a_ball_is_aimed_at_the_height_of_its_place(value):
     thrower, drawn = draws(maps._HEIGHT.vary(CONFIG.task.throws, value))
@@ -72,11 +57,6 @@ def test_a_ball_comes_from_the_sector_of_its_place(value):
     off = torch.rad2deg(torch.atan2(off.sin(), off.cos()))
     assert -22.501 < off.min() < -21
     assert 21 < off.max() < 22.501
-
-
-def test_the_sectors_are_all_directions():
-    assert sorted(maps._DIRECTIONS) == [-180.0 + 45.0 * i for i in range(8)]
-    assert 8 * 2 * maps._SECTOR == 360
 
 
 @pytest.mark.parametrize(

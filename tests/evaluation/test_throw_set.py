@@ -135,25 +135,8 @@ def test_nothing_arrived_is_not_a_share():
     assert summarize(empty, empty, DodgeballConfig()).avoided.first_ball is None
 
 
-@pytest.mark.parametrize(
-    ("version", "aim"), [("2", "skin"), ("1", "body"), ("paper", "skin")]
-)
-def test_the_standard_throw_replaces_the_throw_of_the_run(version, aim):
-    own = ThrowConfig(lead=0.0, flight="straight", speed=(1.0, 2.0))
-    task = DodgeballConfig(
-        throws=own,
-        action_scale=0.3,
-        self_contact_ends=True,
-        success_s=1.0,
-        start_joint_noise=0.5,
-    )
-    standard = standard_task(EnvConfig(task=task), version)
-    assert standard.task.success_s == 3.0
-    assert standard.task.start_joint_noise == DodgeballConfig().start_joint_noise
-    assert not standard.task.self_contact_ends
-    # The first ball comes at the start, in all of them.
-    assert standard.task.throws == ThrowConfig(first_delay=(0.0, 0.0), aim=aim)
-    assert standard.task.action_scale == 0.3
+def test_a_policy_is_judged_by_version_2_by_default():
+    task = DodgeballConfig(throws=ThrowConfig(lead=0.0), success_s=1.0)
     assert standard_task(EnvConfig(task=task)) == standard_task(EnvConfig(), "2")
 
 

@@ -19,6 +19,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensordict import TensorDict
 
 import egoskin
+from calling import limit_file_size
 from egoskin.agents.ppo import NonFiniteError
 from egoskin.envs.dodgeball import DodgeballConfig
 from egoskin.envs.rewards import TERMS
@@ -32,31 +33,20 @@ from egoskin.runs.trainer import METRIC_KEYS, Trainer, open_trainer, train
 from egoskin.sensors.config import SensorConfig
 from egoskin.storage.formats import read_sealed, sealed_json
 from egoskin.storage.tensor_file import PARTIAL, load_tensors, save_tensors
+from making import blind_run
 
 
 @pytest.fixture
 def config(tmp_path: Path) -> TrainConfig:
     """Three rollouts of 64 frames."""
-    return TrainConfig(
-        env=EnvConfig(sensor=SensorConfig(coverage="none")),
-        run_dir=tmp_path / "run",
-        num_envs=4,
-        num_workers=1,
-        total_frames=192,
-    )
+    return blind_run(tmp_path / "run", 192)
 
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory) -> Iterator[Trainer]:
     """A trainer after one rollout of 64 frames."""
-    config = TrainConfig(
-        env=EnvConfig(sensor=SensorConfig(coverage="none")),
-        run_dir=tmp_path_factory.mktemp("trained") / "run",
-        num_envs=4,
-        num_workers=1,
-        total_frames=64,
-    )
-    with open_trainer(Run.create(config)) as trainer:
+    run = Run.create(blind_run(tmp_path_factory.mktemp("trained") / "run", 64))
+    with open_trainer(run) as trainer:
         train(trainer)
         yield trainer
 
@@ -327,9 +317,8 @@ def test_a_metrics_file_turned_into_a_link_while_it_trains_is_not_followed(
 
 @contextmanager
 def full_disk() -> Iterator[None]:
-    """Limit the size of all files to some bytes."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (16, before[1]))
+    limit_file_size(16)
     try:
         yield
     finally:

@@ -22,6 +22,8 @@ from sensing import (
     SEED,
     SHAPES,
     assert_same_bits_in_any_batch,
+    look,
+    looking_up,
     measure,
     placed_by_mujoco,
     turned,
@@ -190,30 +192,7 @@ def test_sensors_sit_and_look_as_the_skin_says(skin, random_state):
 
 def one_sensor(max_range: float, objects=BALLS[:1], **options) -> FieldSensor:
     """A sensor at the origin of the base, looking up."""
-    skin = Skin(
-        robot="h1_2",
-        links=("pelvis",),
-        position=np.zeros((1, 3)),
-        normal=np.array([[0.0, 0, 1]]),
-    )
-    return FieldSensor(skin, H1_2.chain, objects, max_range, **options)
-
-
-def look(sensor, *centres, active=None, quat=(1, 0, 0, 0)):
-    """(distance, detected) for objects at the given places, base at the origin."""
-    pose = torch.zeros(1, len(centres), 7, dtype=torch.float64)
-    pose[0, :, :3] = torch.tensor(centres, dtype=torch.float64)
-    pose[0, :, 3:] = torch.tensor(quat, dtype=torch.float64)
-    if active is None:
-        active = [True] * len(centres)
-    distance, detected = sensor.compute(
-        torch.tensor([[0, 0, 0, 1, 0, 0, 0]], dtype=torch.float64),
-        torch.zeros(1, len(H1_2.joints), dtype=torch.float64),
-        pose,
-        torch.tensor([active]),
-    )
-    distance = distance[0, 0].tolist()
-    return distance, detected[0].tolist()
+    return FieldSensor(looking_up(), H1_2.chain, objects, max_range, **options)
 
 
 def test_distance_is_to_the_surface():

@@ -25,6 +25,8 @@ from sensing import (
     along_axes,
     assert_same_bits,
     assert_same_bits_in_any_batch,
+    look,
+    looking_up,
     measure,
     placed_by_mujoco,
     turned,
@@ -199,28 +201,8 @@ def test_grazing_beams_are_right_to_a_millimetre(skin, random_state):
 
 def one_sensor(max_range, objects, coverage=None, roll_deg=0.0, **options) -> RaySensor:
     """A sensor at the origin of the base, looking up."""
-    skin = Skin(
-        robot="h1_2",
-        links=("pelvis",),
-        position=np.zeros((1, 3)),
-        normal=np.array([[0.0, 0, 1]]),
-        roll_deg=np.array([roll_deg]),
-    )
+    skin = looking_up(roll_deg)
     return RaySensor(skin, H1_2.chain, objects, max_range, coverage, **options)
-
-
-def look(sensor, *centres, quat=(1, 0, 0, 0)):
-    """(distance ``[K]``, detected) for objects at places, base at the origin."""
-    pose = torch.zeros(1, len(centres), 7, dtype=torch.float64)
-    pose[0, :, :3] = torch.tensor(centres, dtype=torch.float64)
-    pose[0, :, 3:] = torch.tensor(quat, dtype=torch.float64)
-    distance, detected = sensor.compute(
-        torch.tensor([[0, 0, 0, 1, 0, 0, 0]], dtype=torch.float64),
-        torch.zeros(1, len(H1_2.joints), dtype=torch.float64),
-        pose,
-        torch.ones(1, len(centres), dtype=torch.bool),
-    )
-    return distance[0, 0].tolist(), detected[0].tolist()
 
 
 ONE = Ray(grid=(1, 1))

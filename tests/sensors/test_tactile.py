@@ -26,7 +26,7 @@ from egoskin.sensors.tactile import (
     contact_free,
     split_by_contact,
 )
-from throwing import TASK
+from throwing import TASK, wild_actions
 
 LINKS = ("base", "left_arm", "right_arm", "foot")
 BODY = [name for name in H1_2.links if name not in H1_2.feet]
@@ -155,18 +155,10 @@ def test_contact_of_a_counted_link_ends_and_leaves_other_ends():
     assert torch.equal(result["done"], columns(".", "x", ".", "x", "x"))
 
 
-def actions(steps: int, rows: int) -> torch.Tensor:
-    """Fixed extreme actions: robots fall soon, at different times."""
-    generator = torch.Generator().manual_seed(0)
-    size = 0.7 * torch.rand(rows, 1, generator=generator)
-    shape = (steps, rows, len(H1_2.joints))
-    return size * torch.randn(shape, generator=generator)
-
-
 def run(env, steps: int) -> Any:
     """Steps ``[T, rows]`` of an environment under fixed actions, with resets."""
     stored, root = [], env.reset()
-    for action in actions(steps, root.numel()):
+    for action in wild_actions(root.numel(), steps):
         root["action"] = action.reshape(*root.batch_size, -1)
         step, root = env.step_and_maybe_reset(root)
         stored.append(step.reshape(-1).clone())

@@ -18,9 +18,9 @@ from test_study_runner import (
     study,
     table,
     undisturbed,
-    wait_for,
 )
 
+from calling import wait_for
 from egoskin.runs.run import Run
 from egoskin.study.claims import is_locked
 from egoskin.study.manifest import Manifest, resolve

@@ -4,23 +4,20 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-import importlib.util
 import io
 import json
 import os
-import resource
 import shutil
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 
 import pytest
 
-from calling import call, succeed
+from calling import call, hide, limit_file_size, succeed, wait_for
 from egoskin.runs.run import Run
 from egoskin.storage.formats import read_sealed, sealed_json
 from egoskin.storage.serialization import to_plain
@@ -31,7 +28,6 @@ from egoskin.study.manifest import EvaluationPlan, Manifest, PlannedRun, Study, 
 from egoskin.study.metrics import runs_csv
 from egoskin.study.runner import LocalRunner, Progress, slurm_script
 from egoskin.study.store import Failure, StudyFolder, duration
-from studies import as_format_1
 
 # 16 agents x 16 steps are 256 frames a rollout.
 BATCH = 256
@@ -230,28 +226,6 @@ def test_a_result_that_was_edited_or_exchanged_is_refused(folder: StudyFolder):
         table(folder)
 
 
-@pytest.mark.slow
-def test_a_study_begun_before_options_changed_goes_on(tmp_path: Path):
-    folder = StudyFolder(tmp_path / "study")
-    old = dataclasses.replace(SHORT, standard="1", seeds=(0, 1))
-    folder.plan(resolve(old))
-    assert work(folder, NAME, Never()) == 0
-    assert work(folder, "blind-seed1", Never(requested=True)) == STOPPED
-    configs = [*folder.path.glob("runs/*/config.json")]
-    configs += folder.path.glob("results/*/config.json")
-    assert len(configs) == 3
-    for path in (folder.manifest_path, *configs):
-        as_format_1(path)
-    # Finished runs stay as they are, and a stopped one is resumed.
-    (done,) = table(folder)
-    before = files(folder.result_path(NAME))
-    for run in folder.plan(resolve(old)).runs:
-        assert work(folder, run.name, Never()) == 0
-    assert table(folder)[0] == done
-    assert files(folder.result_path(NAME)) == before
-    assert [row["trained_on"] for row in table(folder)] == ["1"] * 2
-
-
 # --- progress -----------------------------------------------------------------------
 
 
@@ -410,13 +384,6 @@ def undisturbed(tiny: Manifest, tmp_path_factory) -> list[dict[str, str]]:
     return rows
 
 
-def wait_for(condition: Callable[[], object], seconds: float = 300) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-
-
 def in_the_middle(folder: StudyFolder) -> list[str]:
     """Return the runs that are between a quarter and the end of their frames."""
     status = folder.status(folder.manifest())
@@ -511,16 +478,12 @@ def test_ctrl_c_ends_all_runs_with_checkpoints(study, start, undisturbed):
     assert table(study) == undisturbed
 
 
-def limit_file_size(size: int) -> None:
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
-
-
 @pytest.mark.slow
 def test_a_full_disk_is_told_and_what_was_missing_is_made_up_for(
     study, start, undisturbed
 ):
     # No checkpoint fits any more.
-    full = start(study.path, "--tries", "1", preexec_fn=partial(limit_file_size, 50000))
+    full = start(study.path, "--tries", "1", preexec_fn=lambda: limit_file_size(50000))
     assert full.end() == 1
     for run in study.manifest().runs:
         failure = study.failure(run.name)
@@ -594,11 +557,6 @@ def test_bad_input_is_one_line(args, text, tmp_path: Path):
 def test_a_package_that_is_missing_is_named(
     package, args, error, finished: Path, monkeypatch
 ):
-    find = importlib.util.find_spec
-    monkeypatch.setattr(
-        importlib.util,
-        "find_spec",
-        lambda name: None if name == package else find(name),
-    )
+    hide(package, monkeypatch)
     assert call("study", *args, finished).stderr == f"error: {error}\n"
     assert not (finished / "report").exists()

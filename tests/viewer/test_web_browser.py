@@ -6,7 +6,7 @@ import dataclasses
 import io
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ pytest.importorskip("viser")
 pytest.importorskip("playwright")
 
 from browser import CHROMIUM, browsing
+from calling import wait_for
 from egoskin.viewer.web.page import Page
 
 pytestmark = [
@@ -71,13 +72,6 @@ def visit(page: Page) -> Iterator[Visit]:
         yield visit
         assert visit.faults == []
     wait_for(lambda: not page.server.get_clients())
-
-
-def wait_for(what: Callable[[], object]) -> None:
-    end = time.monotonic() + _WAIT
-    while not what():
-        assert time.monotonic() < end
-        time.sleep(0.2)
 
 
 def is_drawn(picture: np.ndarray) -> bool:

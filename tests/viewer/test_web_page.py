@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 import psutil
@@ -12,7 +12,7 @@ import pytest
 
 pytest.importorskip("viser")
 
-from calling import BATCH, SMALL, fail, succeed
+from calling import BATCH, SMALL, fail, succeed, wait_for
 from egoskin.viewer.web.page import Page
 from egoskin.viewer.web.panel import MEMORY
 from visiting import Visitor
@@ -252,13 +252,6 @@ def test_robots_side_by_side_have_one_control_rate(tmp_path):
         assert page._memory.maxlen == MEMORY * 50
     finally:
         page.close()
-
-
-def wait_for(what: Callable[[], object], seconds: float = 20.0) -> None:
-    end = time.monotonic() + seconds
-    while not what():
-        assert time.monotonic() < end
-        time.sleep(0.02)
 
 
 def test_it_computes_while_somebody_watches_and_not_otherwise():

@@ -478,8 +478,3 @@ def test_names_of_keys_follow_the_reading():
 def test_what_makes_no_sensor_is_refused(build, text):
     with pytest.raises(ValueError, match=text):
         build()
-
-
-def test_a_model_is_its_own_configuration():
-    assert replace(Noise(constant=0.1), linear=0.2) == Noise(constant=0.1, linear=0.2)
-    assert PRESETS["capacitive"]() == PRESETS["capacitive"]()

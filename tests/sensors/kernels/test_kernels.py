@@ -446,7 +446,6 @@ def test_a_killed_compilation_leaves_nothing_in_the_cache(source, cache, tmp_pat
 
 @needs_compiler
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:`torch.jit.script_method` is deprecated")
 def test_compiled_by_torch_a_sensor_measures_the_same(skin, random_state):
     some = skin.select([i for i, x in enumerate(skin.links) if x == "torso_link"][:9])
     state = random_state(101, seed=5, objects=1)
