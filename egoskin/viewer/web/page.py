@@ -159,13 +159,15 @@ class Page(ServedPage):
         Args:
             is_late: Whether the loop is behind the clock; pictures are then skipped.
         """
-        moves = not self.is_paused and (self._replayed or not self._has_failed)
-        if moves:
+        stops = self.is_paused or (self._has_failed and not self._replayed)
+        if not stops:
             self._proceed()
         now = time.monotonic()
         wait = 1 / (_LEAST_PICTURE_HZ if is_late else _PICTURE_HZ)
         # Half a step of tolerance: draw at the step nearest to the due time.
-        if moves and (self.is_paused or now - self._pictured > wait - 0.5 / self.hz):
+        if not stops and (
+            self.is_paused or now - self._pictured > wait - 0.5 / self.hz
+        ):
             self._pictured = now
             self._draw(self._shown)
         if now - self._panel_shown > 1 / _PANEL_HZ:
