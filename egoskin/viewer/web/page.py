@@ -119,7 +119,8 @@ class Page(ServedPage):
         self._shown = [session.frame for session in self.sessions]
         self._memory: deque[list[Frame]] = deque(maxlen=round(MEMORY * self.hz))
         self._replayed: deque[list[Frame]] = deque()
-        self._has_failed = self._pauses_after = False
+        # Whether the last step failed, and whether a replay ends in a pause.
+        self._has_failed = self._holds = False
         self._avoided, self._came = [0] * number, [0] * number
         self._survival = [deque[float](maxlen=EPISODES) for _ in range(number)]
         self._best, self._ended_at = [0.0] * number, [0.0] * number
@@ -159,17 +160,14 @@ class Page(ServedPage):
         Args:
             is_late: Whether the loop is behind the clock; pictures are then skipped.
         """
-        stops = self.is_paused or (self._has_failed and not self._replayed)
-        if not stops:
-            self._proceed()
         now = time.monotonic()
-        wait = 1 / (_LEAST_PICTURE_HZ if is_late else _PICTURE_HZ)
-        # Half a step of tolerance: draw at the step nearest to the due time.
-        if not stops and (
-            self.is_paused or now - self._pictured > wait - 0.5 / self.hz
-        ):
-            self._pictured = now
-            self._draw(self._shown)
+        if not self.is_paused and (self._replayed or not self._has_failed):
+            self._proceed()
+            wait = 1 / (_LEAST_PICTURE_HZ if is_late else _PICTURE_HZ)
+            # Half a step of tolerance: draw at the step nearest to the due time.
+            if self.is_paused or now - self._pictured > wait - 0.5 / self.hz:
+                self._pictured = now
+                self._draw(self._shown)
         if now - self._panel_shown > 1 / _PANEL_HZ:
             self._show()
         if now - self._looked > _FOLLOW_PERIOD:
@@ -178,11 +176,11 @@ class Page(ServedPage):
 
     def _proceed(self) -> None:
         """Take the next frames of a replay, or compute one control step."""
-        if not self._replayed:
+        if self._replayed:
+            self._shown = self._replayed.popleft()
+            self.is_paused |= self._holds and not self._replayed
+        else:
             self.play()
-            return
-        self._shown = self._replayed.popleft()
-        self.is_paused |= self._pauses_after and not self._replayed
 
     def play(self) -> None:
         """Compute one control step of all robots; if this fails, stop until a reset."""
@@ -372,10 +370,9 @@ class Page(ServedPage):
 
     def replay(self) -> None:
         """Replay the recorded frames, then pause if the page is paused now."""
-        self._pauses_after = self.is_paused or bool(
-            self._replayed and self._pauses_after
-        )
-        self._replayed, self.is_paused = deque(self._memory), False
+        self._holds = self.is_paused or bool(self._replayed and self._holds)
+        self._replayed = deque(self._memory)
+        self.is_paused &= not self._replayed
 
     def sense(self, name: str) -> None:
         """Apply a sensor setting of the panel to all robots with a skin, or to none.

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import viser
@@ -151,14 +150,9 @@ class Panel:
             "range": self._range,
             "corruption": self._corruption,
         }
-
-        def change(name: str, event: viser.GuiEvent) -> None:
-            # A change made by the page itself has no client.
-            if event.client:
-                wishes.sense(name)
-
         for name, handle in self._settings.items():
-            handle.on_update(partial(change, name))
+            # A change made by the page itself has no client.
+            handle.on_update(lambda event, n=name: event.client and wishes.sense(n))
         self._readable = gui.add_markdown("")
 
     def _add_plots(self, sessions: Sequence[Session]) -> None:
@@ -201,12 +195,9 @@ class Panel:
             label = ("Left", "Right")[i] if len(sessions) > 1 else "Policy"
             given = [session.source, *(n for n in names if n != session.source)]
             handle = gui.add_dropdown(label, given, initial_value=session.source)
-
-            def choose(i: int, event: viser.GuiEvent) -> None:
-                if event.client:
-                    wishes.load(i, event.target.value)
-
-            handle.on_update(partial(choose, i))
+            handle.on_update(
+                lambda event, i=i: event.client and wishes.load(i, event.target.value)
+            )
             self._policies.append(handle)
         self._about = gui.add_markdown("")
 
@@ -233,7 +224,7 @@ class Panel:
         """Show the loaded policies, their sensors and length of training."""
         texts = []
         for session, note in zip(sessions, notes, strict=True):
-            sensor, trained = session.config.sensor, session.frames_trained
+            sensor, trained = session.config.sensor, session.policy.policy_spec.frames
             texts.append(
                 f"**{session.source}**: {sensor.label()}, trained for "
                 f"{trained / 1e6:.1f} M steps. {note}"

@@ -177,11 +177,6 @@ class Session:
             self.policy, self.critic = policy, critic
         return fits
 
-    @property
-    def frames_trained(self) -> int:
-        """Environment steps that the policy was trained for."""
-        return self.policy.policy_spec.frames
-
     def configure(self, sensor: SensorConfig) -> None:
         """Change the sensors, and reset.
 

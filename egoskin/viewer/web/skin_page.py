@@ -86,7 +86,8 @@ class SkinPage(ServedPage):
         """Joint positions [rad], [m] for slide joints, ``[J]``."""
         self._computing: threading.Thread | None = None
         set_stage(self.server)
-        self._scene = RobotScene(self.server, "/robot", self.body, self._resolved())
+        resolved = skin and SensorPipeline(SensorConfig(), robot, skin).skin
+        self._scene = RobotScene(self.server, "/robot", self.body, resolved)
         size = float(np.ptp(self.body.bounds(), axis=0).max())
         centre = self.body.bounds().mean(0)
         camera = self.server.initial_camera
@@ -94,12 +95,6 @@ class SkinPage(ServedPage):
         camera.look_at, camera.fov = centre + size * np.array([0, 0.25, 0]), 0.75
         self._add_panel()
         self.draw()
-
-    def _resolved(self) -> Skin | None:
-        """Return the skin with the coverage and range of each sensor resolved."""
-        if self.skin is None:
-            return None
-        return SensorPipeline(SensorConfig(), self.robot, self.skin).skin
 
     def _add_panel(self) -> None:
         gui, robot = self.server.gui, self.robot
@@ -208,15 +203,12 @@ class SkinPage(ServedPage):
             ball = Sphere(radius=0.15)
             seen = see_directions(robot, skin, sensor, ball, progress=tell)
         except Exception as error:
-            self._ask(self._fail, error)
+            self._ask(self._end, _LEGEND)
+            self._ask(self.show_error, f"{type(error).__name__}: {error}")
         else:
             # A range in the skin file takes precedence.
             used = skin.resolved(sensor.default_coverage, sensor.range)
             self._ask(self._finish, pose, seen, float(used.range.max()))
-
-    def _fail(self, error: Exception) -> None:
-        self._end(_LEGEND)
-        raise error
 
     def _finish(self, pose: np.ndarray, seen: np.ndarray, max_range: float) -> None:
         if np.array_equal(pose, self.joint_pos):
