@@ -156,9 +156,9 @@ class Session:
                 f"{source} acts at {own:g} Hz and the other robot at {hz:g} Hz: side "
                 "by side they need the same control rate"
             )
+        body = Body(policy.env_config.robot_config)
         self._build(policy, policy.env_config)
-        self.source, self.critic = source, critic
-        self.body = Body(policy.env_config.robot_config)
+        self.source, self.critic, self.body = source, critic, body
         self.masked: frozenset[int] = frozenset()
         """Indices of the sensors that detect nothing."""
         self.reset()
