@@ -50,6 +50,15 @@ class Visitor:
         except ConnectionClosed:
             pass
 
+    def choose(self, handle: viser.GuiInputHandle, value: object) -> None:
+        """Change a control of the panel."""
+        message = {
+            "type": "GuiUpdateMessage",
+            "uuid": handle._impl.uuid,
+            "updates": {"value": value},
+        }
+        self._socket.send(msgspec.msgpack.encode(message))
+
     def leave(self) -> None:
         """Close the page."""
         self._socket.close()

@@ -247,7 +247,8 @@ def see_directions(
 ) -> np.ndarray:
     """Return the clearance at which a ball from each direction is first seen [m].
 
-    This is `Analysis.clearance_map` for a single cell, in the default pose.
+    This is `Analysis.clearance_map` for a single cell, in the default pose. A ball can
+    come if it is above the floor from the longest range of all sensors on.
 
     Args:
         robot: The robot.
@@ -267,7 +268,9 @@ def see_directions(
     cells = pipelines(robot, skin, {sensor.coverage: sensor}, sensor.range)
     paths = direction_paths(body, ball, farthest(cells))
     seen = trace(body, paths, skin, cells, [sensor.range], ball, progress=progress)
-    return _on_grid(seen.clearance[0], seen.runway >= sensor.range)
+    # A range of the skin takes precedence.
+    longest = float(cells[sensor.coverage].skin.range.max())
+    return _on_grid(seen.clearance[0], seen.runway >= longest)
 
 
 def _share(flags: Tensor, among: Tensor) -> float | None:

@@ -400,8 +400,8 @@ def load_policy(path: str | Path) -> Policy:
     return Policy(agent, spec)
 
 
-def load_critic(path: str | Path) -> Critic | None:
-    """Return the critic that was trained with a policy; None if the file has none.
+def load_with_critic(path: str | Path) -> tuple[Policy, Critic | None]:
+    """Return a policy and the critic that was trained with it; None without one.
 
     Checkpoints of runs contain a critic, policy files do not.
 
@@ -411,8 +411,8 @@ def load_critic(path: str | Path) -> Critic | None:
     Raises:
         ValueError: If there is no policy; the text says why.
     """
-    agent, _, has_critic = _load_agent(policy_file(path))
-    return Critic(agent) if has_critic else None
+    agent, spec, has_critic = _load_agent(policy_file(path))
+    return Policy(agent, spec), Critic(agent) if has_critic else None
 
 
 def policy_file(path: str | Path) -> Path:

@@ -283,27 +283,36 @@ class RobotConfig:
     @cached_property
     def default_base_height(self) -> float:
         """Height of the base when the default pose stands on the ground [m]."""
-        data = self._in_default_pose()
+        return self.base_height(self.default_joint_pos)
+
+    def base_height(self, joint_pos: np.ndarray) -> float:
+        """Return the height of the base when a pose stands on the ground [m].
+
+        Args:
+            joint_pos: Joint positions [rad], for slides [m], ``[J]``.
+        """
+        data = self._in_pose(joint_pos)
         lowest, _ = self._extent(data)
         return float(data.xpos[self._bodies[0], 2] - lowest)
 
     @property
     def lowest_link(self) -> str:
         """The link that reaches lowest in the default pose."""
-        data, geoms = self._in_default_pose(), self._collision_geoms(self.links)
+        data = self._in_pose(self.default_joint_pos)
+        geoms = self._collision_geoms(self.links)
         geom = min(geoms, key=lambda g: _extent(self.model, data, g)[0])
         return body_name(self.model, int(self.model.geom_bodyid[geom]))
 
     @cached_property
     def standing_height(self) -> float:
         """Height of the robot in the default pose, rounded to 1 cm [m]."""
-        lowest, highest = self._extent(self._in_default_pose())
+        lowest, highest = self._extent(self._in_pose(self.default_joint_pos))
         return round(highest - lowest, 2)
 
-    def _in_default_pose(self) -> mujoco.MjData:
-        """Return the robot in its default pose, the base where the file puts it."""
+    def _in_pose(self, joint_pos: np.ndarray) -> mujoco.MjData:
+        """Return the robot in a pose, the base where the file puts it."""
         model, data = self.model, mujoco.MjData(self.model)
-        data.qpos[model.jnt_qposadr[self._joint_ids]] = self.default_joint_pos
+        data.qpos[model.jnt_qposadr[self._joint_ids]] = joint_pos
         mujoco.mj_kinematics(model, data)
         return data
 

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+import os
+import shutil
+import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import numpy as np
 import psutil
@@ -13,8 +18,16 @@ import pytest
 pytest.importorskip("viser")
 
 from calling import BATCH, SMALL, fail, succeed, wait_for
-from egoskin.viewer.web.page import Page
-from egoskin.viewer.web.panel import MEMORY
+from egoskin.agents.networks import NetworkConfig
+from egoskin.make import EnvConfig
+from egoskin.policies.policy import policy_file, save_policy
+from egoskin.sensors import Ray, Skin
+from egoskin.sensors.config import SensorConfig, SkinConfig
+from egoskin.viewer.web import session as session_module
+from egoskin.viewer.web.page import Page, _short
+from egoskin.viewer.web.panel import EPISODES, MEMORY
+from egoskin.viewer.web.session import Frame
+from making import make_agent
 from visiting import Visitor
 
 
@@ -33,6 +46,44 @@ def page(shared: Page) -> Page:
     shared.mask_all(False)
     shared.reset()
     return shared
+
+
+@pytest.fixture(scope="module")
+def pair() -> Iterator[Page]:
+    """Return two robots with different sensors."""
+    pair = Page(["field_proximity", "localization"])
+    pair.panel.tempo.value = 0
+    yield pair
+    pair.close()
+
+
+def wait_for(what: Callable[[], object], seconds: float = 20.0) -> None:
+    end = time.monotonic() + seconds
+    while not what():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def serve(page: Page) -> None:
+    """Handle all queued requests, as the loop does."""
+    while not page._commands.empty():
+        page._do(page._commands.get())
+
+
+def end_episode(page: Page) -> None:
+    """End the episode of the first robot."""
+    session = page.sessions[0]
+    session.frame = dataclasses.replace(session.frame, ending="hit")
+    page._end(0)
+
+
+def drawn_by(page: Page, what: Callable[[], object]) -> list[Frame]:
+    """Return the frames of the first robot that are drawn meanwhile."""
+    drawn: list[Frame] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(page._scenes[0], "draw", lambda frame: drawn.append(frame))
+        what()
+    return drawn
 
 
 def advance(page: Page, steps: int) -> None:
@@ -116,19 +167,75 @@ def test_a_replay_shows_what_was_and_computes_nothing(page: Page):
     advance(page, 40)
     steps = page.steps
     page.replay()
-    drawn = []
-    page._scenes[0].draw, original = (
-        lambda frame, masked: drawn.append(frame.step),
-        page._scenes[0].draw,
-    )
-    try:
+
+    def play_all() -> None:
         while page._replayed:
             page._pictured = 0.0
             page.advance()
-    finally:
-        page._scenes[0].draw = original
-    assert drawn == list(range(1, 41))
+
+    drawn = drawn_by(page, play_all)
+    assert [frame.step for frame in drawn] == list(range(1, 41))
     assert page.steps == steps
+
+
+def test_pause_and_step_hold_and_step_a_replay(page: Page):
+    advance(page, 5)
+    page.replay()
+    page.advance()
+    page.pause()
+    page.advance()
+    assert len(page._replayed) == 4
+    assert "Replay" in page._status()[-1]
+    assert "Paused" in page._status()[-1]
+    page.step_once()
+    assert page._shown[0].step == 2
+    assert page.sessions[0].frame.step == 5
+
+
+def test_a_replay_that_begins_in_a_pause_ends_in_one(page: Page):
+    advance(page, 3)
+    page.pause()
+    page.replay()
+    advance(page, 5)
+    assert page.is_paused
+    assert (page._shown[0].step, page.sessions[0].frame.step) == (3, 3)
+
+
+def test_a_replay_is_not_disturbed_by_visitors_and_masks(page: Page):
+    advance(page, 3)
+    page.replay()
+    page.advance()
+    drawn = drawn_by(page, page._greet) + drawn_by(page, lambda: page.mask(0, {4}))
+    assert [(frame.step, list(frame.masked)) for frame in drawn] == [(1, [])] * 2
+
+
+def test_after_an_end_a_step_begins_the_next_episode(page: Page):
+    advance(page, 3)
+    end_episode(page)
+    page.step_once()
+    frame = page.sessions[0].frame
+    assert (frame.step, frame.ending) == (0, None)
+
+
+def test_an_end_is_shown_for_a_time_that_is_not_counted_in_steps(page: Page):
+    advance(page, 3)
+    end_episode(page)
+    page.play()
+    assert page.sessions[0].frame.ending == "hit"
+    page._ended_at[0] -= 1.3
+    page.play()
+    assert page.sessions[0].frame.ending is None
+
+
+def test_a_throw_after_an_end_is_not_lost(pair: Page):
+    pair.reset()
+    pair.play()
+    end_episode(pair)
+    pair.throw_from(0.0)
+    pair.play()
+    assert all(session.frame.active.any() for session in pair.sessions)
+    thrown = [s.task.balls.state["next_throw_step"] for s in pair.sessions]
+    assert all(int(step) > 1000 for step in thrown)
 
 
 def test_a_recording_plays_without_a_server(page: Page):
@@ -137,6 +244,27 @@ def test_a_recording_plays_without_a_server(page: Page):
     text = page.recording()
     assert "__VISER_EMBED_DATA__" in text
     assert len(text) < 4e6
+
+
+@pytest.mark.parametrize(("hz", "pictures"), [(12.0, 10), (60.0, 5), (100.0, 4)])
+def test_a_recording_takes_as_long_as_what_was(
+    page: Page, monkeypatch, hz: float, pictures: int
+):
+    advance(page, 10)
+    waits = []
+    monkeypatch.setattr(Page, "hz", hz)
+    monkeypatch.setattr(
+        page.server,
+        "get_scene_serializer",
+        lambda: type(
+            "Recorder", (), {"insert_sleep": waits.append, "as_html": lambda: ""}
+        ),
+    )
+    drawn = drawn_by(page, page.recording)
+    assert len(waits) == pictures
+    assert sum(waits) == pytest.approx(10 / hz, abs=2 / 30)
+    # The last but one is the last of the recording, then what was shown before.
+    assert drawn[-2].step == 10
 
 
 def test_balls_avoided_are_counted(page: Page):
@@ -164,15 +292,41 @@ def test_a_policy_that_fails_shows_its_error_and_the_page_lives_on(
     with monkeypatch.context() as patch:
         patch.setattr(page.sessions[0], "policy", fall_ill)
         page._do(page.advance)
-        assert "a fault of" in page.panel._error.content
-        assert page.panel._error.visible
+        assert "a fault of" in page._error_text.content
+        assert page._error_text.visible
         steps = page.steps
         page._do(page.advance)
         assert page.steps == steps
     page._do(lambda: page.load(0, "field_proximity"))
-    assert not page.panel._error.visible
+    assert not page._error_text.visible
     page._do(page.advance)
     assert page.steps == steps + 1
+
+
+def test_a_request_that_fails_does_not_stop_play(page: Page):
+    for _ in range(2):
+        page._do(lambda: page.load(0, "nobody"))
+        steps = page.steps
+        page._do(page.advance)
+        assert page.steps == steps + 1
+    assert "no policy nobody" in page.error
+    page.reset()
+    assert not page.error
+
+
+def test_a_chosen_policy_is_not_reset_before_it_is_loaded(page: Page):
+    choice = page.panel._policies[0]
+    visitor = Visitor(page.server.get_port())
+    try:
+        visitor.choose(choice, "blind")
+        wait_for(lambda: choice.value == "blind")
+        page._show()
+        assert choice.value == "blind"
+        page._do(lambda: page.load(0, "nobody"))
+        assert choice.value == "field_proximity"
+    finally:
+        visitor.leave()
+        page._commands.queue.clear()
 
 
 def test_another_policy_is_loaded_and_a_wrong_name_is_told(page: Page):
@@ -190,8 +344,9 @@ def test_another_policy_is_loaded_and_a_wrong_name_is_told(page: Page):
 
 def test_sensors_are_exchanged_as_the_panel_says(page: Page):
     page.panel._range.value = 0.5
+    page.sense("range")
     page.panel._signal.value = "binary"
-    page.sense()
+    page.sense("signal")
     sensor = page.sessions[0].config.sensor
     assert (sensor.range, sensor.signal) == (0.5, "binary")
     advance(page, 2)
@@ -199,10 +354,175 @@ def test_sensors_are_exchanged_as_the_panel_says(page: Page):
     assert page.panel._range.value == 2.0
 
 
-def test_a_newer_policy_of_a_run_is_taken_up(trained, tmp_path):
-    import os
-    import shutil
+def test_a_dragged_slider_is_applied_once_with_its_last_value(page: Page, monkeypatch):
+    session, scene, slider = page.sessions[0], page._scenes[0], page.panel._range
+    built, build = [], session_module.make_worker_env
 
+    def build_slowly(config, *args, **kwargs):
+        built.append(config.sensor.range)
+        # Meanwhile it is dragged on.
+        slider._impl.value = 0.7
+        return build(config, *args, **kwargs)
+
+    visitor = Visitor(page.server.get_port())
+    monkeypatch.setattr(session_module, "make_worker_env", build_slowly)
+    try:
+        for value in (1.8, 1.5, 1.0):
+            visitor.choose(slider, value)
+        wait_for(lambda: slider.value == 1.0 and page._commands.qsize() == 4)
+        serve(page)
+    finally:
+        visitor.leave()
+        monkeypatch.undo()
+    assert built == [1.0, 0.7]
+    assert session.config.sensor.range == slider.value == 0.7
+    # The meshes are not sent again.
+    assert page._scenes[0] is scene
+    page.load(0, "field_proximity")
+
+
+def test_a_setting_changes_both_robots_or_none(pair: Page):
+    one, other = pair.sessions
+    before = [session.config.sensor for session in pair.sessions]
+    pair.panel._signal.value = "binary"
+    pair._do(lambda: pair.sense("signal"))
+    assert "localization cannot read these sensors" in pair.error
+    assert [session.config.sensor for session in pair.sessions] == before
+    assert pair.panel._signal.value == "proximity"
+    pair.panel._range.value = 1.0
+    pair.sense("range")
+    assert (one.config.sensor, other.config.sensor) == tuple(
+        dataclasses.replace(sensor, range=1.0) for sensor in before
+    )
+    assert not pair.error
+
+
+def test_a_range_that_the_slider_cannot_show_is_kept(page: Page):
+    session = page.sessions[0]
+    sensor = session.readable(range=np.inf)
+    assert sensor is not None
+    session.configure(sensor)
+    page.panel._signal.value = "closeness"
+    page.sense("signal")
+    assert session.config.sensor == dataclasses.replace(sensor, signal="closeness")
+    page.load(0, "field_proximity")
+
+
+def test_what_the_skin_file_sets_cannot_be_changed(page: Page, skin: Skin, tmp_path):
+    grid = Ray(grid=(2, 2))
+    beams = dataclasses.replace(
+        skin, coverage=(grid,) * len(skin), range=np.full(len(skin), 0.8)
+    )
+    beams.save(tmp_path / "skin.json")
+    config = EnvConfig(
+        skin=SkinConfig(path=tmp_path / "skin.json"), sensor=SensorConfig(reduce="min")
+    )
+    file = tmp_path / "beams.safetensors"
+    save_policy(file, *make_agent(config, NetworkConfig(hidden=(8,))))
+    page.load(0, str(file))
+    page.play()
+    assert not page.panel._kind.visible
+    assert not page.panel._range.visible
+    assert not page.panel._signal.disabled
+    page.load(0, "field_proximity")
+    assert page.panel._kind.visible
+    assert page.panel._range.visible
+
+
+def test_a_mask_in_a_pause_is_shown_and_the_past_stays(page: Page):
+    page.throw_from(0.0)
+    for _ in range(60):
+        page.play()
+        if page.sessions[0].frame.reading.max() > 0.3:
+            break
+    page.pause()
+    sensor = int(page.sessions[0].frame.reading.argmax())
+    (drawn,) = drawn_by(page, lambda: page.mask(0, {sensor}))
+    assert drawn.reading[sensor] == 0
+    assert np.isnan(drawn.line[sensor]).all()
+    assert list(drawn.masked) == [sensor]
+    (recorded,) = page._memory[-1]
+    assert recorded.reading[sensor] > 0.3
+    assert not recorded.masked
+
+
+def test_a_click_meets_what_is_shown(page: Page):
+    session = page.sessions[0]
+    skin = session.skin
+    assert skin is not None
+    raised = session.frame.qpos + np.eye(len(session.frame.qpos))[2]
+    page._shown = [dataclasses.replace(session.frame, qpos=raised)]
+    session.body.place(raised)
+    point = session.body.sensor_points(skin)[5]
+    normal = session.body.sensor_normals(skin)[5]
+    page.click(point + 2 * normal, -normal)
+    assert session.masked == {5}
+
+
+def test_a_click_masks_no_sensor_that_is_hidden(page: Page):
+    session = page.sessions[0]
+    skin = session.skin
+    assert skin is not None
+    generator = np.random.default_rng(0)
+    masked = 0
+    for _ in range(300):
+        angle = generator.uniform(-np.pi, np.pi)
+        origin = np.array([3 * np.cos(angle), 3 * np.sin(angle), 1.2])
+        way = generator.normal((0, 0, 1.3), (0.15, 0.25, 0.2)) - origin
+        page.mask_all(False)
+        page.click(origin, way)
+        session.body.place(page._shown[0].qpos)
+        for sensor in session.masked:
+            away = np.linalg.norm(session.body.sensor_points(skin)[sensor] - origin)
+            hit = session.body.hit(origin, way / np.linalg.norm(way))
+            assert away < hit + 0.05
+            masked += 1
+    assert masked > 20
+
+
+def test_a_click_meets_the_nearer_robot(pair: Page):
+    pair.reset()
+    session = pair.sessions[1]
+    skin = session.skin
+    assert skin is not None
+    session.body.place(session.frame.qpos)
+    # The sensor that is farthest to its left, where the other robot is not.
+    left = int(session.body.sensor_points(skin)[:, 1].argmax())
+    point = session.body.sensor_points(skin)[left] + pair._scenes[1].place
+    pair.click(point + np.array([0, 2, 0]), np.array([0.0, -1.0, 0.0]))
+    assert [len(session.masked) for session in pair.sessions] == [0, 1]
+    pair.mask_all(False)
+
+
+def test_little_is_sent_while_little_changes(page: Page):
+    advance(page, 3)
+    page.pause()
+    page._show()
+    buffer = page.server._websock_server._broadcast_buffer
+    frame = page.sessions[0].frame
+    qpos = frame.qpos + 1e-6
+    before = buffer.message_counter
+    page._draw([dataclasses.replace(frame, qpos=qpos)])
+    page._show()
+    # The word above the robot moves with it.
+    assert buffer.message_counter - before <= 2
+
+
+def test_the_best_episode_is_kept_longer_than_the_others(page: Page):
+    session = page.sessions[0]
+    for survived in (50.0, *[1.0] * 300):
+        session.frame = dataclasses.replace(session.frame, survived=survived)
+        page._end(0)
+    assert len(page._survival[0]) == EPISODES
+    assert "| 50.0 s |" in page._status()[2]
+
+
+def test_a_name_keeps_its_dots():
+    assert _short("runs/v1.2") == "v1.2"
+    assert _short("files/v1.2.safetensors") == "v1.2"
+
+
+def test_a_newer_policy_of_a_run_is_taken_up(trained, tmp_path):
     run = tmp_path / "run"
     shutil.copytree(trained, run)
     page = Page([str(run)])
@@ -220,6 +540,43 @@ def test_a_newer_policy_of_a_run_is_taken_up(trained, tmp_path):
         assert "loaded at" in page._notes[0]
     finally:
         page.close()
+
+
+def put_checkpoint(run: Path, name: str, age: int) -> None:
+    """Write a policy of the package as the checkpoint of a run."""
+    run.mkdir(exist_ok=True)
+    checkpoint = run / "checkpoint.safetensors"
+    shutil.copy(policy_file(name), checkpoint)
+    os.utime(checkpoint, ns=(0, age * 10**9))
+
+
+def test_a_run_that_changes_in_any_way_is_followed(page: Page, tmp_path, monkeypatch):
+    run, session = tmp_path / "run", page.sessions[0]
+    put_checkpoint(run, "field_proximity", 1)
+    load = type(session).load
+
+    def load_slowly(*args) -> None:
+        load(*args)
+        put_checkpoint(run, "field_proximity", 2)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(type(session), "load", load_slowly)
+        page.load(0, str(run))
+    page.play()
+    old = session.policy
+    page._follow()
+    assert session.policy is not old
+    assert session.frame.step == 1
+    # Another training in the same folder has other sensors.
+    put_checkpoint(run, "blind", 3)
+    page._follow()
+    assert session.skin is None
+    page.play()
+    # A folder that is being cleared is no error.
+    (run / "checkpoint.safetensors").unlink()
+    page._follow()
+    assert "it has no checkpoint" in page._notes[0]
+    page.load(0, "field_proximity")
 
 
 def test_two_robots_meet_the_same_throws():
@@ -287,7 +644,25 @@ def test_it_computes_while_somebody_watches_and_not_otherwise():
 
 
 def test_a_port_that_is_taken_is_an_error(page: Page):
-    assert "is already in use" in fail("view", "--port", page.server.get_port())
+    assert "already in use" in fail("view", "--port", page.server.get_port())
+
+
+def test_a_port_without_rights_is_another_error(monkeypatch):
+    def refuse(*args):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(socket.socket, "bind", refuse)
+    assert "port 80 of 127.0.0.1: Permission denied" in fail("view", "--port", 80)
+
+
+def test_a_page_closes_although_a_visitor_does_not_answer(monkeypatch):
+    page = Page(["blind"])
+    stop = page.server.stop
+    monkeypatch.setattr(page.server, "stop", lambda: time.sleep(30))
+    before = time.monotonic()
+    page.close()
+    assert time.monotonic() - before < 5
+    stop()
 
 
 @pytest.mark.parametrize(

@@ -140,6 +140,32 @@ def test_an_episode_ends_and_the_next_begins_alike(session: Session):
     assert (again.step, again.survived, again.ending) == (0, 0.0, None)
 
 
+def test_a_binary_sensor_without_limit_detects_only_what_is_there(session: Session):
+    own = session.config.sensor
+    sensor = session.readable(signal="binary", range=math.inf)
+    assert sensor is not None
+    session.configure(sensor)
+    assert not session.step().reading.any()
+    session.throw(Throw(speed=6.0, azimuth=0.0, distance=3.0, target=0.5))
+    assert session.step().reading.any()
+    session.configure(own)
+
+
+def test_a_policy_that_cannot_be_played_changes_nothing(session: Session, monkeypatch):
+    session.reset()
+    before = dict(vars(session))
+
+    def refuse(*args, **kwargs):
+        raise ValueError("no such engine here")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("egoskin.viewer.web.session.make_worker_env", refuse)
+        with pytest.raises(ValueError, match="no such engine"):
+            session.load("blind")
+    assert vars(session) == before
+    session.step()
+
+
 def test_only_sensors_that_the_policy_can_read_are_taken(session: Session):
     assert session.readable(signal="localization") is None
     assert session.readable(coverage="ray") is None
@@ -160,11 +186,11 @@ def test_only_sensors_that_the_policy_can_read_are_taken(session: Session):
 
 def test_a_policy_file_has_no_critic_and_a_run_has_one(session: Session, trained):
     assert session.critic is None
-    assert session.reset().value is None
+    assert math.isnan(session.reset().value)
     other = Session(str(trained))
     assert other.critic is not None
     values = [frame.value for frame in play(other, 3)]
-    assert all(isinstance(value, float) for value in values)
+    assert np.isfinite(values).all()
     assert len(set(values)) == 3
 
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+import threading
+import time
 from collections.abc import Iterator
 
 import numpy as np
@@ -12,6 +15,7 @@ pytest.importorskip("viser")
 
 from calling import fail
 from egoskin.robots.config import H1_2, read_robot
+from egoskin.viewer.web import skin_page
 from egoskin.viewer.web.skin_page import SkinPage, colour_directions, group_joints
 
 
@@ -46,6 +50,77 @@ def test_directions_are_shown_and_their_share_is_told(page: SkinPage):
     clearance[18:, :36], clearance[18:, 36:] = 0.0, 0.5
     page.show(clearance, 1.0)
     assert page._result.content.startswith("**50.0%**")
+
+
+def look(page: SkinPage) -> None:
+    """Compute the directions seen, and handle what the computation asks for."""
+    page.look()
+    while page._computing is not None:
+        page._do(page._commands.get(timeout=120))
+
+
+def test_a_map_is_of_the_pose_that_is_shown(page: SkinPage, monkeypatch):
+    nodes = page.server.scene._handle_from_node_name
+    map_of = np.full((36, 72), 0.5)
+    monkeypatch.setattr(skin_page, "see_directions", lambda *_, **__: map_of)
+    page.reset()
+    look(page)
+    assert "/directions" in nodes
+    page.move(0, 0.1)
+    assert "/directions" not in nodes
+    assert page._result.content.startswith("Each point")
+    # A pose that changes during the computation.
+    page.look()
+    page.move(0, 0.2)
+    page._do(page._commands.get(timeout=60))
+    assert "/directions" not in nodes
+    assert not page._button.disabled
+
+
+def test_a_computation_that_fails_shows_its_error(page: SkinPage, monkeypatch):
+    def fall_ill(*args, **kwargs):
+        raise RuntimeError("out of <memory>")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(skin_page, "see_directions", fall_ill)
+        look(page)
+    assert "out of &lt;memory&gt;" in page._error_text.content
+    assert not page._button.disabled
+    # A request that fails does not end the page.
+    ask = [lambda: 1 / 0, lambda: page.move(0, 0.3), threading.Event().wait]
+    for request in ask:
+        page._commands.put(request)
+    threading.Thread(target=page.run, daemon=True).start()
+    end = time.monotonic() + 20
+    while page.joint_pos[0] != 0.3:
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def test_ranges_of_the_skin_file_take_precedence(skin, monkeypatch):
+    page = SkinPage(H1_2, dataclasses.replace(skin, range=np.full(len(skin), 0.4)))
+    shown = []
+    monkeypatch.setattr(page, "show", lambda *args: shown.append(args))
+    monkeypatch.setattr(skin_page, "see_directions", lambda *_, **__: None)
+    try:
+        page._range.value = 3.0
+        page.look()
+        page._do(page._commands.get(timeout=60))
+    finally:
+        page.close()
+    assert shown == [(None, 0.4)]
+
+
+def test_the_robot_stands_on_the_floor_in_every_pose(page: SkinPage):
+    knees = [i for i, name in enumerate(H1_2.joints) if "knee" in name]
+    height = page.body.data.xpos[1, 2]
+    for knee in knees:
+        page.move(knee, 1.5)
+    pose = dict(zip(H1_2.joints, page.joint_pos.tolist(), strict=True))
+    posed = dataclasses.replace(H1_2, default_pose=pose)
+    assert page.body.data.xpos[1, 2] == pytest.approx(posed.default_base_height)
+    assert page.body.data.xpos[1, 2] < height - 0.05
+    page.reset()
 
 
 def test_never_seen_is_red_and_seen_is_not():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -52,15 +53,18 @@ class Body:
         free = mujoco.mjtJoint.mjJNT_FREE
         self.floats = bool(model.njnt and model.jnt_type[0] == free)
         """Whether its base is free to move."""
-        self.place(self.default_qpos)
+        self.place(self.standing(robot.default_joint_pos))
 
-    @property
-    def default_qpos(self) -> np.ndarray:
-        """Base pose, standing on the floor, and joint positions of the default pose."""
+    def standing(self, joint_pos: np.ndarray) -> np.ndarray:
+        """Return base pose and joint positions, ``[7 + J]``, standing on the floor.
+
+        Args:
+            joint_pos: Joint positions [rad], [m] for slide joints, ``[J]``.
+        """
         base = np.array([0.0, 0, 0, 1, 0, 0, 0])
         if self.floats:
-            base[2] = self.robot.default_base_height
-        return np.concatenate((base, self.robot.default_joint_pos))
+            base[2] = self.robot.base_height(joint_pos)
+        return np.concatenate((base, joint_pos))
 
     def place(self, qpos: np.ndarray) -> None:
         """Put the robot into a pose.
@@ -103,13 +107,18 @@ class Body:
         reach = self.model.geom_rbound[shown, None]
         return np.stack(((centre - reach).min(0), (centre + reach).max(0)))
 
-    def hit(self, origin: np.ndarray, direction: np.ndarray) -> np.ndarray | None:
-        """Return the first hit of a ray on the robot, in the world [m], or None."""
+    def hit(self, origin: np.ndarray, direction: np.ndarray) -> float:
+        """Return the distance along a ray to the robot [m]; infinite if it misses.
+
+        Args:
+            origin: Start of the ray in the world [m], ``[3]``.
+            direction: Its direction, of length 1, ``[3]``.
+        """
         geom = np.zeros(1, np.int32)
-        pnt, vec = np.asarray(origin, float), np.asarray(direction, float)
-        vec = vec / np.linalg.norm(vec)
-        away = mujoco.mj_ray(self.model, self.data, pnt, vec, None, 1, -1, geom)
-        return None if away < 0 else pnt + away * vec
+        away = mujoco.mj_ray(
+            self.model, self.data, origin, direction, None, 1, -1, geom
+        )
+        return math.inf if away < 0 else away
 
     def parts(self) -> list[Part]:
         """Return the robot's shapes, merged by link and colour."""

@@ -10,23 +10,17 @@ import math
 import queue
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Collection, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import viser
 
-from egoskin.policies.policy import (
-    load_critic,
-    load_policy,
-    policy_file,
-    shipped_policies,
-)
-from egoskin.viewer.web.panel import MEMORY, Panel, Wishes
+from egoskin.policies.policy import policy_file, shipped_policies
+from egoskin.viewer.web.panel import EPISODES, MEMORY, Panel, Wishes
 from egoskin.viewer.web.scene import RobotScene, set_stage
-from egoskin.viewer.web.server import open_server, stop_server
+from egoskin.viewer.web.server import ServedPage
 from egoskin.viewer.web.session import Frame, Session, Throw
 
 _PAUSE_AFTER_END = 1.2
@@ -48,7 +42,7 @@ _PICK_RADIUS = 0.035
 """A click this close to a sensor selects it [m]."""
 
 
-class Page:
+class Page(ServedPage):
     """A local page with one robot, or several that receive the same throws.
 
     Args:
@@ -58,17 +52,19 @@ class Page:
 
     Raises:
         ValueError: If a policy does not exist, or two have different control rates.
-        OSError: If the port is taken.
+        OSError: If the port cannot be used.
     """
 
     def __init__(self, sources: Sequence[str], port: int = 0, seed: int = 0) -> None:
+        # Before loading: a checkpoint that is written meanwhile is newer.
+        self._versions = [_version(source) for source in sources]
+        self._notes = [""] * len(sources)
         self.sessions: list[Session] = []
         for source in sources:
             rate = self.hz if self.sessions else None
             self.sessions.append(Session(source, seed, rate))
-        self.server = open_server(port)
+        super().__init__(port)
         set_stage(self.server)
-        self._commands: queue.Queue[Callable[[], object]] = queue.Queue()
         self._scenes = [self._scene_of(i) for i in range(len(sources))]
         self.panel = Panel(
             self.server,
@@ -82,7 +78,7 @@ class Page:
                 replay=lambda: self._ask(self.replay),
                 save=lambda client: self._ask(self.save, client),
                 mask=lambda every: self._ask(self.mask_all, every),
-                sense=lambda: self._ask(self.sense),
+                sense=lambda name: self._ask(self.sense, name),
                 load=lambda i, source: self._ask(self.load, i, source),
             ),
         )
@@ -94,19 +90,13 @@ class Page:
             )
         )
         self.server.on_client_connect(self._welcome)
-        self.server.on_client_disconnect(lambda _: self._ask(lambda: None))
         self._look(self.server.initial_camera, _USUAL_SIZE)
         self.is_paused = False
-        self.error = ""
-        """Text of the last error; "" if there is none."""
         self.steps = 0
         """Control steps computed so far."""
         self._random = np.random.default_rng(seed)
-        self._versions = [_version(source) for source in sources]
-        self._notes = [""] * len(sources)
         self._looked = self._panel_shown = self._pictured = 0.0
         self._steps_shown, self._speed = 0, ""
-        self._replayed: deque[list[Frame]] = deque()
         self._forget()
 
     def _scene_of(self, i: int) -> RobotScene:
@@ -126,28 +116,22 @@ class Page:
     def _forget(self) -> None:
         """Reset all counts and recorded frames."""
         number = len(self.sessions)
+        self._shown = [session.frame for session in self.sessions]
         self._memory: deque[list[Frame]] = deque(maxlen=round(MEMORY * self.hz))
+        self._replayed: deque[list[Frame]] = deque()
+        # Whether the last step failed, and whether a replay ends in a pause.
+        self._has_failed = self._holds = False
         self._avoided, self._came = [0] * number, [0] * number
-        self._survival: list[list[float]] = [[] for _ in range(number)]
-        self._ended_for = [0] * number
+        self._survival = [deque[float](maxlen=EPISODES) for _ in range(number)]
+        self._best, self._ended_at = [0.0] * number, [0.0] * number
         self._since_throw = 0
-        self._replayed.clear()
 
     @property
     def hz(self) -> float:
         """Control rate of all robots [Hz]."""
         return self.sessions[0].hz
 
-    @property
-    def address(self) -> str:
-        """URL of the page."""
-        return f"http://127.0.0.1:{self.server.get_port()}"
-
     # --- the loop ---------------------------------------------------------------
-
-    def _ask(self, wish: Callable[..., object], *args: Any) -> None:
-        """Queue a function for the loop; any thread may call this."""
-        self._commands.put(lambda: wish(*args))
 
     def run(self) -> None:
         """Play in real time until the process ends."""
@@ -170,67 +154,56 @@ class Page:
                     break
                 self._do(wish)
 
-    def close(self) -> None:
-        """Close the page."""
-        stop_server(self.server)
-
-    def _do(self, wish: Callable[[], object]) -> None:
-        """Call a function; an exception is shown on the page and does not end it."""
-        try:
-            wish()
-        # A policy may be arbitrary code and raise anything.
-        except Exception as error:
-            self.error = f"{type(error).__name__}: {error}"
-            self.panel.show_error(self.error)
-
     def advance(self, is_late: bool = False) -> None:
         """Advance one control step unless paused, and draw if a picture is due.
 
         Args:
             is_late: Whether the loop is behind the clock; pictures are then skipped.
         """
-        if self._replayed:
-            frames = self._replayed.popleft()
-        elif not self.is_paused and not self.error:
-            self.play()
-            frames = [session.frame for session in self.sessions]
-        else:
-            frames = None
         now = time.monotonic()
-        wait = 1 / (_LEAST_PICTURE_HZ if is_late else _PICTURE_HZ)
-        # Half a step of tolerance: draw at the step nearest to the due time.
-        if frames is not None and now - self._pictured > wait - 0.5 / self.hz:
-            self._pictured = now
-            self._draw(frames)
+        if not self.is_paused and (self._replayed or not self._has_failed):
+            self._proceed()
+            wait = 1 / (_LEAST_PICTURE_HZ if is_late else _PICTURE_HZ)
+            # Half a step of tolerance: draw at the step nearest to the due time.
+            if self.is_paused or now - self._pictured > wait - 0.5 / self.hz:
+                self._pictured = now
+                self._draw(self._shown)
         if now - self._panel_shown > 1 / _PANEL_HZ:
             self._show()
         if now - self._looked > _FOLLOW_PERIOD:
             self._looked = now
             self._follow()
 
+    def _proceed(self) -> None:
+        """Take the next frames of a replay, or compute one control step."""
+        if self._replayed:
+            self._shown = self._replayed.popleft()
+            self.is_paused |= self._holds and not self._replayed
+        else:
+            self.play()
+
     def play(self) -> None:
-        """Compute one control step of all robots."""
+        """Compute one control step of all robots; if this fails, stop until a reset."""
+        self._has_failed = True
         self._since_throw += 1
         tempo = self.panel.tempo.value
-        if tempo and self._since_throw >= 60 * self.hz / tempo:
+        ended = [session.frame.ending is not None for session in self.sessions]
+        # Not while an end is shown, which a throw would cut short.
+        if tempo and self._since_throw >= 60 * self.hz / tempo and not any(ended):
             self.throw_from(None)
-        # The pause after the end of an episode is not recorded.
-        goes_on = any(session.frame.ending is None for session in self.sessions)
-        frames = []
         for i, session in enumerate(self.sessions):
-            if session.frame.ending is None:
-                frame = session.step()
-                if frame.ending is not None:
+            if not ended[i]:
+                session.step()
+                if session.frame.ending is not None:
                     self._end(i)
-            else:
-                frame = session.frame
-                self._ended_for[i] += 1
-                if self._ended_for[i] > _PAUSE_AFTER_END * self.hz:
-                    frame = session.reset()
-            frames.append(frame)
+            elif time.monotonic() - self._ended_at[i] > _PAUSE_AFTER_END:
+                session.reset()
+        self._has_failed = False
+        self._shown = [session.frame for session in self.sessions]
         self.steps += 1
-        if goes_on or not self._memory:
-            self._memory.append(frames)
+        # The pause after the end of an episode is not recorded.
+        if not all(ended) or not self._memory:
+            self._memory.append(self._shown)
 
     def _end(self, i: int) -> None:
         """Add the results of an ended episode to the counts."""
@@ -239,14 +212,13 @@ class Page:
         self._avoided[i] += avoided
         self._came[i] += came
         self._survival[i].append(session.frame.survived)
-        self._ended_for[i] = 0
+        self._best[i] = max(self._best[i], session.frame.survived)
+        self._ended_at[i] = time.monotonic()
 
     def _draw(self, frames: Sequence[Frame]) -> None:
         with self.server.atomic():
-            for session, scene, frame in zip(
-                self.sessions, self._scenes, frames, strict=True
-            ):
-                scene.draw(frame, session.masked)
+            for scene, frame in zip(self._scenes, frames, strict=True):
+                scene.draw(frame)
 
     def _look(
         self,
@@ -281,8 +253,8 @@ class Page:
         self._ask(self._greet)
 
     def _greet(self) -> None:
-        """Draw the current frames and update the panel."""
-        self._draw([session.frame for session in self.sessions])
+        """Draw the shown frames and update the panel."""
+        self._draw(self._shown)
         self._show()
 
     def throw(self, throw: Throw) -> None:
@@ -290,6 +262,9 @@ class Page:
         self._since_throw = 0
         self._replayed.clear()
         for session in self.sessions:
+            # A reset would discard the throw.
+            if session.frame.ending is not None:
+                session.reset()
             session.throw(throw)
 
     def throw_from(self, bearing: float | None) -> None:
@@ -301,12 +276,20 @@ class Page:
         """
         if bearing is None:
             bearing = self._random.uniform(-180, 180)
-        # All robots receive the same throw.
+        distance = self._random.uniform(*self.sessions[0].distances)
+        self._throw(math.radians(bearing), distance)
+
+    def _throw(
+        self, azimuth: float, distance: float, target: float | None = None
+    ) -> None:
+        # All robots receive the same throw, also where it is random.
+        if target is None:
+            target = self._random.uniform()
         self.throw(
             Throw(
-                azimuth=np.radians(bearing),
-                distance=self._random.uniform(*self.sessions[0].distances),
-                target=self._random.uniform(),
+                azimuth=azimuth,
+                distance=distance,
+                target=target,
                 speed=self.panel.speed.value,
                 height=self.panel.height.value,
             )
@@ -322,93 +305,101 @@ class Page:
             origin: Viewpoint of the visitor [m], ``[3]``.
             direction: Direction of the click, ``[3]``.
         """
-        for i, (session, scene) in enumerate(
-            zip(self.sessions, self._scenes, strict=True)
+        direction = direction / np.linalg.norm(direction)
+        origins = [origin - scene.place for scene in self._scenes]
+        away = []
+        for session, frame, local in zip(
+            self.sessions, self._shown, origins, strict=True
         ):
-            local = origin - scene.place
-            sensor = session.sensor_at(local, direction, _PICK_RADIUS)
+            session.body.place(frame.qpos)
+            away.append(session.body.hit(local, direction))
+        nearest = min(away)
+        for i, (session, local) in enumerate(zip(self.sessions, origins, strict=True)):
+            sensor = session.sensor_at(local, direction, _PICK_RADIUS, nearest)
             if sensor is not None:
                 self.mask(i, session.masked ^ {sensor})
                 return
-            session.body.place(session.frame.qpos)
-            place = session.body.hit(local, direction)
-            if place is not None:
-                self._throw_at(session, session.azimuth_of(local), place)
-                return
-        if direction[2] < 0:
-            floor = origin - origin[2] / direction[2] * direction
-            away = [np.linalg.norm(floor - s.place) for s in self._scenes]
-            i = int(np.argmin(away))
-            session, floor = self.sessions[i], floor - self._scenes[i].place
-            azimuth, distance = session.azimuth_of(floor), session.distance_of(floor)
-            self.throw(
-                Throw(
-                    azimuth=azimuth,
-                    distance=distance,
-                    speed=self.panel.speed.value,
-                    height=self.panel.height.value,
-                )
-            )
+        if nearest < math.inf:
+            i = away.index(nearest)
+            session, local = self.sessions[i], origins[i]
+            target = session.target_near(local + nearest * direction)
+            distance = float(np.mean(session.distances))
+            self._throw(session.azimuth_of(local), distance, target)
+        elif direction[2] < 0:
+            floor = [o - o[2] / direction[2] * direction for o in origins]
+            i = int(np.argmin(np.linalg.norm(floor, axis=-1)))
+            session, point = self.sessions[i], floor[i]
+            self._throw(session.azimuth_of(point), session.distance_of(point))
 
-    def _throw_at(self, session: Session, azimuth: float, place: np.ndarray) -> None:
-        self.throw(
-            Throw(
-                azimuth=azimuth,
-                distance=float(np.mean(session.distances)),
-                target=session.target_near(place),
-                speed=self.panel.speed.value,
-                height=self.panel.height.value,
-            )
-        )
-
-    def mask(self, i: int, sensors: set[int]) -> None:
+    def mask(self, i: int, sensors: Collection[int]) -> None:
         """Mask exactly these sensors of a robot."""
         session = self.sessions[i]
         session.mask(sensors)
         if session.skin is not None:
             self.panel.show_masked(len(sensors), len(session.skin))
-        self._draw([session.frame for session in self.sessions])
+        if not self._replayed:
+            self._shown = [session.frame for session in self.sessions]
+        self._draw(self._shown)
 
     def mask_all(self, every: bool) -> None:
         """Mask all sensors of all robots, or none."""
         for i, session in enumerate(self.sessions):
             if session.skin is not None:
-                self.mask(i, set(range(len(session.skin))) if every else set())
+                self.mask(i, range(len(session.skin)) if every else ())
 
     def pause(self) -> None:
-        """Pause or resume."""
+        """Pause or resume, also a replay."""
         self.is_paused = not self.is_paused
+        self._draw(self._shown)
 
     def step_once(self) -> None:
-        """Pause, and advance one control step."""
+        """Pause, and advance one control step, also in a replay."""
         self.is_paused = True
-        self.play()
-        self._draw([session.frame for session in self.sessions])
+        # The next episode begins at once.
+        self._ended_at = [0.0] * len(self.sessions)
+        self._proceed()
+        self._draw(self._shown)
 
     def reset(self) -> None:
         """Restart all episodes, with all counts at 0."""
-        self._clear_error()
+        self.show_error("")
         for session in self.sessions:
             session.reset()
         self._forget()
         self._greet()
 
     def replay(self) -> None:
-        """Replay the recorded frames."""
+        """Replay the recorded frames, then pause if the page is paused now."""
+        self._holds = self.is_paused or bool(self._replayed and self._holds)
         self._replayed = deque(self._memory)
+        self.is_paused &= not self._replayed
 
-    def sense(self) -> None:
-        """Apply the panel's sensor settings to all robots with a skin."""
-        for i, session in enumerate(self.sessions):
-            if session.skin is not None:
-                sensor = session.readable(**self.panel.sensor_changes)
-                if sensor is None:
-                    self.panel.show_sensors(self.sessions)
-                    raise ValueError("the policy cannot read these sensors")
-                session.configure(sensor)
-                self._exchange_scene(i)
-        self.reset()
-        self.panel.show_sensors(self.sessions)
+    def sense(self, name: str) -> None:
+        """Apply a sensor setting of the panel to all robots with a skin, or to none.
+
+        Args:
+            name: The setting, as in `Panel.sensor_changes`.
+
+        Raises:
+            ValueError: If a policy cannot read such sensors.
+        """
+        changes = self.panel.sensor_changes(name)
+        wanted = []
+        for session, scene in zip(self.sessions, self._scenes, strict=True):
+            if session.skin is None:
+                continue
+            sensor = session.readable(**changes)
+            if sensor is None:
+                self.panel.show_sensors(self.sessions)
+                raise ValueError(f"{session.source} cannot read these sensors")
+            # A slider queues many requests, and the first applies its latest value.
+            if sensor != session.config.sensor:
+                wanted.append((session, scene, sensor))
+        for session, scene, sensor in wanted:
+            session.configure(sensor)
+            scene.skin = session.skin
+        if wanted:
+            self.reset()
 
     def load(self, i: int, source: str) -> None:
         """Load another policy for a robot.
@@ -419,19 +410,16 @@ class Page:
         """
         # All robots have the same rate; a single one may change it.
         rate = self.hz if len(self.sessions) > 1 else None
-        self.sessions[i].load(source, rate)
-        self._versions[i], self._notes[i] = _version(source), ""
-        self._exchange_scene(i)
-        self.reset()
-        self.panel.show_sensors(self.sessions)
-
-    def _exchange_scene(self, i: int) -> None:
+        try:
+            version = _version(source)
+            self.sessions[i].load(source, rate)
+        finally:
+            self.panel.select_policy(i, self.sessions[i].source)
+        self._versions[i], self._notes[i] = version, ""
         self._scenes[i].remove()
         self._scenes[i] = self._scene_of(i)
-
-    def _clear_error(self) -> None:
-        self.error = ""
-        self.panel.show_error("")
+        self.reset()
+        self.panel.show_sensors(self.sessions)
 
     # --- display --------------------------------------------------------------
 
@@ -448,7 +436,8 @@ class Page:
         frames = list(self._memory)
         self.panel.show_status(self._status())
         self.panel.show_policies(self.sessions, self._notes)
-        if not frames:
+        # Without new steps, as in a pause, the plots are those already shown.
+        if not frames or not done:
             return
         maps = [
             np.stack([f[i].reading for f in frames if len(f[i].reading)])
@@ -461,15 +450,15 @@ class Page:
         self.panel.show_plots(
             clock,
             [np.array([f[i].reading.max(initial=0) for f in frames]) for i in robots],
-            [np.array([_or_nan(f[i].value) for f in frames]) for i in robots],
+            [np.array([f[i].value for f in frames]) for i in robots],
             self._survival,
             {s.source: s.critic is not None for s in self.sessions},
         )
 
     def _status(self) -> list[str]:
         """Return the status, in lines of Markdown."""
-        state = "**Paused.** " if self.is_paused else self._speed
-        state = "**Replay.** " if self._replayed else state
+        state = "**Replay.** " * bool(self._replayed) + "**Paused.** " * self.is_paused
+        state = state or self._speed
         lines = ["| | avoided&ensp; | untouched&ensp; | best |", "|---|---|---|---|"]
         for i, session in enumerate(self.sessions):
             avoided, came = session.avoided
@@ -477,7 +466,7 @@ class Page:
                 # Counted already.
                 avoided = came = 0
             now = session.frame.survived
-            best = max([now, *self._survival[i]])
+            best = max(now, self._best[i])
             lines.append(
                 f"| {_short(session.source)}&ensp; "
                 f"| **{self._avoided[i] + avoided}** of {self._came[i] + came} "
@@ -490,12 +479,18 @@ class Page:
         for i, session in enumerate(self.sessions):
             if not Path(session.source).is_dir():
                 continue
-            version = _version(session.source)
-            if version != self._versions[i]:
-                self._versions[i] = version
-                session.follow(load_policy(session.source), load_critic(session.source))
-                clock = time.strftime("%H:%M:%S")
-                self._notes[i] = f"Latest policy of the run, loaded at {clock}."
+            try:
+                version = _version(session.source)
+            except (ValueError, OSError) as error:
+                self._notes[i] = f"Not followed: {error}."
+                continue
+            if version == self._versions[i]:
+                continue
+            self._versions[i] = version
+            if not session.follow():
+                self.load(i, session.source)
+            clock = time.strftime("%H:%M:%S")
+            self._notes[i] = f"Latest policy of the run, loaded at {clock}."
 
     def save(self, client: viser.ClientHandle | None) -> None:
         """Send a visitor the `recording` as a file."""
@@ -506,14 +501,18 @@ class Page:
 
     def recording(self) -> str:
         """Return an HTML page that plays the recorded frames without a server."""
-        frames = list(self._memory)[:: round(self.hz / _PICTURE_HZ)]
+        stride = max(1, round(self.hz / _PICTURE_HZ))
+        # The last frame is always one of them.
+        frames = list(self._memory)[::-stride][::-1]
         recorder = self.server.get_scene_serializer()
-        # Visitors only see the last of these pictures.
+        # Visitors do not see these pictures.
         with self.server.atomic():
             for each in frames:
                 self._draw(each)
-                recorder.insert_sleep(1 / _PICTURE_HZ)
-        return recorder.as_html()
+                recorder.insert_sleep(stride / self.hz)
+            page = recorder.as_html()
+            self._draw(self._shown)
+        return page
 
 
 def offered_policies(sources: Sequence[str]) -> list[str]:
@@ -531,8 +530,4 @@ def _version(source: str) -> int:
 
 def _short(source: str) -> str:
     """Return the name of a policy without its folder."""
-    return Path(source).stem if "/" in source else source
-
-
-def _or_nan(value: float | None) -> float:
-    return np.nan if value is None else value
+    return Path(source).name.removesuffix(".safetensors") or source

@@ -6,10 +6,8 @@ receives and passes requests to the page, by one function for each kind of reque
 
 from __future__ import annotations
 
-import html
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import viser
@@ -30,6 +28,8 @@ _CORRUPTIONS = ("none", "time_of_flight", "capacitive", "acoustic")
 _COLOURS = ("#e8590c", "#1c7ed6")
 MEMORY = 5.0
 """Length of the recording that is plotted, replayed and saved [s]."""
+EPISODES = 200
+"""Number of the last episodes that are plotted."""
 # A scale that begins at 0 and reaches at least 1, with room above.
 _FROM_ZERO = {
     "min": {"soft": 0.0, "pad": 0.0, "mode": 1},
@@ -60,8 +60,8 @@ class Wishes:
     """Send a visitor a page with the recorded frames."""
     mask: Callable[[bool], None]
     """Mask all sensors, or none."""
-    sense: Callable[[], None]
-    """Apply the panel's sensor settings."""
+    sense: Callable[[str], None]
+    """Apply a sensor setting of the panel."""
     load: Callable[[int, str], None]
     """Load another policy for a robot."""
 
@@ -84,17 +84,8 @@ class Panel:
         wishes: Wishes,
     ) -> None:
         self._gui, self._wishes = server.gui, wishes
-        gui = server.gui
-        gui.configure_theme(
-            show_logo=False,
-            show_share_button=False,
-            control_width="medium",
-            brand_color=(28, 126, 214),
-        )
-        gui.set_panel_label("egoskin")
-        self._error = gui.add_markdown("", visible=False)
-        self._status = gui.add_markdown("")
-        tabs = gui.add_tab_group()
+        self._status = server.gui.add_markdown("")
+        tabs = server.gui.add_tab_group()
         with tabs.add_tab("Play"):
             self._add_play()
         with tabs.add_tab("Sensors"):
@@ -153,9 +144,15 @@ class Panel:
         self._signal = gui.add_dropdown("Signal", _SIGNALS)
         self._range = gui.add_slider("Range [m]", 0.1, 5.0, 0.1, 2.0)
         self._corruption = gui.add_dropdown("Imperfection", _CORRUPTIONS)
-        for handle in (self._kind, self._signal, self._range, self._corruption):
+        self._settings = {
+            "kind": self._kind,
+            "signal": self._signal,
+            "range": self._range,
+            "corruption": self._corruption,
+        }
+        for name, handle in self._settings.items():
             # A change made by the page itself has no client.
-            handle.on_update(lambda event: event.client and wishes.sense())
+            handle.on_update(lambda event, n=name: event.client and wishes.sense(n))
         self._readable = gui.add_markdown("")
 
     def _add_plots(self, sessions: Sequence[Session]) -> None:
@@ -188,7 +185,7 @@ class Panel:
         self._nearest = plot("time [s]", seconds, share)
         self._value_title = gui.add_markdown("**Value of the state**, from the critic")
         self._value = plot("time [s]", seconds, uplot.Scale(auto=True))
-        gui.add_markdown("**Untouched** [s], by episode")
+        gui.add_markdown(f"**Untouched** [s], last {EPISODES} episodes")
         self._survival = plot("episode", episodes, upward, whole)
 
     def _add_policies(self, sessions: Sequence[Session], names: Sequence[str]) -> None:
@@ -198,34 +195,24 @@ class Panel:
             label = ("Left", "Right")[i] if len(sessions) > 1 else "Policy"
             given = [session.source, *(n for n in names if n != session.source)]
             handle = gui.add_dropdown(label, given, initial_value=session.source)
-
-            def choose(i: int, event: viser.GuiEvent) -> None:
-                if event.client:
-                    wishes.load(i, event.target.value)
-
-            handle.on_update(partial(choose, i))
+            handle.on_update(
+                lambda event, i=i: event.client and wishes.load(i, event.target.value)
+            )
             self._policies.append(handle)
         self._about = gui.add_markdown("")
 
     # --- requested settings ---------------------------------------------------
 
-    @property
-    def sensor_changes(self) -> dict:
-        """Selected fields of the sensor configuration."""
-        return {
-            **_KINDS[self._kind.value],
-            "signal": self._signal.value,
-            "range": self._range.value,
-            "corruption": self._corruption.value,
-        }
+    def sensor_changes(self, name: str) -> dict:
+        """Return the fields of the sensor configuration that a setting selects.
+
+        Args:
+            name: The setting: "kind", "signal", "range" or "corruption".
+        """
+        value = self._settings[name].value
+        return _KINDS[value] if name == "kind" else {name: value}
 
     # --- display --------------------------------------------------------------
-
-    def show_error(self, text: str) -> None:
-        """Show an error text; "" hides it."""
-        self._error.visible = bool(text)
-        if text:
-            self._error.content = f"**Error.** {html.escape(text)}"
 
     def show_status(self, lines: Sequence[str]) -> None:
         """Show the status, in lines of Markdown."""
@@ -234,17 +221,19 @@ class Panel:
             self._status.content = text
 
     def show_policies(self, sessions: Sequence[Session], notes: Sequence[str]) -> None:
-        """Show which policies are loaded, their sensors and length of training."""
+        """Show the loaded policies, their sensors and length of training."""
         texts = []
-        for session, handle, note in zip(sessions, self._policies, notes, strict=True):
-            if handle.value != session.source:
-                handle.value = session.source
-            sensor, trained = session.config.sensor, session.frames_trained
+        for session, note in zip(sessions, notes, strict=True):
+            sensor, trained = session.config.sensor, session.policy.policy_spec.frames
             texts.append(
                 f"**{session.source}**: {sensor.label()}, trained for "
                 f"{trained / 1e6:.1f} M steps. {note}"
             )
         self._about.content = "\n\n".join(texts)
+
+    def select_policy(self, i: int, source: str) -> None:
+        """Show that a robot has a policy."""
+        self._policies[i].value = source
 
     def show_sensors(self, sessions: Sequence[Session]) -> None:
         """Show the sensors of the first robot that has any."""
@@ -254,7 +243,7 @@ class Panel:
         else:
             self._masked.content = "No robot here has a skin."
             self._readable.content = ""
-            for handle in (self._kind, self._signal, self._range, self._corruption):
+            for handle in self._settings.values():
                 handle.disabled = True
             return
         assert session.skin is not None
@@ -263,17 +252,22 @@ class Panel:
         signals = [s for s in _SIGNALS if session.readable(signal=s) is not None]
         flaws = [c for c in _CORRUPTIONS if session.readable(corruption=c) is not None]
         chosen = {"coverage": sensor.coverage, "reduce": sensor.reduce}
-        kind = next(k for k, v in _KINDS.items() if v == chosen)
+        # None if sensors that the skin file sets are mixed with others.
+        kind = next((k for k, v in _KINDS.items() if v == chosen), None)
         for handle, options, value in (
             (self._kind, kinds, kind),
             (self._signal, signals, sensor.signal),
             (self._corruption, flaws, sensor.corruption),
         ):
-            if tuple(handle.options) != tuple(options):
-                handle.options = options
-            handle.value, handle.disabled = value, len(options) < 2
+            handle.disabled = value is None or len(options) < 2
+            if value is not None:
+                handle.options, handle.value = options, value
         self._range.disabled = False
         self._range.value = min(max(sensor.range, 0.1), 5.0)
+        # What the skin file sets cannot be changed.
+        skin = session.policy.skin
+        self._kind.visible = kind is not None and None in skin.coverage
+        self._range.visible = bool(np.isnan(skin.range).any())
         size = session.pipeline.signal_size
         self._readable.content = (
             f"The policy reads {size} numbers from its skin and was trained with "
@@ -301,9 +295,9 @@ class Panel:
             colours = colour_of(padded.T.ravel()).reshape(-1, steps, 3)
             rows += [np.full((1, steps, 3), 255, np.uint8)] * bool(rows)
             rows.append(colours)
-        image = np.concatenate(rows) if rows else _EMPTY
         self._map.visible = bool(rows)
         if rows:
+            image = np.concatenate(rows)
             self._map.image = np.repeat(np.repeat(image, 2, axis=0), 2, axis=1)
 
     def show_plots(
@@ -320,7 +314,7 @@ class Panel:
             time: Time of each step [s], ``[T]``.
             strongest: The strongest reading of each robot, ``[T]`` each.
             value: The critic's value, ``[T]`` each, NaN without one.
-            survival: Untouched time of each robot, by episode [s].
+            survival: Untouched time of each robot in its last episodes [s].
             has_critic: Whether each policy has a critic.
         """
         self._nearest.data = (time, *strongest)

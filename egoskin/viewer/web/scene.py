@@ -6,7 +6,7 @@ Contract: a picture is made from a `Frame` alone, so recorded frames can be draw
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import trimesh
@@ -30,6 +30,8 @@ _FARTHEST = 12.0
 # A ball that moved farther than this between two pictures was thrown again [m].
 _JUMP = 1.0
 _TRAIL_LENGTH = 24
+# Links that move or turn less than this are not sent [m], [1].
+_STILL = 1e-4
 _WORD_HEIGHT = 1.95
 
 
@@ -89,7 +91,9 @@ class RobotScene:
         place: tuple[float, float] = (0.0, 0.0),
         title: str = "",
     ) -> None:
-        self._server, self._body, self._skin, self._title = server, body, skin, title
+        self._server, self._body, self._title = server, body, title
+        self.skin = skin
+        """The sensors; their kind may change, but not their number or positions."""
         self.place = np.array([*place, 0.0])
         self._root = server.scene.add_frame(name, show_axes=False, position=self.place)
         # Only link frames move: poses reach the browser faster than other updates.
@@ -131,8 +135,6 @@ class RobotScene:
         self, name: str, skin: Skin
     ) -> list[tuple[np.ndarray, viser.BatchedMeshHandle]]:
         """Add the sensors of each link; return their indices and meshes, by link."""
-        kinds = np.array([isinstance(own, Ray) for own in skin.coverage])
-        self._line_colour = np.where(kinds[:, None], _RAY_LINE, _FIELD_LINE)
         ball = trimesh.creation.icosphere(subdivisions=2, radius=_SENSOR_RADIUS)
         owner = np.array(self._body.link_indices(skin))
         added = []
@@ -154,28 +156,26 @@ class RobotScene:
             added.append((which, mesh))
         return added
 
-    def draw(self, frame: Frame, masked: Collection[int] = ()) -> None:
-        """Draw a frame.
-
-        Args:
-            frame: The frame.
-            masked: Indices of the sensors that are masked.
-        """
-        body = self._body
-        body.place(frame.qpos)
+    def draw(self, frame: Frame) -> None:
+        """Draw a frame."""
+        data = self._body.data
+        self._body.place(frame.qpos)
         for index, link in self._links.items():
-            link.position = body.data.xpos[index]
-            link.wxyz = body.data.xquat[index]
+            # A new visitor waits the longer, the more messages were ever sent.
+            if np.abs(link.position - data.xpos[index]).max() > _STILL:
+                link.position = data.xpos[index]
+            if np.abs(link.wxyz - data.xquat[index]).max() > _STILL:
+                link.wxyz = data.xquat[index]
         if self._sensors:
-            self._draw_sensors(frame, masked)
+            self._draw_sensors(frame)
         self._draw_balls(frame)
         self._draw_word(frame)
 
-    def _draw_sensors(self, frame: Frame, masked: Collection[int]) -> None:
-        assert self._skin is not None
-        points = self._body.sensor_points(self._skin)
+    def _draw_sensors(self, frame: Frame) -> None:
+        assert self.skin is not None
+        points = self._body.sensor_points(self.skin)
         colours = colour_of(frame.reading)
-        colours[list(masked)] = _MASKED
+        colours[list(frame.masked)] = _MASKED
         scales = 1 + (_LARGEST - 1) * np.sqrt(frame.reading)
         for which, mesh in self._sensors:
             if not np.array_equal(colours[which], mesh.batched_colors):
@@ -183,8 +183,9 @@ class RobotScene:
                 mesh.batched_scales = scales[which].astype(np.float32)
         seeing = np.isfinite(frame.line[:, 0])
         ends = np.stack((points[seeing], frame.line[seeing]), 1)
-        colour = np.repeat(self._line_colour[seeing][:, None], 2, axis=1)
-        _set_lines(self._lines, ends, colour)
+        is_ray = np.array([isinstance(own, Ray) for own in self.skin.coverage])
+        colour = np.where(is_ray[seeing, None, None], _RAY_LINE, _FIELD_LINE)
+        _set_lines(self._lines, ends, np.repeat(colour, 2, axis=1))
 
     def _draw_balls(self, frame: Frame) -> None:
         pieces, shades = [], []

@@ -21,9 +21,9 @@ from torchrl.envs import Compose
 from egoskin.envs.dodgeball import DodgeballEnv
 from egoskin.envs.throws import Draw, Thrower
 from egoskin.make import EnvConfig, make_worker_env
-from egoskin.policies.policy import Critic, Policy, load_critic, load_policy
+from egoskin.policies.policy import Policy, load_with_critic
 from egoskin.robots.kinematics import rotate
-from egoskin.sensors import FieldSensor, RaySensor, SensorPipeline, Skin
+from egoskin.sensors import FieldSensor, RaySensor, Skin
 from egoskin.sensors.config import SensorConfig
 from egoskin.sensors.pipeline import SensorGroup
 from egoskin.viewer.offscreen import closest_point, ending_of
@@ -68,13 +68,15 @@ class Frame:
     line: np.ndarray
     """End of each sensor's line, on the ball it detects [m], ``[S, 3]``; NaN if it
     detects none."""
-    step: int
+    masked: Collection[int] = ()
+    """Indices of the sensors that are masked."""
+    step: int = 0
     """Control steps since the start of the episode."""
-    survived: float
+    survived: float = 0.0
     """Time since the first throw of the episode [s]."""
-    value: float | None
-    """Value of the state by the critic; None without one."""
-    ending: str | None
+    value: float = math.nan
+    """Value of the state by the critic; NaN without one."""
+    ending: str | None = None
     """Why the episode ends here ("hit", "fall", ...); None while it goes on."""
 
 
@@ -132,8 +134,6 @@ class Session:
 
     def __init__(self, policy: str, seed: int = 0, hz: float | None = None) -> None:
         self.seed = seed
-        self.masked: set[int] = set()
-        """Indices of the sensors that detect nothing."""
         self.load(policy, hz)
 
     # --- policy and sensors -----------------------------------------------------
@@ -149,29 +149,33 @@ class Session:
             ValueError: If there is no such policy, or it has another control rate;
                 nothing is changed then.
         """
-        policy, critic = load_policy(source), load_critic(source)
+        policy, critic = load_with_critic(source)
         own = policy.env_config.task.physics.control_hz
         if hz is not None and own != hz:
             raise ValueError(
                 f"{source} acts at {own:g} Hz and the other robot at {hz:g} Hz: side "
                 "by side they need the same control rate"
             )
-        self.source = source
-        self._take(policy, critic)
-        self.masked.clear()
-        self.configure(policy.env_config.sensor)
+        body = Body(policy.env_config.robot_config)
+        self._build(policy, policy.env_config)
+        self.source, self.critic, self.body = source, critic, body
+        self.masked: frozenset[int] = frozenset()
+        """Indices of the sensors that detect nothing."""
+        self.reset()
 
-    def follow(self, policy: Policy, critic: Critic | None) -> None:
-        """Continue the episode with a newer version of the policy."""
-        self._take(policy, critic)
+    def follow(self) -> bool:
+        """Continue the episode with the newest version of the policy, if it fits.
 
-    def _take(self, policy: Policy, critic: Critic | None) -> None:
-        self.policy, self.critic = policy, critic
-
-    @property
-    def frames_trained(self) -> int:
-        """Environment steps that the policy was trained for."""
-        return self.policy.policy_spec.frames
+        Returns:
+            Whether it has the same robot, task, sensors and skin; nothing is changed
+            otherwise.
+        """
+        policy, critic = load_with_critic(self.source)
+        new, old = policy.policy_spec, self.policy.policy_spec
+        fits = (new.env, new.skin.to_dict()) == (old.env, old.skin.to_dict())
+        if fits:
+            self.policy, self.critic = policy, critic
+        return fits
 
     def configure(self, sensor: SensorConfig) -> None:
         """Change the sensors, and reset.
@@ -179,52 +183,52 @@ class Session:
         Raises:
             ValueError: If the policy cannot read their signal.
         """
-        config, pipeline = self._check(sensor)
-        self.config, self.pipeline = config, pipeline
-        self.env = make_worker_env(
-            config, self.policy.skin, num_envs=1, seed=self.seed, keep_raw=True
-        )
-        base = self.env.base_env
-        assert isinstance(base, DodgeballEnv)
-        self.task, self.body = base, Body(config.robot_config)
-        task = config.task
-        self.hz = task.physics.control_hz
-        self._thrower = ThrownOnDemand(
-            task.throws, config.robot_config, task.physics.timestep
-        )
-        base.balls.thrower = self._thrower
-        chain = self.env.transform
-        assert isinstance(chain, Compose)
-        self._sensors = [t for t in chain if isinstance(t, (FieldSensor, RaySensor))]
+        self._build(self.policy, self._check(sensor))
         # The new sensors are all unmasked: apply the mask again.
         self.mask(self.masked)
         self.reset()
 
+    def _build(self, policy: Policy, config: EnvConfig) -> None:
+        """Take a policy and its environment; if this fails, nothing is changed."""
+        pipeline, task = config.pipeline(policy.skin), config.task
+        env = make_worker_env(
+            config, policy.skin, num_envs=1, seed=self.seed, keep_raw=True
+        )
+        base, chain = env.base_env, env.transform
+        assert isinstance(base, DodgeballEnv)
+        assert isinstance(chain, Compose)
+        thrower = ThrownOnDemand(
+            task.throws, config.robot_config, task.physics.timestep
+        )
+        self.policy, self.config, self.pipeline = policy, config, pipeline
+        self.env, self.task, self.hz = env, base, task.physics.control_hz
+        self._thrower = base.balls.thrower = thrower
+        self._sensors = [t for t in chain if isinstance(t, (FieldSensor, RaySensor))]
+
     def readable(self, **changes: Any) -> SensorConfig | None:
-        """Return the policy's own sensors with changes; None if it cannot read them.
+        """Return the sensors with changes; None if the policy cannot read them.
 
         Args:
             changes: Fields of the sensor configuration.
         """
-        own = self.policy.env_config
         try:
-            sensor = dataclasses.replace(own.sensor, **changes)
+            sensor = dataclasses.replace(self.config.sensor, **changes)
             self._check(sensor)
         except ValueError:
             return None
         return sensor
 
-    def _check(self, sensor: SensorConfig) -> tuple[EnvConfig, SensorPipeline]:
-        """Return config and pipeline; raise ValueError if the policy cannot read it."""
+    def _check(self, sensor: SensorConfig) -> EnvConfig:
+        """Return the configuration; raise ValueError if the policy cannot read it."""
         own, skin = self.policy.env_config, self.policy.skin
         config = dataclasses.replace(own, sensor=sensor)
-        pipeline, expected = config.pipeline(skin), own.pipeline(skin).signal_size
-        if pipeline.signal_size != expected or config.actor_keys != own.actor_keys:
+        size, expected = (c.pipeline(skin).signal_size for c in (config, own))
+        if size != expected or config.actor_keys != own.actor_keys:
             raise ValueError(
                 f"the policy reads {expected} numbers from its skin, but these sensors "
-                f"give {pipeline.signal_size}"
+                f"give {size}"
             )
-        return config, pipeline
+        return config
 
     @property
     def skin(self) -> Skin | None:
@@ -233,9 +237,16 @@ class Session:
 
     def mask(self, sensors: Collection[int]) -> None:
         """Mask exactly these sensors: they detect nothing from now on."""
-        self.masked = set(sensors)
+        self.masked = frozenset(sensors)
         for group, sensor in zip(self.pipeline.groups, self._sensors, strict=True):
             sensor.mask([i for i, own in enumerate(group.index) if own in self.masked])
+        # Copies: the frame may be recorded.
+        which, old = list(sensors), self.frame
+        reading, line = old.reading.copy(), old.line.copy()
+        reading[which], line[which] = 0.0, np.nan
+        self.frame = dataclasses.replace(
+            old, reading=reading, line=line, masked=self.masked
+        )
 
     # --- time -------------------------------------------------------------------
 
@@ -304,24 +315,27 @@ class Session:
         return self.config.task.throws.distance
 
     def sensor_at(
-        self, origin: np.ndarray, direction: np.ndarray, within: float
+        self,
+        origin: np.ndarray,
+        direction: np.ndarray,
+        within: float,
+        until: float = math.inf,
     ) -> int | None:
         """Return the first sensor on a ray whose normal faces its origin, or None.
 
         Args:
             origin: Start of the ray in the world [m], ``[3]``.
-            direction: Its direction, ``[3]``.
+            direction: Its direction, of length 1, ``[3]``.
             within: Largest distance of the sensor from the ray [m].
+            until: Distance along the ray at which something hides what is behind [m].
         """
         if self.skin is None:
             return None
-        self.body.place(self.frame.qpos)
-        along = direction / np.linalg.norm(direction)
         way = self.body.sensor_points(self.skin) - origin
-        ahead = way @ along
-        beside = np.linalg.norm(way - ahead[:, None] * along, axis=-1)
-        faces = self.body.sensor_normals(self.skin) @ along < 0
-        met = (beside < within) & (ahead > 0) & faces
+        ahead = way @ direction
+        beside = np.linalg.norm(way - ahead[:, None] * direction, axis=-1)
+        faces = self.body.sensor_normals(self.skin) @ direction < 0
+        met = (beside < within) & (ahead > 0) & (ahead < until + within) & faces
         return int(np.where(met, ahead, np.inf).argmin()) if met.any() else None
 
     def target_near(self, point: np.ndarray) -> float | None:
@@ -366,7 +380,7 @@ class Session:
             line[seeing] = ends[nearest, np.arange(len(points))]
         step = int(row["episode_step"])
         since = 0 if self.first_throw is None else step - self.first_throw
-        value = None
+        value = math.nan
         if self.critic is not None:
             value = float(self.critic(state)["state_value"])
         return Frame(
@@ -375,6 +389,7 @@ class Session:
             active=active,
             reading=reading,
             line=line,
+            masked=self.masked,
             step=step,
             survived=since / self.hz,
             value=value,
@@ -388,7 +403,8 @@ class Session:
         distance = np.asarray(row[key], float).reshape(len(group.index), -1).min(-1)
         ranges = group.skin.range
         if self.config.sensor.signal == "binary":
-            return (distance <= ranges).astype(float)
+            # As in the binary signal, an infinite range detects nothing at infinity.
+            return (np.isfinite(distance) & (distance <= ranges)).astype(float)
         # As in the proximity signal, with a scale of 1 m for infinite range.
         with np.errstate(invalid="ignore"):
             share = np.where(

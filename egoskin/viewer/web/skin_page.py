@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import queue
 import threading
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 
 import numpy as np
 import viser
@@ -25,7 +23,7 @@ from egoskin.sensors.pipeline import SensorPipeline
 from egoskin.shapes import Sphere
 from egoskin.viewer.web.body import Body
 from egoskin.viewer.web.scene import RobotScene, set_stage
-from egoskin.viewer.web.server import open_server, stop_server
+from egoskin.viewer.web.server import ServedPage
 from egoskin.viewer.web.session import Frame
 
 # Point size relative to the sphere's radius; slider limit of an unlimited joint [rad].
@@ -65,7 +63,7 @@ def group_joints(names: Sequence[str]) -> dict[str, list[int]]:
     return small
 
 
-class SkinPage:
+class SkinPage(ServedPage):
     """A local page with a standing robot and sliders for its joints.
 
     Args:
@@ -75,7 +73,7 @@ class SkinPage:
 
     Raises:
         ValueError: If the skin is on links that the robot does not have.
-        OSError: If the port is taken.
+        OSError: If the port cannot be used.
     """
 
     def __init__(self, robot: RobotConfig, skin: Skin | None, port: int = 0) -> None:
@@ -83,13 +81,13 @@ class SkinPage:
         if skin is not None:
             skin.check_links(robot.links)
         self.body = Body(robot)
-        self.server = open_server(port)
+        super().__init__(port)
         self.joint_pos = robot.default_joint_pos.copy()
         """Joint positions [rad], [m] for slide joints, ``[J]``."""
-        self._commands: queue.Queue[Callable[[], object]] = queue.Queue()
         self._computing: threading.Thread | None = None
         set_stage(self.server)
-        self._scene = RobotScene(self.server, "/robot", self.body, self._resolved())
+        resolved = skin and SensorPipeline(SensorConfig(), robot, skin).skin
+        self._scene = RobotScene(self.server, "/robot", self.body, resolved)
         size = float(np.ptp(self.body.bounds(), axis=0).max())
         centre = self.body.bounds().mean(0)
         camera = self.server.initial_camera
@@ -98,21 +96,8 @@ class SkinPage:
         self._add_panel()
         self.draw()
 
-    def _resolved(self) -> Skin | None:
-        """Return the skin with the coverage and range of each sensor resolved."""
-        if self.skin is None:
-            return None
-        return SensorPipeline(SensorConfig(), self.robot, self.skin).skin
-
-    @property
-    def address(self) -> str:
-        """URL of the page."""
-        return f"http://127.0.0.1:{self.server.get_port()}"
-
     def _add_panel(self) -> None:
         gui, robot = self.server.gui, self.robot
-        gui.configure_theme(show_logo=False, show_share_button=False)
-        gui.set_panel_label("egoskin")
         number = 0 if self.skin is None else len(self.skin)
         text = f"**{robot.name}**, {len(robot.joints)} joints, {number} sensors"
         gui.add_markdown(text)
@@ -120,7 +105,7 @@ class SkinPage:
         self._sliders: dict[int, viser.GuiSliderHandle] = {}
         with tabs.add_tab("Joints"):
             reset = gui.add_button("Default pose")
-            reset.on_click(lambda _: self._commands.put(self.reset))
+            reset.on_click(lambda _: self._ask(self.reset))
             low, high = robot.joint_range
             for k, (name, members) in enumerate(group_joints(robot.joints).items()):
                 with gui.add_folder(name, expand_by_default=k == 0):
@@ -132,7 +117,7 @@ class SkinPage:
             self._kind = gui.add_dropdown("Sensors", ("field", "ray"))
             self._range = gui.add_slider("Range [m]", 0.1, 3.0, 0.1, 0.5)
             self._button = gui.add_button("Show what is seen in this pose")
-            self._button.on_click(lambda _: self._commands.put(self.look))
+            self._button.on_click(lambda _: self._ask(self.look))
             self._result = gui.add_markdown(_LEGEND)
 
     def _add_slider(self, i: int, low: float, high: float) -> None:
@@ -150,7 +135,7 @@ class SkinPage:
 
         def move(event: viser.GuiEvent) -> None:
             if event.client:
-                self._commands.put(partial(self.move, i, event.target.value))
+                self._ask(self.move, i, event.target.value)
 
         slider.on_update(move)
         self._sliders[i] = slider
@@ -160,11 +145,7 @@ class SkinPage:
     def run(self) -> None:
         """Handle the requests of visitors until the process ends."""
         while True:
-            self._commands.get()()
-
-    def close(self) -> None:
-        """Close the page."""
-        stop_server(self.server)
+            self._do(self._commands.get())
 
     def move(self, joint: int, position: float) -> None:
         """Move a joint to a position [rad], [m] for a slide joint."""
@@ -179,52 +160,61 @@ class SkinPage:
         self.draw()
 
     def draw(self) -> None:
-        """Draw the robot in its pose."""
+        """Draw the robot in its pose, without the directions seen in another."""
         number = 0 if self.skin is None else len(self.skin)
-        qpos = np.concatenate((self.body.default_qpos[:7], self.joint_pos))
+        frame = Frame(
+            qpos=self.body.standing(self.joint_pos),
+            balls=np.zeros((0, 3)),
+            active=np.zeros(0, bool),
+            reading=np.zeros(number),
+            line=np.full((number, 3), np.nan),
+        )
         with self.server.atomic():
-            self._scene.draw(
-                Frame(
-                    qpos=qpos,
-                    balls=np.zeros((0, 3)),
-                    active=np.zeros(0, bool),
-                    reading=np.zeros(number),
-                    line=np.full((number, 3), np.nan),
-                    step=0,
-                    survived=0.0,
-                    value=None,
-                    ending=None,
-                )
-            )
+            self._scene.draw(frame)
+            self.server.scene.remove_by_name("/directions")
+        if self.skin is not None and self._computing is None:
+            self._result.content = _LEGEND
 
     def look(self) -> None:
         """Start to compute the directions seen in this pose; show them when done."""
         if self._computing is not None:
             return
+        assert self.skin is not None
         self._button.disabled = True
+        self.show_error("")
         pose = dict(zip(self.robot.joints, self.joint_pos.tolist(), strict=True))
         robot = dataclasses.replace(self.robot, default_pose=pose)
         sensor = SensorConfig(coverage=self._kind.value, range=self._range.value)
         self._computing = threading.Thread(
-            target=self._compute, args=(robot, sensor), daemon=True
+            target=self._compute,
+            args=(robot, self.skin, sensor, self.joint_pos.copy()),
+            daemon=True,
         )
         self._computing.start()
 
-    def _compute(self, robot: RobotConfig, sensor: SensorConfig) -> None:
-        assert self.skin is not None
-
+    def _compute(
+        self, robot: RobotConfig, skin: Skin, sensor: SensorConfig, pose: np.ndarray
+    ) -> None:
         def tell(what: str, share: float) -> None:
             self._result.content = f"Computing: {share:.0%}"
 
         tell("", 0.0)
         try:
             ball = Sphere(radius=0.15)
-            seen = see_directions(robot, self.skin, sensor, ball, progress=tell)
-        except ValueError as error:
-            done = partial(self._end, f"**Error.** {error}")
+            seen = see_directions(robot, skin, sensor, ball, progress=tell)
+        except Exception as error:
+            self._ask(self._end, _LEGEND)
+            self._ask(self.show_error, f"{type(error).__name__}: {error}")
         else:
-            done = partial(self.show, seen, sensor.range)
-        self._commands.put(done)
+            # A range in the skin file takes precedence.
+            used = skin.resolved(sensor.default_coverage, sensor.range)
+            self._ask(self._finish, pose, seen, float(used.range.max()))
+
+    def _finish(self, pose: np.ndarray, seen: np.ndarray, max_range: float) -> None:
+        if np.array_equal(pose, self.joint_pos):
+            self.show(seen, max_range)
+        else:
+            self._end(f"The robot moved meanwhile.\n\n{_LEGEND}")
 
     def _end(self, text: str) -> None:
         self._computing, self._button.disabled = None, False
@@ -236,14 +226,14 @@ class SkinPage:
         Args:
             clearance: Clearance at which a ball is first seen [m], in the order of
                 `direction_grid`; 0 if never, NaN where no ball can come from.
-            max_range: Range of the sensors [m].
+            max_range: Longest range of the sensors [m].
         """
         azimuth, elevation = (angle.ravel() for angle in direction_grid())
         share = clearance.ravel() / max_range
         comes = np.isfinite(share)
         outward = unit_vectors(azimuth[comes], elevation[comes])
         bounds = self.body.bounds()
-        centre = self.body.default_qpos[:3]
+        centre = self.body.standing(self.joint_pos)[:3]
         radius = 1.05 * np.abs(bounds - centre).max()
         self.server.scene.add_point_cloud(
             "/directions",
