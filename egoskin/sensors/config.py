@@ -91,7 +91,7 @@ class SensorConfig:
     """Whether the robot's own body hides objects behind it."""
     corruption: Literal["none", "time_of_flight", "capacitive", "acoustic"] = "none"
     """Ideal sensors, or a model of real ones (docs/sensor-models.md), applied to each
-    beam or, with reduce, to each sensor's minimum."""
+    beam; reduce takes the minimum afterwards, as on a real robot."""
     keep_last: bool = False
     """Localization: keep the last position while nothing is detected."""
 

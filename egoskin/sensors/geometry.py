@@ -179,6 +179,12 @@ class ProximitySensor(RowTransform):
         constant("_offset", skin.position.T[:, :, None], torch.float64)
         # Axes of the sensor frames in the link frames, [3 (axis), 3, S, 1].
         constant("_axes", skin.rotation().transpose(2, 1, 0)[..., None], torch.float64)
+        if self._occluder is not None:
+            # Where the sensors' paths start for occlusion.
+            start = self._occluder.outside(
+                self._link, self._offset[..., 0], self._axes[2, ..., 0]
+            )
+            constant("_start", start[..., None], torch.float64)
         constant("_range", skin.range[:, None], torch.float64)
         self._skin_range = self._range.clone()
         # An object whose centre is farther from the base than this is out of range in
@@ -332,13 +338,12 @@ class ProximitySensor(RowTransform):
         assert self._occluder is not None
         link = self._link[sensor]
         turn, position = (x[..., link, row] for x in scene.links)
-        offset = scene.skin["offset"][:, sensor, 0]
 
         def to_base(v: Tensor, of: Tensor | slice = slice(None)) -> list[Tensor]:
             return [r[0, of] * v[0] + r[1, of] * v[1] + r[2, of] * v[2] for r in turn]
 
         # p + R o
-        x, y, z = offset
+        x, y, z = scene.skin["start"][:, sensor, 0]
         origin = position + turn[:, 0] * x + turn[:, 1] * y + turn[:, 2] * z
         pair, path = (length < torch.inf).nonzero().unbind(1)
         hidden = torch.zeros_like(length, dtype=torch.bool)

@@ -13,6 +13,8 @@ from egoskin.shapes import shape_of
 # A path is blocked if a longer part of it than this lies inside one primitive [m]. The
 # surface that a sensor sits on therefore does not block it, nor paths along a surface.
 _DEPTH = 1e-3
+# Sensors less than this below a surface are on it: skin files have six decimals [m].
+_ROUNDING = 1e-5
 # Margin for rounding when primitives are culled [m].
 _SLACK = 1e-3
 # Bundles processed at a time, so that temporaries stay in the cache.
@@ -35,6 +37,33 @@ class Occluder:
         self._shapes = [shape_of(p.kind, p.size.tolist()) for p in primitives]
         self._centres = [p.position.tolist() for p in primitives]
         self._turns = [p.rotation.T.tolist() for p in primitives]
+
+    def outside(self, link: Tensor, point: Tensor, normal: Tensor) -> Tensor:
+        """Return points, moved along their normals out of the primitives of their link.
+
+        A real cover is not exactly the robot's primitives: a sensor inside one of them
+        is on the surface above it.
+
+        Args:
+            link: Link of each point, ``[S]``.
+            point: Points in the frames of their links [m], ``[3, S]``.
+            normal: Unit normals in these frames, ``[3, S]``.
+
+        Returns:
+            ``[3, S]``; points that are not inside are unchanged.
+        """
+        before = None
+        # Repeated, because a way out of one primitive can end in another.
+        while before is None or not torch.equal(point, before):
+            before = point
+            for i, shape in enumerate(self._shapes):
+                start = [p - c for p, c in zip(point, self._centres[i], strict=True)]
+                start, way = (_turned(self._turns[i], v) for v in (start, normal))
+                inside = shape.signed_distance(*start) < -_ROUNDING
+                inside &= link == self._link[i]
+                _, leave = shape.ray_interval(*start, *way)
+                point = torch.where(inside, point + leave * normal, point)
+        return point
 
     def blocked(
         self,

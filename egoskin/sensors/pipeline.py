@@ -22,7 +22,13 @@ from egoskin.sensors.history import KeepLast
 from egoskin.sensors.imperfections.corruption import Corruption
 from egoskin.sensors.imperfections.presets import PRESETS
 from egoskin.sensors.ray import RaySensor, SparseRays
-from egoskin.sensors.signals import Binary, Localization, Proximity, SkinOrder
+from egoskin.sensors.signals import (
+    BeamMinimum,
+    Binary,
+    Localization,
+    Proximity,
+    SkinOrder,
+)
 from egoskin.sensors.skin.coverage import Ray
 from egoskin.sensors.skin.skin import Skin
 from egoskin.shapes import Shape
@@ -144,6 +150,9 @@ class SensorPipeline:
     ) -> list[FieldSensor | RaySensor]:
         """Return the transforms that compute the measurements, one per group.
 
+        With corruption they measure all beams, also if the signal is each sensor's
+        minimum.
+
         Args:
             objects: Shapes of the objects.
             masked: Indices of sensors that detect nothing.
@@ -158,7 +167,10 @@ class SensorPipeline:
                 "compile": True,
             }
             if group.is_ray:
-                sensor = RaySensor(*args, reduce=self.config.reduce, **common)
+                # The beams of a real sensor have their own errors.
+                real = self.config.corruption != "none"
+                reduce = "none" if real else self.config.reduce
+                sensor = RaySensor(*args, reduce=reduce, **common)
             else:
                 sensor = FieldSensor(*args, **common)
             sensor.mask([i for i, own in enumerate(group.index) if own in masked])
@@ -221,6 +233,12 @@ class SensorPipeline:
                     zip(distances, readings, strict=True)
                 )
             ]
+            if config.reduce == "min":
+                for i, group in enumerate(self.groups):
+                    if group.is_ray:
+                        least = f"least{group.suffix}"
+                        transforms.append(BeamMinimum([readings[i]], [least]))
+                        readings[i] = least
         skins = [group.skin for group in self.groups]
         transforms += map(self._signal, skins, readings, signals)
         if len(signals) > 1:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import partial
 
 import mujoco
@@ -212,3 +213,29 @@ def test_an_object_around_the_sensor_is_not_hidden():
     skin = chest(front=True)
     sensor = FieldSensor(skin, H1_2.chain, [Sphere(radius=0.5)], RANGE, body=BODY)
     assert look(sensor, skin, (0.1, 0, 0)) == (0.0, True)
+
+
+@pytest.mark.parametrize("depth", [0.0, 2e-3, 0.02, 0.1])
+def test_the_solid_around_a_sensor_hides_only_what_is_behind_it(depth):
+    on = chest(front=True)
+    within = replace(on, position=on.position - depth * on.normal)
+    for kind in (FieldSensor, RaySensor):
+        sensor = kind(within, H1_2.chain, [BALL], RANGE, body=BODY)
+        clear = kind(within, H1_2.chain, [BALL], RANGE)
+        for way, sees in (((0.6, 0.1, 0.1), True), ((-0.6, 0.1, 0.1), False)):
+            distance, detected = look(sensor, within, way)
+            assert detected == sees
+            assert not sees or distance == look(clear, within, way)[0]
+
+
+def test_sensors_below_the_surface_see_as_much_as_those_on_it(skin, random_state):
+    state = crowd(random_state, 5, rows=64)
+    shares = [
+        measure(FieldSensor(s, H1_2.chain, [*SHAPES], RANGE, body=BODY), state)[0]
+        .isfinite()
+        .double()
+        .mean()
+        .item()
+        for s in (skin, skin.misplaced(5e-3, 0.0, seed=0))
+    ]
+    assert shares[1] == pytest.approx(shares[0], rel=0.1)

@@ -114,3 +114,22 @@ def test_a_real_sensor_signals_nothing_from_beyond_its_range(
     beyond = (reading > reach) & (reading < math.inf)
     assert beyond.sum() > 50
     assert torch.equal(stored["signal"], (reading <= reach).float())
+
+
+@pytest.mark.parametrize("kind", ["proximity", "closeness", "binary"])
+def test_the_closest_beam_of_a_real_sensor_is_that_of_its_readings(
+    mixed, random_state, kind
+):
+    # A chip reports all zones; each can be wrong.
+    options = {"signal": kind, "range": 1.0, "corruption": "time_of_flight"}
+    state = random_state(500, seed=2)
+    every, least = SensorConfig(**options), SensorConfig(**options, reduce="min")
+    size = [len(c.directions()) if isinstance(c, Ray) else 1 for c in mixed.coverage]
+    choose = torch.amin if kind == "proximity" else torch.amax
+    zones = measured(every, mixed, state)["signal"].split(size, -1)
+    expected = torch.stack([choose(signal, -1) for signal in zones], -1)
+    signal = measured(least, mixed, state)["signal"]
+    assert torch.equal(signal, expected)
+    assert len(signal.unique()) > 1
+    pipeline = SensorPipeline(least, H1_2, mixed)
+    assert pipeline.signal_size == signal.shape[-1] == len(mixed)
