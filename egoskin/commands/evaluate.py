@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -166,7 +167,7 @@ def behaviour_table(result: Behaviour) -> str:
 
     def row(name: str, unit: str, show: Callable[[Motion], float]) -> str:
         own, zero = show(result.motion), show(result.motion_zero_action)
-        return f"  {name:<32}{own:10.3g} {zero:13.3g} {unit}"
+        return f"  {name:<32}{own:10.3g} {zero:13.3g} {unit}".replace("nan", "  -")
 
     return "\n".join(
         [
@@ -174,11 +175,16 @@ def behaviour_table(result: Behaviour) -> str:
             row("mechanical power", "W", lambda m: m.power),
             row("joint acceleration, rms", "rad/s^2", lambda m: m.joint_acceleration),
             row("torques at their limit", "%", lambda m: 100 * m.torque_saturation),
-            row("feet slide, while on the floor", "cm/s", lambda m: 100 * m.foot_slip),
+            row("feet slide, while on the floor", "cm/s", _slip),
             row("steps without floor contact", "%", lambda m: 100 * m.airborne),
             row("steps with self-contact", "%", lambda m: 100 * m.self_contact),
         ]
     )
+
+
+def _slip(motion: Motion) -> float:
+    """Return the sliding speed of the feet [cm/s], NaN if there is none."""
+    return math.nan if motion.foot_slip is None else 100 * motion.foot_slip
 
 
 def perturbed_table(rows: list[Perturbed], age: float) -> str:
