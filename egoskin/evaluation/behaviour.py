@@ -384,7 +384,7 @@ class _Feet:
         Their shapes are ``[B, F, 3]`` and ``[B, F, 3, 3]``.
         """
         position, rotation = self._kinematics.poses_b(state["joint_pos"])
-        base, turn = state["base_pose"][:, None].split((3, 4), -1)
+        base, turn = state["base_pose"][:, None].split([3, 4], -1)
         turn = quat_to_matrix(turn)
         return base + _times(turn, position), turn @ rotation
 
