@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,12 +22,20 @@ import tyro
 
 from egoskin.bounds import COUNT, check_bounds
 from egoskin.commands.errors import check_packages
+from egoskin.envs.dodgeball import DodgeballConfig
 from egoskin.envs.physics import Engine, engine_of
 from egoskin.evaluation.behaviour import Behaviour, Motion, behave
 from egoskin.evaluation.operating_map import check_map, draw_map, operating_map
 from egoskin.evaluation.perturbations import Perturbed, perturb
-from egoskin.evaluation.throw_set import Estimate, Evaluation, evaluate, standard_task
+from egoskin.evaluation.throw_set import (
+    LATER,
+    Estimate,
+    Evaluation,
+    evaluate,
+    standard_task,
+)
 from egoskin.make import EnvConfig, check_num_workers, device_of
+from egoskin.parallel import default_num_workers
 from egoskin.policies.policy import load_policy
 from egoskin.progress import StatusLine, counted
 from egoskin.rng import check_seed
@@ -104,8 +113,10 @@ def share(value: float | None) -> str:
     return "     -" if value is None else f"{100 * value:6.2f} %"
 
 
-def table(result: Evaluation, title: str, age: float) -> str:
-    """Return the results as text; success is contact-free survival to an age [s]."""
+def table(result: Evaluation, title: str, task: DodgeballConfig) -> str:
+    """Return the results on a task as text."""
+    age, end = task.success_s, task.episode_length_s
+    later = min(LATER, end)
 
     def interval(value: Estimate, scale: float, unit: str) -> str:
         mean, low, high = (scale * v for v in (value.mean, value.low, value.high))
@@ -119,9 +130,9 @@ def table(result: Evaluation, title: str, age: float) -> str:
     }
     rows = [
         (f"success (no contact for {age:g} s)", interval(result.success, 100, "%")),
-        ("  no contact for 5 s", interval(result.success_5s, 100, "%")),
+        (f"  no contact for {later:g} s", interval(result.success_5s, 100, "%")),
         ("  same throws, robot held rigid", share(result.rigid_success)),
-        ("survival time (at most 10 s)", interval(result.survival_time, 1, "s")),
+        (f"survival time (at most {end:g} s)", interval(result.survival_time, 1, "s")),
         *((f"ended within {age:g} s by {how}", share(x)) for how, x in ends.items()),
         ("first balls avoided", share(result.avoided.first_ball)),
         ("later balls avoided", share(result.avoided.later_balls)),
@@ -166,7 +177,7 @@ def behaviour_table(result: Behaviour) -> str:
 
     def row(name: str, unit: str, show: Callable[[Motion], float]) -> str:
         own, zero = show(result.motion), show(result.motion_zero_action)
-        return f"  {name:<32}{own:10.3g} {zero:13.3g} {unit}"
+        return f"  {name:<32}{own:10.3g} {zero:13.3g} {unit}".replace("nan", "  -")
 
     return "\n".join(
         [
@@ -174,11 +185,16 @@ def behaviour_table(result: Behaviour) -> str:
             row("mechanical power", "W", lambda m: m.power),
             row("joint acceleration, rms", "rad/s^2", lambda m: m.joint_acceleration),
             row("torques at their limit", "%", lambda m: 100 * m.torque_saturation),
-            row("feet slide, while on the floor", "cm/s", lambda m: 100 * m.foot_slip),
+            row("feet slide, while on the floor", "cm/s", _slip),
             row("steps without floor contact", "%", lambda m: 100 * m.airborne),
             row("steps with self-contact", "%", lambda m: 100 * m.self_contact),
         ]
     )
+
+
+def _slip(motion: Motion) -> float:
+    """Return the sliding speed of the feet [cm/s], NaN if there is none."""
+    return math.nan if motion.foot_slip is None else 100 * motion.foot_slip
 
 
 def perturbed_table(rows: list[Perturbed], age: float) -> str:
@@ -240,9 +256,11 @@ def main(args: list[str]) -> None:
     }
     engine: dict[str, Any] = {"engine": config.engine, "device": config.device}
     # For evaluations that are repeated many times.
+    episodes, workers = max(config.episodes // 4, 1), config.num_workers
     quarter: dict[str, Any] = {
         "throw_set": config.throw_set,
-        "episodes": max(config.episodes // 4, 1),
+        "episodes": episodes,
+        "num_workers": workers and default_num_workers(episodes, workers),
         "mask": config.masked,
     }
     behaviour = checked = None
@@ -267,8 +285,8 @@ def main(args: list[str]) -> None:
     if config.engine != "mujoco":
         title += f", engine {config.engine}"
     title += ", physics at "
-    age = env_config.task.success_s
-    print(table(result, title + physics_rate(env_config), age))
+    task = env_config.task
+    print(table(result, title + physics_rate(env_config), task))
     content = {
         **dataclasses.asdict(result),
         "standard": played,
@@ -283,7 +301,7 @@ def main(args: list[str]) -> None:
         print(behaviour_table(behaviour))
         content["behaviour"] = dataclasses.asdict(behaviour)
     if checked is not None:
-        print("\n" + table(checked, title + physics_rate(finer), age))
+        print("\n" + table(checked, title + physics_rate(finer), task))
         lost = 100 * (result.success.mean - checked.success.mean)
         print(f"  success lost with the other physics rate: {lost:.2f} points")
         content["check_substeps"] = config.check_substeps
@@ -293,7 +311,7 @@ def main(args: list[str]) -> None:
             policy, env_config, policy.skin, **quarter, on_point=on_perturbed
         )
         line.finish()
-        print(perturbed_table(rows, age))
+        print(perturbed_table(rows, task.success_s))
         content["perturbed"] = [dataclasses.asdict(row) for row in rows]
     if config.map is not None:
         lines = operating_map(

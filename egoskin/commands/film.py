@@ -97,6 +97,11 @@ class RenderConfig:
                 "a policy brings its own robot, task, skin and sensors: leave their "
                 "options out, or leave out the policy"
             )
+        if self.policy is None and self.standard != "2":
+            raise ValueError(
+                "--standard needs a policy: without one, the options of --task set the "
+                "throws"
+            )
 
     @property
     def sheet_path(self) -> Path:

@@ -23,7 +23,7 @@ import tyro
 
 from egoskin.bounds import COUNT, POSITIVE, check_bounds
 from egoskin.commands.errors import check_packages, parse_subcommand
-from egoskin.evaluation.visibility import analyse
+from egoskin.evaluation.visibility import alike, analyse, warning_texts
 from egoskin.parallel import available_cores
 from egoskin.progress import counted
 from egoskin.storage.serialization import to_plain
@@ -38,8 +38,15 @@ from egoskin.study.store import RunStatus, StudyFolder, duration
 _MANY_CORES = 64
 # Environment steps of a study that is long enough to measure its best settings.
 _WORTH_MEASURING = 50_000_000
-# Cells see alike if their warnings differ for a smaller share of hits than this.
-_ALIKE = 0.05
+# Fields that the analysis of visibility takes from the base, by their first parts.
+_OF_THE_BASE = (
+    "env.robot",
+    "env.skin",
+    "env.sensor.field",
+    "env.sensor.ray",
+    "env.sensor.occlusion",
+    "env.task.throws",
+)
 
 Name = Annotated[str, tyro.conf.Positional]
 Folder = Annotated[Path, tyro.conf.Positional]
@@ -123,7 +130,7 @@ class Plan:
         )
         if self.visibility:
             seen = what_is_seen(manifest)
-            if self.dir is not None:
+            if seen and self.dir is not None:
                 text = json.dumps(seen, indent=2, allow_nan=False) + "\n"
                 write_file(self.dir / "visibility.json", text.encode())
         if self.dir is not None:
@@ -148,11 +155,20 @@ def describe(manifest: Manifest) -> None:
 
 def what_is_seen(manifest: Manifest) -> dict[str, Any]:
     """Print and return the visibility of thrown balls by coverage and range."""
-    sensors = [
-        c.config.env.sensor for c in manifest.cells if c.config.env.sensor.uses_skin
+    skinned = [c for c in manifest.cells if c.config.env.sensor.uses_skin]
+    others = [
+        c
+        for c in skinned
+        if any(name.startswith(_OF_THE_BASE) for name in manifest.overrides(c))
     ]
+    sensors = [c.config.env.sensor for c in skinned if c not in others]
+    if others:
+        print(
+            "visibility is not analysed for cells with another robot, skin, shape of "
+            f"sensors or throw than the base: {', '.join(c.name for c in others)}"
+        )
     if not sensors:
-        print("no cell has a skin: there is no visibility to analyse")
+        print("no cell has the skin of the base: there is no visibility to analyse")
         return {}
     base = manifest.base.env
     analysis = analyse(
@@ -167,16 +183,11 @@ def what_is_seen(manifest: Manifest) -> dict[str, Any]:
     report = analysis.report()
     print("visibility of the thrown balls that hit a standing robot, without training:")
     for cell, row in zip(analysis.cells, report["cells"], strict=True):
-        warning = row["warning"]
-        times = [warning[key] for key in ("5%", "median", "95%")]
-        text = " / ".join("-" if t is None else f"{1e3 * t:.0f}" for t in times)
-        seen = "-" if warning["seen"] is None else f"{warning['seen']:.1%}"
-        print(f"  {cell!s:<14} sees {seen:>6}, {text} ms before (5 / 50 / 95 %)")
-    shares = report["differing_share"] or []
-    for a, one in enumerate(analysis.cells):
-        for b, other in enumerate(analysis.cells[:a]):
-            if shares and shares[a][b] < _ALIKE:
-                print(f"  {other} and {one} see the same")
+        seen, times = warning_texts(row)
+        text = " / ".join(times)
+        print(f"  {cell!s:<14} sees {seen:>7}, {text} ms before (5 / 50 / 95 %)")
+    for one, other, _ in alike(analysis):
+        print(f"  {one} and {other} see the same")
     return {"config": to_plain(base), **report}
 
 

@@ -39,7 +39,7 @@ except ImportError:
 
 from egoskin.envs.physics import PhysicsConfig
 from egoskin.envs.throws import ThrowConfig
-from egoskin.evaluation.visibility import Analysis, analyse
+from egoskin.evaluation.visibility import Analysis, alike, analyse, warning_texts
 from egoskin.progress import counted
 from egoskin.robots.own import find_robot
 from egoskin.sensors import Field, Ray
@@ -47,8 +47,6 @@ from egoskin.sensors.config import SensorConfig, SkinConfig
 from egoskin.storage.serialization import to_plain
 from egoskin.viewer.film import check_path
 
-# Cells see alike if their warnings differ for a smaller share of hits than this.
-ALIKE = 0.05
 PICTURE_SUFFIXES = (".png", ".jpg", ".svg", ".pdf")
 BLIND, NOWHERE = "#c1272d", "#e6e6e6"
 
@@ -103,28 +101,20 @@ def print_table(analysis: Analysis, report: dict[str, Any]) -> None:
         f"{'5 %':>6}{'50 %':>6}{'95 %':>6}{'at once':>9}"
     )
     for cell, row in zip(analysis.cells, report["cells"], strict=True):
-        warning = row["warning"]
-        shares = [row["directions_seen"], row["surface_blind"], warning.get("seen")]
-        seen, blind, hits = ("-" if x is None else f"{x:.1%}" for x in shares)
+        shares = row["directions_seen"], row["surface_blind"]
+        seen, blind = ("-" if x is None else f"{100 * x:.1f} %" for x in shares)
+        hits, warning = warning_texts(row)
         cone = f"{row['widest_blind_cone_deg']['half_angle']:.0f} deg"
-        times = "".join(
-            f"{1e3 * warning[key]:6.0f}" if warning["hits"] else "     -"
-            for key in ("5%", "median", "95%")
-        )
+        times = "".join(f"{time:>6}" for time in warning)
         at_once = row["sensors_at_once"]["median"] or 0
         print(
             f"{cell!s:15s}{seen:>10}{cone:>8}{blind:>9}{hits:>8}{times}{at_once:9.0f}"
         )
-    if report["differing_share"] is None:
-        return
-    for a, one in enumerate(analysis.cells):
-        for b, other in enumerate(analysis.cells[:a]):
-            share = report["differing_share"][a][b]
-            if share < ALIKE:
-                print(
-                    f"{other} and {one} see the same: {share:.1%} of the warnings "
-                    "differ by more than a control step"
-                )
+    for one, other, share in alike(analysis):
+        print(
+            f"{one} and {other} see the same: {share:.1%} of the warnings differ by "
+            "more than a control step"
+        )
 
 
 def draw_map(axes: Axes, analysis: Analysis, cell: int, seen: float | None) -> Any:

@@ -28,8 +28,8 @@ from egoskin.evaluation.throw_set import (
     wilson,
 )
 from egoskin.make import EnvConfig
-from egoskin.robots.config import RobotConfig
-from egoskin.robots.kinematics import LinkKinematics, rotate
+from egoskin.robots.config import Primitive, RobotConfig
+from egoskin.robots.kinematics import LinkKinematics, quat_to_matrix
 from egoskin.sensors import Skin
 
 # Ages at which the displacement of the base is recorded [s].
@@ -90,8 +90,9 @@ class Motion:
     """Root mean square joint acceleration, by differences of steps [rad/s^2]."""
     torque_saturation: float
     """Share of joint torques at their limit."""
-    foot_slip: float
-    """Sliding speed of the lowest corner of a foot while on the floor [m/s]."""
+    foot_slip: float | None
+    """Sliding speed of the lowest point of a foot while on the floor [m/s]; None if it
+    is never there, or the feet have no shapes."""
     airborne: float
     """Share of the steps in which no link touches the floor."""
     self_contact: float
@@ -272,11 +273,13 @@ class Watcher:
 
     def motion(self) -> Motion:
         """Return the motion of the robot."""
-        mean = {
+        mean: dict[str, Any] = {
             name: total / max(self._counts[name], 1)
             for name, total in self._sums.items()
         }
         mean["joint_acceleration"] = math.sqrt(mean["joint_acceleration"])
+        if not self._counts["foot_slip"]:
+            mean["foot_slip"] = None
         return Motion(**mean)
 
     def displacement(self) -> list[Displacement]:
@@ -355,47 +358,72 @@ class Watcher:
 
 
 class _Feet:
-    """The corners of the feet's boxes."""
+    """The shapes of the feet, each the hull of 8 corners, rounded by a radius.
+
+    A capsule is the hull of the ends of its axis, a sphere that of its centre.
+    """
 
     def __init__(self, robot: RobotConfig) -> None:
-        boxes = [
-            p for p in robot.primitives if p.link in robot.feet and p.kind == "box"
-        ]
-        signs = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3)
+        shapes = robot.primitives_on(robot.feet)
+        signs = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3).double().numpy()
         corners = [
-            (signs.double().numpy() * box.size) @ box.rotation.T + box.position
-            for box in boxes
+            (signs * _half_extents(shape)) @ shape.rotation.T + shape.position
+            for shape in shapes
         ]
         # In the frames of the feet [m], [F, 8, 3].
-        self._corners = torch.from_numpy(np.stack(corners)).float()
-        self._kinematics = LinkKinematics(robot.chain, [box.link for box in boxes])
+        self._corners = torch.from_numpy(np.reshape(corners, (-1, 8, 3))).float()
+        # From a corner to the lowest point of its rounding [m], [F, 3].
+        self._down = torch.zeros(len(shapes), 3)
+        for down, shape in zip(self._down, shapes, strict=True):
+            down[2] = 0.0 if shape.kind == "box" else -shape.size[0]
+        self._kinematics = LinkKinematics(robot.chain, [s.link for s in shapes])
 
-    def corners_w(self, state: TensorDictBase) -> Tensor:
-        """Return the corners of each foot in the world [m], ``[B, F, 8, 3]``."""
+    def poses_w(self, state: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Return the positions [m] and rotations of the feet in the world.
+
+        Their shapes are ``[B, F, 3]`` and ``[B, F, 3, 3]``.
+        """
         position, rotation = self._kinematics.poses_b(state["joint_pos"])
-        # p + R x
-        turned = (rotation[:, :, None] * self._corners[..., None, :]).sum(-1)
-        points_b = position[:, :, None] + turned
-        pose = state["base_pose"][:, None, None].expand(*points_b.shape[:-1], 7)
-        return pose[..., :3] + rotate(pose[..., 3:], points_b)
+        base, turn = state["base_pose"][:, None].split([3, 4], -1)
+        turn = quat_to_matrix(turn)
+        return base + _times(turn, position), turn @ rotation
+
+    def corners_w(self, position: Tensor, rotation: Tensor) -> Tensor:
+        """Return the corners of each foot in the world [m], ``[B, F, 8, 3]``."""
+        return position[:, :, None] + _times(rotation[:, :, None], self._corners)
 
     def slip(self, before: TensorDictBase, after: TensorDictBase) -> Tensor:
-        """Return the distance that the lowest corner of each foot slides in a step [m].
+        """Return the distance that the lowest point of each foot slides in a step [m].
 
         Args:
             before: State of ``B`` rows at the start of the step.
             after: State at its end.
 
         Returns:
-            Planar distance, ``[B, F]``; NaN where that corner does not stay on the
+            Planar distance, ``[B, F]``; NaN where that point does not stay on the
             floor. A foot that rolls over an edge is not counted as sliding.
         """
-        start, end = self.corners_w(before), self.corners_w(after)
-        lowest = start[..., 2:].argmin(2, keepdim=True).expand(-1, -1, 1, 3)
-        start, end = (x.gather(2, lowest)[:, :, 0] for x in (start, end))
-        stays = (start[..., 2] < _ON_FLOOR) & (end[..., 2] < _ON_FLOOR)
-        way = (end - start)[..., :2].norm(dim=-1)
+        (start, turn), (end, turn_after) = self.poses_w(before), self.poses_w(after)
+        corners = self.corners_w(start, turn)
+        index = corners[..., 2:].argmin(2, keepdim=True).expand(-1, -1, 1, 3)
+        lowest = corners.gather(2, index)[:, :, 0] + self._down
+        # The same point of the foot at the end of the step.
+        later = end + _times(turn_after, _times(turn.mT, lowest - start))
+        stays = (lowest[..., 2] < _ON_FLOOR) & (later[..., 2] < _ON_FLOOR)
+        way = (later - lowest)[..., :2].norm(dim=-1)
         return way.where(stays, math.nan)
+
+
+def _half_extents(shape: Primitive) -> np.ndarray:
+    """Return the half extents of a shape without its rounding [m], ``[3]``."""
+    if shape.kind == "box":
+        return shape.size
+    return np.array([0.0, 0.0, shape.size[1] if shape.kind == "capsule" else 0.0])
+
+
+def _times(matrix: Tensor, vector: Tensor) -> Tensor:
+    """Return the products of matrices ``[*B, 3, 3]`` and vectors ``[*B, 3]``."""
+    return (matrix * vector[..., None, :]).sum(-1)
 
 
 def _bands(

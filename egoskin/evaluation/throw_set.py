@@ -39,8 +39,8 @@ Watch = Callable[[TensorDictBase, TensorDictBase, Tensor], None]
 (``[N]`` rows, raw keys kept) and the rows whose episode is still running, ``[N]``
 bool."""
 
-# Success is also reported at this age [s].
-_LATER = 5.0
+LATER = 5.0
+"""Success is also reported at this age [s]."""
 # Up to this many episodes take less time than starting workers.
 _FEW = 64
 # Two-sided 95 % quantile of the normal distribution.
@@ -82,7 +82,8 @@ class Evaluation:
     success_5s: Estimate
     """The same up to 5 s, where trained policies with different skins differ more."""
     survival_time: Estimate
-    """Mean survival time [s], restricted to 10 s."""
+    """Mean survival time [s], restricted to the length of an episode (standard task:
+    10 s)."""
     ended_by_ball: float
     """Share of episodes ended by a ball."""
     ended_by_fall: float
@@ -293,7 +294,7 @@ def summarize(played: Episodes, rigid: Episodes, task: DodgeballConfig) -> Evalu
 
     return Evaluation(
         success=success(played, limit),
-        success_5s=success(played, round(_LATER * control_hz)),
+        success_5s=success(played, round(LATER * control_hz)),
         survival_time=mean_estimate(played.steps.clamp(min=0) / control_hz),
         ended_by_ball=float((played.hit & early).double().mean()),
         ended_by_fall=float((played.fallen & early).double().mean()),

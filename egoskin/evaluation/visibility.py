@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -42,6 +42,8 @@ CLEARANCES = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
 """Clearances for which the share of directions seen by then is reported [m]."""
 BANDS = (0.0, 0.8, 1.2, 1.6, math.inf)
 """Bounds of the bands of contact height above ground [m], from legs to head."""
+# Cells see alike if their warnings differ for a smaller share of hits than this.
+_ALIKE = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -229,6 +231,31 @@ class Analysis:
             return {"median": None, "one": None}
         one = (count == 1).double().mean()
         return {"median": float(count.median()), "one": float(one)}
+
+
+def warning_texts(row: Mapping[str, Any]) -> tuple[str, list[str]]:
+    """Return the warning of a cell of `Analysis.report` as text, "-" without hits.
+
+    Args:
+        row: The cell.
+
+    Returns:
+        Share of hits that are seen before, and 5 %, 50 % and 95 % of the times [ms].
+    """
+    warning = row["warning"]
+    if not warning["hits"]:
+        return "-", ["-"] * 3
+    times = [f"{1e3 * warning[key]:.0f}" for key in ("5%", "median", "95%")]
+    return f"{100 * warning['seen']:.1f} %", times
+
+
+def alike(analysis: Analysis) -> Iterator[tuple[Cell, Cell, float]]:
+    """Yield the pairs of cells that see alike, and their `Analysis.differing_share`."""
+    if analysis.throws.touches.any():
+        shares = analysis.differing_share()
+        for a, b in itertools.combinations(range(len(shares)), 2):
+            if shares[a, b] < _ALIKE:
+                yield analysis.cells[a], analysis.cells[b], float(shares[a, b])
 
 
 def _on_grid(clearance: Tensor, comes: Tensor) -> np.ndarray:

@@ -89,6 +89,10 @@ _WARP_PACKAGES = ("mujoco-warp", "warp-lang")
 _METRICS = "log/metrics"
 
 
+class RunLockedError(ValueError):
+    """Raised if another process is training a run."""
+
+
 class Run:
     """An open run folder.
 
@@ -273,7 +277,8 @@ class Run:
         The operating system releases the lock when this process ends.
 
         Raises:
-            ValueError: If another process is training it.
+            RunLockedError: If another process is training it.
+            ValueError: If the lock is a link.
         """
         path = self.path / "lock"
         flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
@@ -287,7 +292,7 @@ class Run:
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                raise ValueError(
+                raise RunLockedError(
                     f"{self.path} is being trained by another process"
                 ) from None
             yield

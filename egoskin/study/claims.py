@@ -10,6 +10,7 @@ owner creates the file with the next number, which only one process can do.
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import json
 import os
@@ -129,8 +130,10 @@ def _open(path: Path, *, create: bool) -> IO[str]:
         return open(path, "a")
     try:
         return open(path, "r+")
-    except PermissionError:
-        # Readers without write permission can still check the lock.
+    except OSError as error:
+        if error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS):
+            raise
+        # Who may only read can still check the lock.
         return open(path)
 
 

@@ -337,7 +337,7 @@ def equivalence(manifest: Manifest, table: Table) -> Figure | None:
         kind = "undecided"
         if SAME.p_inside(effect) <= 0.05:
             kind = "equivalent within 5 points"
-        elif low > 0 or high < 0:
+        elif effect.error > 0 and (low > 0 or high < 0):
             kind = "different"
         _draw_effect(axes, y, effect, kinds[kind])
     for kind, colour in kinds.items():

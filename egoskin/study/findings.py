@@ -14,7 +14,7 @@ replaced by a similar statement about our budget, called a stand-in.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Literal
@@ -80,8 +80,6 @@ class Tested:
     """P-value of "it lies inside its region"."""
     p_refute: float
     """P-value of "it lies outside its region"."""
-    seeds_needed: int | None
-    """Seeds needed to decide it; None if unknown or if no number is enough."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -263,7 +261,7 @@ def judge_findings(tables: Mapping[str, Table]) -> list[Judged]:
                 claims=tuple(claims),
                 verdict=verdict,
                 p_value=p,
-                seeds_needed=_needed(claims),
+                seeds_needed=_needed(claims, tables[finding.metric]),
             )
         )
     return result
@@ -271,39 +269,43 @@ def judge_findings(tables: Mapping[str, Table]) -> list[Judged]:
 
 def _test(finding: Finding, table: Table) -> list[Tested]:
     result = []
-    # Bonferroni, as if all findings were to be decided at once.
-    alpha, one = ALPHA / len(FINDINGS), seed_sd(table)
     for claim in finding.claims:
         effect = contrast(claim.weights, table)
         known = effect is not None
-        # Assumed for cells with one seed: the spread of the others, and unpaired seeds.
-        sd = one * math.sqrt(sum(w**2 for w in claim.weights.values()))
         result.append(
             Tested(
                 claim=claim,
                 effect=effect,
                 p_confirm=claim.region.p_inside(effect) if known else 1.0,
                 p_refute=claim.region.p_outside(effect) if known else 1.0,
-                seeds_needed=(
-                    seeds_needed(effect, claim.region, alpha, sd) if known else None
-                ),
             )
         )
     return result
 
 
-def _needed(claims: list[Tested]) -> int | None:
+def _needed(claims: Sequence[Tested], table: Table) -> int | None:
     """Return the number of seeds that decides a finding in its present direction."""
-    against = [
-        t.seeds_needed
-        for t in claims
-        if t.effect is not None
-        and t.effect.mean not in t.claim.region
-        and t.seeds_needed is not None
-    ]
-    if against:
+    # Bonferroni, as if all findings were to be decided at once.
+    alpha, one = ALPHA / len(FINDINGS), seed_sd(table)
+    confirm: list[float] = []
+    refute: list[int | None] = []
+    for tested in claims:
+        effect, region = tested.effect, tested.claim.region
+        if effect is None:
+            confirm.append(math.nan)
+            continue
+        sd = effect.sd
+        if not sd > 0:
+            # Assumed: the spread of the other cells, and unpaired seeds.
+            weights = tested.claim.weights.values()
+            sd = one * math.sqrt(sum(w**2 for w in weights)) or math.nan
+        distances = [abs(effect.mean - bound) / sd for bound in region.bounds]
+        confirm += distances
+        if effect.mean not in region:
+            # Only the end beyond which it lies; Bonferroni over all ends of all claims.
+            level = alpha / len(distances) / len(claims)
+            refute.append(seeds_needed([min(distances)], level))
+    if refute:
         # A single refuted claim is enough.
-        return min(against)
-    needed = [t.seeds_needed for t in claims]
-    known = [n for n in needed if n is not None]
-    return max(known) if len(known) == len(needed) else None
+        return min((n for n in refute if n is not None), default=None)
+    return seeds_needed(confirm, alpha)

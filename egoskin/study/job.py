@@ -21,6 +21,7 @@ from egoskin.agents.ppo import NonFiniteError
 from egoskin.interrupts import ENDING, take
 from egoskin.parallel import WorkerError
 from egoskin.progress import ProgressLine
+from egoskin.runs.run import RunLockedError
 from egoskin.runs.trainer import open_trainer, train
 from egoskin.study.claims import claimed
 from egoskin.study.store import StudyFolder, judge_run, now
@@ -95,14 +96,18 @@ def work(folder: StudyFolder, name: str, stop: Stop, cores: int = 1) -> int:
         if folder.is_trained_elsewhere(name):
             return CLAIMED
         if not folder.is_trained(planned):
-            with open_trainer(run) as trainer:
-                line = ProgressLine(trainer.frames, planned.end)
-                train(trainer, lambda: stop.requested, line.update)
+            try:
+                with open_trainer(run) as trainer:
+                    line = ProgressLine(trainer.frames, planned.end)
+                    train(trainer, lambda: stop.requested, line.update)
+            except RunLockedError:
+                # It was free a moment ago.
+                return CLAIMED
             if trainer.frames < planned.end:
                 return STOPPED
         print(f"{now()} evaluate on {manifest.evaluation.episodes} throws", flush=True)
         try:
-            judge_run(folder, planned, manifest.evaluation, stop.check)
+            judge_run(folder, planned, manifest.evaluation, stop.check, cores)
         except _StoppedError:
             return STOPPED
         print(f"{now()} finished", flush=True)

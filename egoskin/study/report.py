@@ -14,6 +14,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
+from egoskin.evaluation.visibility import warning_texts
 from egoskin.storage.serialization import read_json
 from egoskin.storage.tensor_file import write_file
 from egoskin.study.figures import (
@@ -34,6 +35,9 @@ from egoskin.study.statistics import (
     spread,
 )
 from egoskin.study.store import Result, RunStatus, StudyFolder
+
+# The budget is the same for all runs: the share of it adds nothing to the frames.
+_SHOWN = [m for m in METRICS if m.name != "share_to_90"]
 
 
 @dataclass(frozen=True)
@@ -146,8 +150,9 @@ def _blocks(
 ) -> Iterable[Block]:
     plan, total = manifest.evaluation, len(manifest.runs)
     yield Heading(f"Study {manifest.study}")
+    purpose = manifest.purpose and f"{manifest.purpose}. "
     yield Text(
-        f"{manifest.purpose[0].upper()}{manifest.purpose[1:]}. {len(results)} of "
+        f"{purpose[:1].upper()}{purpose[1:]}{len(results)} of "
         f"{total} runs are done. Evaluated on standard {plan.standard}, throw set "
         f"{plan.throw_set} of {plan.episodes:,} sequences, with the mean action. "
         "Intervals are over seeds, not over throws."
@@ -186,7 +191,7 @@ def _blocks(
         "Standard deviation between cells divided by that between the seeds of a cell: "
         "at 1, two cells differ about as much as two seeds of one cell."
     )
-    ratios = [(separation(values[m.name]), m) for m in METRICS]
+    ratios = [(separation(values[m.name]), m) for m in _SHOWN]
     known = sorted((r for r in ratios if r[0] >= 0), key=lambda r: -r[0])
     if known:
         yield Rows(
@@ -250,7 +255,11 @@ def _deciding(judged: Judged) -> Tested:
 
 
 def _finding_rows(judged: Sequence[Judged], results: Sequence[Result]) -> Rows:
-    hours = [r.stored.record.wall_s / 3600 for r in results]
+    # Core-hours of a run: its workers are as many as its cores.
+    hours = [
+        r.stored.record.wall_s / 3600 * (r.stored.config.num_workers or 1)
+        for r in results
+    ]
     each = sum(hours) / len(hours)
     have: dict[str, int] = {}
     for result in results:
@@ -299,14 +308,13 @@ def _finding_rows(judged: Sequence[Judged], results: Sequence[Result]) -> Rows:
 
 
 def _cell_rows(manifest: Manifest, values: Mapping[str, Table]) -> Rows:
-    shown = [m for m in METRICS if m.name != "share_to_90"]
     rows = []
     for cell in manifest.cells:
         success = values["success_3s"].get(cell.name)
         if not success:
             continue
         row = [cell.name, str(len(success))]
-        for metric in shown:
+        for metric in _SHOWN:
             own = list(values[metric.name].get(cell.name, {}).values())
             row.append(_spread(own))
         effect = mean_effect(list(success.values()))
@@ -314,7 +322,7 @@ def _cell_rows(manifest: Manifest, values: Mapping[str, Table]) -> Rows:
         if effect.error > 0:
             row[2] += f" [{effect.mean:.1f}, {low:.1f} to {high:.1f}]"
         rows.append(row)
-    return Rows(("cell", "seeds", *(f"{m.label} [{m.unit}]" for m in shown)), rows)
+    return Rows(("cell", "seeds", *(f"{m.label} [{m.unit}]" for m in _SHOWN)), rows)
 
 
 def _spread(values: Sequence[float]) -> str:
@@ -329,11 +337,8 @@ def _spread(values: Sequence[float]) -> str:
 def _seen_rows(seen: dict) -> Rows:
     rows = []
     for row in seen["cells"]:
-        warning = row["warning"]
-        share = "-" if warning["seen"] is None else f"{100 * warning['seen']:.1f} %"
-        times = [warning[key] for key in ("5%", "median", "95%")]
-        text = " / ".join("-" if t is None else f"{1e3 * t:.0f}" for t in times)
-        rows.append((f"{row['coverage']} {row['range']:g} m", share, text))
+        share, times = warning_texts(row)
+        rows.append((f"{row['coverage']} {row['range']:g} m", share, " / ".join(times)))
     head = ("cell", "hits seen before contact", "warning [ms], 5 / 50 / 95 %")
     return Rows(head, rows)
 

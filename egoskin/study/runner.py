@@ -44,17 +44,28 @@ class Progress:
     """Time left at the present speed [s], None if unknown."""
 
     @classmethod
-    def of(cls, status: list[RunStatus]) -> Progress:
-        """Return the progress for the status of all runs."""
+    def of(cls, status: list[RunStatus], tries: int | None = None) -> Progress:
+        """Return the progress for the status of all runs.
+
+        Args:
+            status: Status of each run.
+            tries: Maximum number of attempts for each run; those that failed as often
+                are not counted in the time left. None: there is no maximum.
+        """
         counts = {"done": 0, "running": 0, "failed": 0, "begun": 0, "missing": 0}
         for each in status:
             counts[each.state] += 1
         total = sum(each.run.end for each in status)
         done = sum(each.frames for each in status)
+        lost = sum(
+            each.run.end - each.frames
+            for each in status
+            if tries and each.state == "failed" and each.tries >= tries
+        )
         speeds = [s.per_s for s in status if s.state == "running" and s.per_s]
         # Runs that have just begun are assumed to be as fast as the others.
         speed = sum(speeds) / len(speeds) * counts["running"] if speeds else 0.0
-        left = (total - done) / speed if speed else None
+        left = (total - done - lost) / speed if speed else None
         left = 0.0 if counts["done"] == len(status) else left
         return cls(counts=counts, share=done / total, left_s=left)
 
@@ -128,7 +139,7 @@ class Runner(ABC):
                 self._start(open_runs)
                 if time.monotonic() - shown > interval:
                     status = self._folder.status(self._manifest)
-                    self._show(str(Progress.of(status)))
+                    self._show(str(Progress.of(status, self._tries)))
                     shown = time.monotonic()
                 time.sleep(_POLL)
         finally:

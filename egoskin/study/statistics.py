@@ -71,8 +71,8 @@ class Effect:
     """Degrees of freedom of the standard error."""
     seeds: int
     """Seeds it is based on: pairs, or the fewest of any cell."""
-    paired: bool = True
-    """Whether the cells were compared seed by seed."""
+    sd: float = math.nan
+    """Standard deviation of the effect of one seed per cell; NaN if it is unknown."""
 
     def interval(self, level: float = 0.95) -> tuple[float, float]:
         """Return a two-sided t interval; NaN if the error is unknown."""
@@ -100,6 +100,11 @@ class Region:
     """Lower end."""
     high: float = math.inf
     """Upper end."""
+
+    @property
+    def bounds(self) -> list[float]:
+        """Its finite ends."""
+        return [x for x in (self.low, self.high) if math.isfinite(x)]
 
     def __contains__(self, value: float) -> bool:
         """Return whether a value lies inside."""
@@ -131,8 +136,14 @@ def spread(values: Sequence[float]) -> Spread:
 def mean_effect(values: Sequence[float]) -> Effect:
     """Return the mean of values over seeds."""
     n = len(values)
-    error = float(np.std(values, ddof=1)) / math.sqrt(n) if n > 1 else math.nan
-    return Effect(mean=float(np.mean(values)), error=error, df=max(n - 1, 1), seeds=n)
+    sd = float(np.std(values, ddof=1)) if n > 1 else math.nan
+    return Effect(
+        mean=float(np.mean(values)),
+        error=sd / math.sqrt(n),
+        df=max(n - 1, 1),
+        seeds=n,
+        sd=sd,
+    )
 
 
 def contrast(weights: Mapping[str, float], table: Table) -> Effect | None:
@@ -158,17 +169,21 @@ def contrast(weights: Mapping[str, float], table: Table) -> Effect | None:
     mean = sum(w * float(np.mean(list(own[k].values()))) for k, w in weights.items())
     fewest = min(map(len, own.values()))
     if fewest == 1:
-        return Effect(mean=mean, error=math.nan, df=1, seeds=1, paired=False)
+        return Effect(mean=mean, error=math.nan, df=1, seeds=1)
     terms = [
-        (w**2 * float(np.var(list(own[k].values()), ddof=1)) / len(own[k]), len(own[k]))
+        (w**2 * float(np.var(list(own[k].values()), ddof=1)), len(own[k]))
         for k, w in weights.items()
     ]
-    variance = sum(v for v, _ in terms)
+    variance = sum(v / n for v, n in terms)
     # Welch and Satterthwaite: v^2 / sum_i v_i^2 / (n_i - 1)
-    below = sum(v**2 / (n - 1) for v, n in terms)
-    df = variance**2 / below if below else 1.0
-    error = math.sqrt(variance)
-    return Effect(mean=mean, error=error, df=df, seeds=fewest, paired=False)
+    below = sum((v / n) ** 2 / (n - 1) for v, n in terms)
+    return Effect(
+        mean=mean,
+        error=math.sqrt(variance),
+        df=variance**2 / below if below else 1.0,
+        seeds=fewest,
+        sd=math.sqrt(sum(v for v, _ in terms)),
+    )
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
@@ -180,38 +195,23 @@ def holm(p_values: Sequence[float]) -> list[float]:
     return result
 
 
-def seeds_needed(
-    effect: Effect, region: Region, alpha: float = ALPHA, sd: float = math.nan
-) -> int | None:
-    """Return the number of seeds that decides a claim, with the effect as observed.
+def seeds_needed(distances: Sequence[float], alpha: float = ALPHA) -> int | None:
+    """Return the number of seeds with which all of some one-sided t tests succeed.
 
-    The claim is decided in the direction of the observed effect, with a power of
-    `POWER`; seeds are assumed to be paired.
+    Their joint power is at least `POWER`; seeds are assumed to be paired.
 
     Args:
-        effect: The effect observed so far.
-        region: The claim.
-        alpha: Level of the test.
-        sd: Standard deviation between seeds, used if that of the effect is unknown.
+        distances: Distance of each effect from its bound, in standard deviations
+            between seeds; NaN if unknown.
+        alpha: Level of each test.
 
     Returns:
-        Total number of seeds; None if the spread is unknown or no number is enough.
+        Total number of seeds; None if a distance is unknown or no number is enough.
     """
-    if effect.error > 0:
-        sd = effect.error * math.sqrt(effect.seeds)
-    if not sd > 0:
-        return None
-    bounds = [b for b in (region.low, region.high) if math.isfinite(b)]
-    inside = effect.mean in region
-    if not inside:
-        # Only the end beyond which it lies; Bonferroni over the ends.
-        alpha /= len(bounds)
-        bounds = [min(bounds, key=lambda b: abs(effect.mean - b))]
-    distances = [abs(effect.mean - b) / sd for b in bounds]
 
     def power(n: int) -> float:
         critical = float(stats.t.ppf(1 - alpha, n - 1))
-        # The power of a one-sided t test; for two tests, a lower bound.
+        # For several tests, a lower bound.
         missed = sum(
             float(stats.nct.cdf(critical, n - 1, d * math.sqrt(n))) for d in distances
         )

@@ -29,6 +29,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from egoskin.evaluation.throw_set import play_throws, standard_task, summarize
+from egoskin.parallel import default_num_workers
 from egoskin.policies.policy import Policy, load_policy
 from egoskin.runs.run import Run
 from egoskin.sensors import MASK_ALL
@@ -78,6 +79,11 @@ class RunStatus:
     """Success of a finished run on the throw set."""
     failure: Failure | None = None
     """Its last failure, unless it has finished since."""
+
+    @property
+    def tries(self) -> int:
+        """Number of failures."""
+        return 0 if self.failure is None else self.failure.tries
 
     @property
     def left_s(self) -> float | None:
@@ -396,6 +402,7 @@ def judge(
     policy: Policy,
     plan: EvaluationPlan,
     on_step: Callable[[int, int], None] | None = None,
+    cores: int = 1,
 ) -> dict[str, Any]:
     """Evaluate a policy on a study's throw set; return the results as JSON values.
 
@@ -403,6 +410,7 @@ def judge(
         policy: The policy.
         plan: The throw set and how to evaluate on it.
         on_step: Called with (steps done, episodes still running).
+        cores: Number of cores to use; the results do not depend on it.
     """
     config = standard_task(policy.env_config, plan.standard)
     play = partial(
@@ -411,7 +419,7 @@ def judge(
         skin=policy.skin,
         throw_set=plan.throw_set,
         episodes=plan.episodes,
-        num_workers=1,
+        num_workers=default_num_workers(plan.episodes, cores),
         on_step=on_step,
     )
     rigid = play(None, hold=True)
@@ -435,11 +443,12 @@ def judge_run(
     planned: PlannedRun,
     plan: EvaluationPlan,
     on_step: Callable[[int, int], None] | None = None,
+    cores: int = 1,
 ) -> None:
     """Evaluate the policy of a trained run, and mark the run as finished."""
     run = Run(folder.run_path(planned.name), planned.config)
     policy = load_policy(run.policy_path(planned.end))
-    folder.finish(planned, judge(policy, plan, on_step))
+    folder.finish(planned, judge(policy, plan, on_step, cores))
 
 
 def policy_hash(path: Path) -> str:

@@ -16,12 +16,20 @@ import torch
 from tensordict import TensorDict
 
 import egoskin
+import egoskin.commands.evaluate as command
 from calling import BATCH, SMALL, call, fail, succeed
 from egoskin.commands.evaluate import EvaluateConfig
 from egoskin.commands.verify import run_hash
+from egoskin.envs.dodgeball import DodgeballConfig
 from egoskin.evaluation import operating_map
 from egoskin.evaluation.perturbations import PERTURBATIONS
-from egoskin.evaluation.throw_set import evaluate, standard_task
+from egoskin.evaluation.throw_set import (
+    Avoided,
+    Estimate,
+    Evaluation,
+    evaluate,
+    standard_task,
+)
 from egoskin.runs.run import Run
 from egoskin.sensors import MASK_ALL
 from egoskin.storage.tensor_file import load_tensors
@@ -250,6 +258,42 @@ def test_an_evaluation_tells_what_a_policy_bears(
     names = [row["name"] for row in result["perturbed"]]
     assert names == list(PERTURBATIONS)
     assert all(f"\n  {name} " in text for name in names)
+
+
+def test_the_workers_of_an_evaluation_are_those_of_all_its_parts(
+    trained: Path, tmp_path: Path, monkeypatch
+):
+    used = []
+
+    def noted(*args, num_workers: int | None = None, **options):
+        used.append((options["episodes"], num_workers))
+        return []
+
+    monkeypatch.setattr(command, "perturb", noted)
+    figures_of(tmp_path, trained, "--perturbed", "--num-workers", "2")
+    # A quarter of the episodes on as many workers as divide it.
+    assert used == [(1, 1)]
+
+
+def test_a_table_names_the_ages_of_the_task():
+    share = Estimate(mean=0.5, low=0.4, high=0.6)
+    result = Evaluation(
+        success=share,
+        success_5s=share,
+        survival_time=share,
+        ended_by_ball=0.5,
+        ended_by_fall=0.0,
+        ended_by_self_contact=0.0,
+        diverged=0.0,
+        rigid_success=0.0,
+        avoided=Avoided(first_ball=None, later_balls=None),
+        episodes=8,
+    )
+    task = DodgeballConfig(success_s=2.0, episode_length_s=4.0)
+    text = command.table(result, "title", task)
+    assert "success (no contact for 2 s)" in text
+    assert "no contact for 4 s" in text
+    assert "survival time (at most 4 s)" in text
 
 
 def test_an_upper_bound_counts_what_policy_and_search_avoid(tmp_path: Path):

@@ -70,6 +70,7 @@ def test_a_film_is_of_the_longest_of_the_episodes_that_are_evaluated(
         (["--fps", "61"], "fps must be in"),
         (["--standard", "3"], "--standard"),
         (["nothing.safetensors"], "nothing.safetensors"),
+        (["--standard", "1"], "--standard needs a policy"),
         (["nothing", "--sensor.range", "1"], "a policy brings its own"),
     ],
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -10,12 +11,14 @@ from tensordict import TensorDict
 
 from egoskin.envs.dodgeball import DodgeballConfig
 from egoskin.envs.throws import Thrower
-from egoskin.evaluation.behaviour import Group, Watcher, behave
+from egoskin.evaluation.behaviour import Group, Watcher, _Feet, behave
 from egoskin.evaluation.throw_set import Episodes, evaluate, play_throws
 from egoskin.make import EnvConfig
 from egoskin.rng import held_out
 from egoskin.robots.config import H1_2
+from egoskin.robots.own import find_robot
 from egoskin.sensors.config import SensorConfig
+from owning import MODEL, write_robot
 from throwing import AT_ONCE
 
 JOINTS = len(H1_2.joints)
@@ -274,7 +277,8 @@ def test_a_foot_that_rolls_over_its_toes_does_not_slide():
     before, after = state(1), state(1)
     half = torch.tensor(0.05)
     turn = torch.tensor([half.cos(), 0, half.sin(), 0])  # forward, about y
-    corners = watcher._feet.corners_w(before)[0].reshape(-1, 3)
+    feet = watcher._feet
+    corners = feet.corners_w(*feet.poses_w(before))[0].reshape(-1, 3)
     toe = corners[corners[:, 0].argmax()].clone()
     toe[2] = corners[:, 2].min()
     # Both robots lean over their toes, the second one farther about the same line.
@@ -290,8 +294,43 @@ def test_a_foot_that_rolls_over_its_toes_does_not_slide():
             q = td["base_pose"][0, 3:].clone()
             td["base_pose"][0, 3] = w * q[0] - y * q[2]
             td["base_pose"][0, 5] = w * q[2] + y * q[0]
-    slip = watcher._feet.slip(before, after)
+    slip = feet.slip(before, after)
     torch.testing.assert_close(slip, torch.zeros(1, 2), atol=1e-5, rtol=0)
+
+
+def test_round_feet_slide_but_do_not_slide_by_rolling(tmp_path: Path):
+    # Balls of 5 cm whose centres are 67 cm below the base.
+    round_feet = MODEL.replace(
+        'type="box" size="0.15 0.06 0.02"', 'type="sphere" size="0.05"'
+    )
+    robot = find_robot(str(write_robot(tmp_path / "pip", model=round_feet)))
+    feet = _Feet(robot)
+    before = TensorDict(
+        base_pose=torch.tensor([[0.0, 0, 0.72, 1, 0, 0, 0]]),
+        joint_pos=torch.zeros(1, len(robot.joints)),
+        batch_size=[1],
+    )
+    slid, rolled = before.clone(), before.clone()
+    slid["base_pose"][0, 0] += 0.01
+    torch.testing.assert_close(feet.slip(before, slid), torch.full((1, 2), 0.01))
+    # The whole robot turns about the lowest points, by 0.02 rad.
+    half = torch.tensor(0.01)
+    turned = torch.tensor([0.72 * (2 * half).sin(), 0, 0.72 * (2 * half).cos()])
+    rolled["base_pose"][0] = torch.cat(
+        (turned, torch.tensor([half.cos(), 0, half.sin(), 0]))
+    )
+    slip = feet.slip(before, rolled)
+    torch.testing.assert_close(slip, torch.zeros(1, 2), atol=1e-6, rtol=0)
+    # In the air they do not slide.
+    before["base_pose"][0, 2] = slid["base_pose"][0, 2] = 0.8
+    assert feet.slip(before, slid).isnan().all()
+
+
+def test_a_robot_without_shapes_on_its_feet_has_no_slip():
+    watcher = Watcher(make(), 0, 1)
+    watcher._feet = _Feet(replace(H1_2, feet=()))
+    watcher(state(1), state(1), torch.tensor([True]))
+    assert watcher.motion().foot_slip is None
 
 
 def test_displacement_is_that_of_the_episodes_that_last():

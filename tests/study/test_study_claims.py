@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from egoskin.study import claims
 from egoskin.study.claims import claimed, is_claimed, this_host
 
 HOLD = """
@@ -65,6 +66,20 @@ def test_who_may_only_read_sees_claims(tmp_path: Path, monkeypatch: pytest.Monke
     process.send_signal(signal.SIGKILL)
     process.communicate()
     assert not is_claimed(folder, "run")
+
+
+def test_a_lock_on_a_read_only_file_system_is_seen(tmp_path: Path, monkeypatch):
+    process = hold(tmp_path)
+
+    def refuse(path: Path, mode: str = "r"):
+        if mode == "r+":
+            raise OSError(errno.EROFS, "Read-only file system")
+        return open(path, mode)
+
+    monkeypatch.setattr(claims, "open", refuse, raising=False)
+    assert is_claimed(tmp_path, "run")
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
 
 
 def test_a_claim_is_held_by_one_process_and_freed_by_its_death(tmp_path: Path):

@@ -5,13 +5,16 @@ from __future__ import annotations
 import csv
 import dataclasses
 import io
+import json
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from egoskin.study.figures import places
+from egoskin.commands.study import what_is_seen
+from egoskin.runs.run import Run
+from egoskin.study.figures import equivalence, places
 from egoskin.study.manifest import Manifest, resolve
 from egoskin.study.metrics import METRICS, frames_to, runs_csv, tables
 from egoskin.study.report import Heading, Rows, Text, markdown, page, write_report
@@ -141,6 +144,75 @@ def test_cells_of_other_kinds_are_reported_too(tmp_path: Path):
     text = (tmp_path / "report" / "report.md").read_text()
     assert "field-proximity-2m-history-3" in text
     assert "learning-curves.png" in text
+
+
+def test_the_cost_of_a_decision_is_in_core_hours(manifest: Manifest, tmp_path: Path):
+    hours = []
+    for cores in (1, 4):
+        folder = StudyFolder(tmp_path / str(cores))
+        folder.plan(manifest)
+        cells = ("ray-binary-1m", "ray-binary-1m-reduce-min")
+        for run in manifest.runs:
+            if run.cell.name in cells and run.seed < 2:
+                store(folder, manifest, run, 50.0 + 5 * run.seed * len(run.cell.name))
+                config = dataclasses.replace(run.config, num_workers=cores)
+                Run(folder.result_path(run.name), config).write_config()
+        write_report(folder, folder.path / "report")
+        text = (folder.path / "report" / "report.md").read_text()
+        (row,) = (line for line in text.splitlines() if line.startswith("| 6a |"))
+        hours.append(float(row.split("|")[-2]))
+    # Each run took an hour of wall time.
+    assert hours[1] == 4 * hours[0] > 0
+
+
+def test_the_visibility_of_balls_that_all_miss_is_reported(
+    manifest: Manifest, tmp_path: Path
+):
+    folder = StudyFolder(tmp_path)
+    folder.plan(manifest)
+    store(folder, manifest, manifest.runs[0], 50.0)
+    cell = {"coverage": "field", "range": 0.5, "warning": {"hits": 0}}
+    (tmp_path / "visibility.json").write_text(json.dumps({"cells": [cell]}))
+    write_report(folder, tmp_path / "report")
+    text = (tmp_path / "report" / "report.md").read_text()
+    assert "| field 0.5 m | - | - / - / - |" in text
+
+
+def test_a_study_without_a_purpose_has_a_report(tmp_path: Path):
+    folder = StudyFolder(tmp_path)
+    folder.plan(resolve(dataclasses.replace(FINDINGS, purpose="")))
+    write_report(folder, tmp_path / "report")
+    text = (tmp_path / "report" / "report.md").read_text()
+    assert text.startswith("# Study findings\n\n0 of 87 runs are done.")
+
+
+def test_signals_whose_seeds_have_no_spread_are_neither_equal_nor_different(
+    manifest: Manifest,
+):
+    cells = ("field-proximity-1m", "field-localization-1m")
+    table = {cells[0]: {0: 60.0, 1: 70.0}, cells[1]: {0: 50.0, 1: 60.0}}
+    figure = equivalence(manifest, table)
+    (axes,) = figure.axes
+    points = [x for x in axes.lines if x.get_marker() == "o" and len(x.get_xdata())]
+    assert [point.get_color() for point in points] == ["#888888"]
+
+
+def test_visibility_is_that_of_the_cells_with_the_bases_skin(capsys):
+    cells = (
+        {"sensor.range": 0.5},
+        {"sensor.range": 0.5, "skin.num_sensors": 8},
+        {"sensor.range": 0.3, "sensor.occlusion": True},
+        {"sensor.coverage": "none"},
+    )
+    study = dataclasses.replace(
+        FINDINGS, name="mine", cells=cells, base={"skin.num_sensors": 4}
+    )
+    seen = what_is_seen(resolve(study))
+    assert [(c["coverage"], c["range"]) for c in seen["cells"]] == [("field", 0.5)]
+    said = capsys.readouterr().out
+    assert "not analysed" in said
+    assert "field-proximity-0.5m-num_sensors-8, field-proximity-0.3m-occlusion" in said
+    assert what_is_seen(resolve(dataclasses.replace(study, cells=cells[1:]))) == {}
 
 
 def test_frames_to_a_share_are_read_off_the_curve(

@@ -21,13 +21,14 @@ from calling import call, hide, limit_file_size, succeed, wait_for
 from egoskin.runs.run import Run
 from egoskin.storage.formats import read_sealed, sealed_json
 from egoskin.storage.serialization import to_plain
+from egoskin.study import store
 from egoskin.study.claims import claimed
 from egoskin.study.cost import cost, measure
 from egoskin.study.job import CLAIMED, STOPPED, Stop, work
 from egoskin.study.manifest import EvaluationPlan, Manifest, PlannedRun, Study, resolve
 from egoskin.study.metrics import runs_csv
 from egoskin.study.runner import LocalRunner, Progress, slurm_script
-from egoskin.study.store import Failure, StudyFolder, duration
+from egoskin.study.store import Failure, RunStatus, StudyFolder, duration
 
 # 16 agents x 16 steps are 256 frames a rollout.
 BATCH = 256
@@ -154,6 +155,34 @@ def test_a_run_that_ppo_trains_is_left_to_it(folder: StudyFolder):
     assert work(folder, NAME, Never()) == 0
 
 
+def test_a_run_that_is_being_trained_since_a_moment_is_left_alone(
+    folder: StudyFolder, monkeypatch: pytest.MonkeyPatch
+):
+    shutil.rmtree(folder.result_path(NAME))
+    monkeypatch.setattr(StudyFolder, "is_trained", lambda *args: False)
+    with Run.open(folder.run_path(NAME)).locked():
+        # The lock was still free when the job looked.
+        monkeypatch.setattr(StudyFolder, "is_trained_elsewhere", lambda *args: False)
+        assert work(folder, NAME, Never()) == CLAIMED
+
+
+def test_a_run_is_judged_on_all_its_cores(
+    folder: StudyFolder, monkeypatch: pytest.MonkeyPatch
+):
+    expected, used = table(folder), []
+    shutil.rmtree(folder.result_path(NAME))
+    play = store.play_throws
+
+    def noted(*args, num_workers: int, **options):
+        used.append(num_workers)
+        return play(*args, num_workers=num_workers, **options)
+
+    monkeypatch.setattr(store, "play_throws", noted)
+    assert work(folder, NAME, Never(), cores=2) == 0
+    assert used == [2, 2]
+    assert table(folder) == expected
+
+
 def test_a_run_made_before_is_adopted(folder: StudyFolder, tmp_path: Path):
     expected = table(folder)
     made = tmp_path / "made"
@@ -244,6 +273,12 @@ def test_status_tells_failures_and_what_is_left(folder: StudyFolder):
     assert status[1].failure == failure
     progress = Progress.of(status)
     assert str(progress) == "1 done, 1 failed, 1 missing; 33.3% of the frames, ETA -"
+    # The time left is that of the runs that are still tried.
+    (planned,) = (s.run for s in status[2:])
+    half = planned.end // 2
+    running = RunStatus(run=planned, state="running", frames=half, per_s=float(half))
+    assert Progress.of([*status[:2], running]).left_s == pytest.approx(3)
+    assert Progress.of([*status[:2], running], tries=2).left_s == pytest.approx(1)
     folder.forget_failures()
     assert folder.status(manifest)[1].state == "missing"
 

@@ -62,7 +62,6 @@ def test_a_mean_has_scipys_t_interval():
 def test_shared_seeds_are_compared_in_pairs():
     effect = contrast(DIFFERENCE, TABLE)
     assert effect is not None
-    assert effect.paired
     own = stats.ttest_rel(A, B, alternative="greater")
     assert effect.p_above(0) == pytest.approx(own.pvalue)
     assert effect.p_below(0) == pytest.approx(1 - own.pvalue)
@@ -85,10 +84,14 @@ def test_cells_that_share_no_seeds_are_compared_by_welch():
     apart = {"a": TABLE["a"], "b": {k + 10: v for k, v in TABLE["b"].items()}}
     effect = contrast(DIFFERENCE, apart)
     assert effect is not None
-    assert not effect.paired
     own = stats.ttest_ind(A, B, equal_var=False, alternative="greater")
     assert effect.df == pytest.approx(own.df)
     assert effect.p_above(0) == pytest.approx(own.pvalue)
+    # Its spread is that of one seed of each cell, whatever their numbers of seeds.
+    few = {"a": TABLE["a"], "b": {10: 55.0, 11: 63.0}}
+    effect = contrast(DIFFERENCE, few)
+    assert effect is not None
+    assert effect.sd == pytest.approx(math.sqrt(np.var(A, ddof=1) + 32.0))
 
 
 def test_one_seed_or_no_spread_decides_nothing():
@@ -100,7 +103,6 @@ def test_one_seed_or_no_spread_decides_nothing():
     for effect in (one, equal):
         assert ABOVE.p_inside(effect) == ABOVE.p_outside(effect) == 1.0
         assert SAME.p_inside(effect) == 1.0
-        assert seeds_needed(effect, ABOVE) is None
     assert contrast(DIFFERENCE, {"a": {0: 1.0}}) is None
 
 
@@ -126,20 +128,14 @@ def test_holm_is_that_of_his_paper():
 
 def test_the_seeds_needed_have_the_power_that_is_asked():
     # An effect of one standard deviation, one-sided at 5 %: 8 pairs (tables of Cohen).
-    effect = Effect(mean=1.0, error=1 / math.sqrt(5), df=4, seeds=5)
-    assert seeds_needed(effect, ABOVE) == 8
-    # The same on the other side.
-    below = Effect(mean=-1.0, error=1 / math.sqrt(5), df=4, seeds=5)
-    assert seeds_needed(below, ABOVE) == 8
-    # In the middle of the margin both tests must succeed: a distance of 1 sd.
-    middle = Effect(mean=0.0, error=5 / math.sqrt(5), df=4, seeds=5)
-    needed = seeds_needed(middle, SAME)
+    assert seeds_needed([1.0]) == 8
+    # If both of two tests must succeed, a few more.
+    needed = seeds_needed([1.0, 1.0])
     assert needed is not None
     assert 8 < needed < 12
-    # No number decides an effect on the bound; one seed uses the given sd.
-    assert seeds_needed(Effect(mean=0.0, error=1.0, df=4, seeds=5), ABOVE) is None
-    alone = Effect(mean=1.0, error=math.nan, df=1, seeds=1)
-    assert seeds_needed(alone, ABOVE, sd=1.0) == 8
+    # No number decides an effect on its bound, or one whose spread is unknown.
+    assert seeds_needed([0.0]) is None
+    assert seeds_needed([1.0, math.nan]) is None
 
 
 def test_a_metric_that_sets_cells_apart_is_told_from_one_that_does_not():
@@ -215,6 +211,38 @@ def test_one_seed_confirms_no_finding_but_says_how_many_would():
     judged = {j.finding.label: j for j in judge_findings(tables)}
     assert judged["6a"].verdict == "undecided"
     assert 2 < (judged["6a"].seeds_needed or 0) < 10
+
+
+def test_the_seeds_needed_decide_all_claims_of_a_finding():
+    # Each of four claims is one standard deviation above its bound.
+    claims = next(f for f in FINDINGS if f.label == "4").claims
+    apart = {0: 1 - math.sqrt(0.5), 1: 1 + math.sqrt(0.5)}
+    table = {}
+    for claim in claims:
+        field, ray = claim.weights
+        table |= {field: {k: 2 * v for k, v in apart.items()}, ray: {0: 0.0, 1: 0.0}}
+
+    def needed() -> int:
+        tables = {"success_3s": table, "share_to_90": {}}
+        (judged,) = (j for j in judge_findings(tables) if j.finding.label == "4")
+        assert judged.verdict == "undecided"
+        assert judged.seeds_needed is not None
+        return judged.seeds_needed
+
+    draw, alpha, trials = np.random.default_rng(3), 0.05 / len(FINDINGS), 4000
+
+    def p_values(seeds: int) -> np.ndarray:
+        values = draw.normal(1.0, 1.0, (trials, 4, seeds))
+        return stats.ttest_1samp(values, 0, axis=2, alternative="greater").pvalue
+
+    confirmed = (p_values(needed()).max(1) <= alpha).mean()
+    # Three standard errors below the power; the bound on the power is close to it.
+    assert 0.8 - 0.02 < confirmed < 0.9
+    # One claim below its bound is enough to refute it, at a fourth of the level.
+    field, _ = claims[0].weights
+    table[field] = {k: -2 * v for k, v in apart.items()}
+    refuted = (p_values(needed())[:, 0] <= alpha / 4).mean()
+    assert 0.8 - 0.02 < refuted < 0.9
 
 
 # --- by simulation ------------------------------------------------------------------

@@ -57,13 +57,6 @@ def pair() -> Iterator[Page]:
     pair.close()
 
 
-def wait_for(what: Callable[[], object], seconds: float = 20.0) -> None:
-    end = time.monotonic() + seconds
-    while not what():
-        assert time.monotonic() < end
-        time.sleep(0.02)
-
-
 def serve(page: Page) -> None:
     """Handle all queued requests, as the loop does."""
     while not page._commands.empty():
