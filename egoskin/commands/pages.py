@@ -37,7 +37,7 @@ Evaluate a policy on a fixed set of held-out throws.
 
   POLICY                  run folder, checkpoint, policy file, or a policy of the
                           package: field_proximity, blind, g1_proximity (trained on
-                          standard 2), field_binary, localization (on standard 1)
+                          standard 2), localization (too), field_binary (on 1)
   --episodes INT          throw sequences (1024)
   --throw-set INT         seed of the throw set (0)
   --standard {2,1,paper,run}
