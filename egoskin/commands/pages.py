@@ -36,8 +36,8 @@ Train a robot to dodge balls with a skin of proximity sensors.
 Evaluate a policy on a fixed set of held-out throws.
 
   POLICY                  run folder, checkpoint, policy file, or a policy of the
-                          package: field_proximity, blind, g1_proximity (trained on
-                          standard 2), localization (too), field_binary (on 1)
+                          package: field_proximity, localization, blind and
+                          g1_proximity (standard 2), field_binary (standard 1)
   --episodes INT          throw sequences (1024)
   --throw-set INT         seed of the throw set (0)
   --standard {2,1,paper,run}
