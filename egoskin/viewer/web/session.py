@@ -23,7 +23,7 @@ from egoskin.envs.throws import Draw, Thrower
 from egoskin.make import EnvConfig, make_worker_env
 from egoskin.policies.policy import Critic, Policy, load_critic, load_policy
 from egoskin.robots.kinematics import rotate
-from egoskin.sensors import FieldSensor, RaySensor, SensorPipeline, Skin
+from egoskin.sensors import SensorPipeline, Skin
 from egoskin.sensors.config import SensorConfig
 from egoskin.sensors.pipeline import SensorGroup
 from egoskin.viewer.offscreen import closest_point, ending_of
@@ -193,9 +193,6 @@ class Session:
             task.throws, config.robot_config, task.physics.timestep
         )
         base.balls.thrower = self._thrower
-        chain = self.env.transform
-        assert isinstance(chain, Compose)
-        self._sensors = [t for t in chain if isinstance(t, (FieldSensor, RaySensor))]
         # The new sensors are all unmasked: apply the mask again.
         self.mask(self.masked)
         self.reset()
@@ -234,8 +231,8 @@ class Session:
     def mask(self, sensors: Collection[int]) -> None:
         """Mask exactly these sensors: they detect nothing from now on."""
         self.masked = set(sensors)
-        for group, sensor in zip(self.pipeline.groups, self._sensors, strict=True):
-            sensor.mask([i for i, own in enumerate(group.index) if own in self.masked])
+        assert isinstance(self.env.transform, Compose)
+        self.pipeline.mask(self.env.transform, self.masked)
 
     # --- time -------------------------------------------------------------------
 
