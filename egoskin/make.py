@@ -194,8 +194,8 @@ def make_worker_env(
                 seed=seed,
                 row_offset=row_offset,
                 out_key=f"signal{suffix}",
-                masked=sensors.masked(mask),
             )
+            sensors.mask(transforms, sensors.masked(mask))
         if config.sensor.coverage == "oracle":
             transforms.append(Oracle(out_keys=[f"signal{suffix}"]))
         if suffix:

@@ -6,7 +6,7 @@ range and group of a sensor from it.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -143,11 +143,23 @@ class SensorPipeline:
         every = masks_all(mask)
         return [i for i, name in enumerate(self.skin.links) if every or name in mask]
 
+    def mask(self, transforms: Iterable[Transform], masked: Collection[int]) -> None:
+        """Mask sensors in the result of `transforms`; replaces the previous mask.
+
+        Args:
+            transforms: The result of `transforms`, also among others.
+            masked: Indices of sensors that detect nothing.
+        """
+        transforms = list(transforms)
+        for kind in ((FieldSensor, RaySensor), Corruption):
+            own = [t for t in transforms if isinstance(t, kind)]
+            # One for each group; without corruption there is no second kind.
+            for group, transform in zip(self.groups, own, strict=False):
+                transform.mask([i for i, s in enumerate(group.index) if s in masked])
+
     # --- transforms -------------------------------------------------------------
 
-    def sensors(
-        self, objects: Sequence[Shape], masked: Collection[int] = ()
-    ) -> list[FieldSensor | RaySensor]:
+    def sensors(self, objects: Sequence[Shape]) -> list[FieldSensor | RaySensor]:
         """Return the transforms that compute the measurements, one per group.
 
         With corruption they measure all beams, also if the signal is each sensor's
@@ -155,7 +167,6 @@ class SensorPipeline:
 
         Args:
             objects: Shapes of the objects.
-            masked: Indices of sensors that detect nothing.
         """
         sensors: list[FieldSensor | RaySensor] = []
         for group in self.groups:
@@ -170,11 +181,9 @@ class SensorPipeline:
                 # The beams of a real sensor have their own errors.
                 real = self.config.corruption != "none"
                 reduce = "none" if real else self.config.reduce
-                sensor = RaySensor(*args, reduce=reduce, **common)
+                sensors.append(RaySensor(*args, reduce=reduce, **common))
             else:
-                sensor = FieldSensor(*args, **common)
-            sensor.mask([i for i, own in enumerate(group.index) if own in masked])
-            sensors.append(sensor)
+                sensors.append(FieldSensor(*args, **common))
         return sensors
 
     def transforms(
@@ -185,7 +194,6 @@ class SensorPipeline:
         seed: int = 0,
         row_offset: int = 0,
         out_key: str = "signal",
-        masked: Collection[int] = (),
     ) -> list[Transform]:
         """Return the transforms that write the signal (none without a skin).
 
@@ -198,12 +206,11 @@ class SensorPipeline:
             seed: Seed of the sensor models (`SensorConfig.corruption`).
             row_offset: Global index of the first row.
             out_key: Key of the signal.
-            masked: Indices of sensors that detect nothing.
         """
         if not self.groups:
             return []
         config = self.config
-        transforms: list[Transform] = [*self.sensors(objects, masked)]
+        transforms: list[Transform] = [*self.sensors(objects)]
         suffixes = [group.suffix for group in self.groups]
         if config.signal == "localization":
             detected = [f"object_detected{suffix}" for suffix in suffixes]

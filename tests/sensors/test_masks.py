@@ -39,6 +39,15 @@ SENSORS = {
     "field, closeness": SensorConfig(**FAR, signal="closeness"),
     "field, localization": SensorConfig(**FAR, signal="localization"),
     "field, occluded": SensorConfig(**FAR, occlusion=True),
+    # Real sensors, which also detect what is not there.
+    "field, acoustic": SensorConfig(**FAR, corruption="acoustic"),
+    "ray, reduced, acoustic": SensorConfig(
+        **FAR,
+        coverage="ray",
+        ray=Ray(grid=(4, 4)),
+        reduce="min",
+        corruption="acoustic",
+    ),
     "ray": SensorConfig(**FAR, coverage="ray", ray=Ray(grid=(4, 4))),
     "ray, reduced": SensorConfig(
         **FAR, coverage="ray", ray=Ray(grid=(4, 4)), reduce="min"
@@ -185,6 +194,9 @@ def test_a_masked_link_is_one_without_sensors(sensor, compiled, monkeypatch):
         assert (signal[..., masked, :] == nothing).all()
         assert (full[..., masked, :] != nothing).any()
         other = expected["signal"].reshape(*got.batch_size, len(kept), -1)
+        if sensor.corruption != "none":
+            # The errors of a sensor depend on its index.
+            other = full[..., kept, :]
         assert torch.equal(signal[..., kept, :], other)
         assert (other != nothing).any()
 
@@ -215,6 +227,11 @@ def test_all_sensors_masked_by_name_are_all_sensors_masked():
     # The order of the names does not matter.
     assert SENSING.masked(["all"]) == SENSING.masked(MASK_ALL)
     assert SENSING.masked(MASK_ALL) == list(range(len(SKIN)))
+
+
+def test_a_masked_skin_of_real_sensors_signals_nothing():
+    sensor = SensorConfig(**FAR, corruption="acoustic")
+    assert (flown(sensor, SKIN, MASK_ALL)["signal"] == 1).all()
 
 
 def test_an_oracle_is_masked_as_a_whole():

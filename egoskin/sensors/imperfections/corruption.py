@@ -361,6 +361,17 @@ class Corruption(StatefulTransform):
             (*where, f"{name}_{n}") if where else f"{name}_{n}" for n in names
         ]
         super().__init__(in_keys or needed, [out, *state_keys], state_keys)
+        self._masked: list[int] = []
+
+    def mask(self, sensors: Sequence[int]) -> None:
+        """Mask some sensors: they read nothing. Replaces the previous mask.
+
+        Without it, sensors that measure nothing still have false positives.
+
+        Args:
+            sensors: Indices of the masked sensors.
+        """
+        self._masked = list(sensors)
 
     def _moment(self, rows: Tensor, clock: Tensor, joint_vel: list[Tensor]) -> Moment:
         """Return the moment of some rows, from their clocks ``[B, 2]``."""
@@ -398,6 +409,9 @@ class Corruption(StatefulTransform):
             before,
             self._moment(rows, clock, joint_vel),
         )
+        if self._masked:
+            masked = torch.tensor(self._masked, device=reading.device)
+            reading = reading.index_fill(1, masked, torch.inf)
         values = [after[i][name] for i, name in self._states]
         return [reading.reshape(distance.shape), clock, *values]
 

@@ -23,7 +23,7 @@ from egoskin.envs.throws import Draw, Thrower
 from egoskin.make import EnvConfig, make_worker_env
 from egoskin.policies.policy import Policy, load_with_critic
 from egoskin.robots.kinematics import rotate
-from egoskin.sensors import FieldSensor, RaySensor, Skin
+from egoskin.sensors import Skin
 from egoskin.sensors.config import SensorConfig
 from egoskin.sensors.pipeline import SensorGroup
 from egoskin.viewer.offscreen import closest_point, ending_of
@@ -194,16 +194,14 @@ class Session:
         env = make_worker_env(
             config, policy.skin, num_envs=1, seed=self.seed, keep_raw=True
         )
-        base, chain = env.base_env, env.transform
+        base = env.base_env
         assert isinstance(base, DodgeballEnv)
-        assert isinstance(chain, Compose)
         thrower = ThrownOnDemand(
             task.throws, config.robot_config, task.physics.timestep
         )
         self.policy, self.config, self.pipeline = policy, config, pipeline
         self.env, self.task, self.hz = env, base, task.physics.control_hz
         self._thrower = base.balls.thrower = thrower
-        self._sensors = [t for t in chain if isinstance(t, (FieldSensor, RaySensor))]
 
     def readable(self, **changes: Any) -> SensorConfig | None:
         """Return the sensors with changes; None if the policy cannot read them.
@@ -238,8 +236,8 @@ class Session:
     def mask(self, sensors: Collection[int]) -> None:
         """Mask exactly these sensors: they detect nothing from now on."""
         self.masked = frozenset(sensors)
-        for group, sensor in zip(self.pipeline.groups, self._sensors, strict=True):
-            sensor.mask([i for i, own in enumerate(group.index) if own in self.masked])
+        assert isinstance(self.env.transform, Compose)
+        self.pipeline.mask(self.env.transform, self.masked)
         # Copies: the frame may be recorded.
         which, old = list(sensors), self.frame
         reading, line = old.reading.copy(), old.line.copy()
