@@ -203,8 +203,8 @@ class SkinPage(ServedPage):
             ball = Sphere(radius=0.15)
             seen = see_directions(robot, skin, sensor, ball, progress=tell)
         except Exception as error:
-            self._ask(self._end, _LEGEND)
             self._ask(self.show_error, f"{type(error).__name__}: {error}")
+            self._ask(self._end, _LEGEND)
         else:
             # A range in the skin file takes precedence.
             used = skin.resolved(sensor.default_coverage, sensor.range)
