@@ -79,7 +79,8 @@ class PPOConfig:
     entropy_frames: Annotated[int | None, COUNT] = 65_536_000
     """Frames over which the entropy weight falls linearly to zero; None: constant."""
     critic_coeff: Annotated[float, POSITIVE] = 1.0
-    """Weight of the value loss."""
+    """Weight of the value loss. It matters little: the critic has its own weights, and
+    Adam's step does not depend on the scale of a loss, except through max_grad_norm."""
     learning_rate: Annotated[float, POSITIVE] = 1e-3
     """Initial learning rate of Adam."""
     desired_kl: Annotated[float | None, POSITIVE] = 0.02

@@ -75,8 +75,10 @@ def correlated_noise(
 ) -> Tensor:
     """Return standard normal noise that is correlated in time, ``[T, N, J]``.
 
-    The action of each step has the same distribution and log-probability as with white
-    noise. PPO then learns the effect of an action shift that lasts several steps.
+    PPO then learns the effect of an action shift that lasts several steps. The noise of
+    each step alone is distributed as white noise, but not given the state, which
+    contains the effect of the noise before: ``action_log_prob``, computed as for white
+    noise, is not the density of the behaviour, and PPO's ratio is an approximation.
 
     Args:
         shape: Steps, rows, actions.

@@ -127,10 +127,10 @@ class Balls:
         """
         state = self.state
         gap = now.object_pose[..., :2] - now.base_pose[:, None, :2]
-        closing = now.object_lin_vel_w[..., :2] - now.base_lin_vel_w[:, None, :2]
+        away = now.object_lin_vel_w[..., :2] - now.base_lin_vel_w[:, None, :2]
         far = gap.square().sum(-1) > PASSED_DISTANCE**2
         landed = now.object_pose[..., 2] <= self._half_height
-        leaving = ((gap * closing).sum(-1) > 0) & far
+        leaving = ((gap * away).sum(-1) > 0) & far
         fresh = state["active"] & ~state["passed"] & sound
         avoided = fresh & (landed | leaving) & ~hit_by
         arrived = avoided | (fresh & hit_by)
