@@ -511,7 +511,7 @@ class WorkerPool(ParallelEnv):
         if not self.is_closed:
             if all(process.is_alive() for process in self._workers):
                 super().close(raise_if_closed=raise_if_closed)
+                self._bell.close()
             else:
                 self._end()
-            self._bell.close()
         shutil.rmtree(self._reports, ignore_errors=True)

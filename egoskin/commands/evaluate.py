@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -175,9 +174,10 @@ def behaviour_table(result: Behaviour) -> str:
         )
     lines += ["", f"  {'':<32}{'policy':>10} {'zero action':>13}"]
 
-    def row(name: str, unit: str, show: Callable[[Motion], float]) -> str:
-        own, zero = show(result.motion), show(result.motion_zero_action)
-        return f"  {name:<32}{own:10.3g} {zero:13.3g} {unit}".replace("nan", "  -")
+    def row(name: str, unit: str, show: Callable[[Motion], float | None]) -> str:
+        motions = result.motion, result.motion_zero_action
+        own, zero = ("-" if x is None else f"{x:.3g}" for x in map(show, motions))
+        return f"  {name:<32}{own:>10} {zero:>13} {unit}"
 
     return "\n".join(
         [
@@ -192,9 +192,9 @@ def behaviour_table(result: Behaviour) -> str:
     )
 
 
-def _slip(motion: Motion) -> float:
-    """Return the sliding speed of the feet [cm/s], NaN if there is none."""
-    return math.nan if motion.foot_slip is None else 100 * motion.foot_slip
+def _slip(motion: Motion) -> float | None:
+    """Return the sliding speed of the feet [cm/s], None if there is none."""
+    return None if motion.foot_slip is None else 100 * motion.foot_slip
 
 
 def perturbed_table(rows: list[Perturbed], age: float) -> str:

@@ -186,7 +186,7 @@ def what_is_seen(manifest: Manifest) -> dict[str, Any]:
         seen, times = warning_texts(row)
         text = " / ".join(times)
         print(f"  {cell!s:<14} sees {seen:>7}, {text} ms before (5 / 50 / 95 %)")
-    for one, other, _ in alike(analysis):
+    for one, other, _ in alike(analysis.cells, report):
         print(f"  {one} and {other} see the same")
     return {"config": to_plain(base), **report}
 

@@ -110,7 +110,7 @@ def print_table(analysis: Analysis, report: dict[str, Any]) -> None:
         print(
             f"{cell!s:15s}{seen:>10}{cone:>8}{blind:>9}{hits:>8}{times}{at_once:9.0f}"
         )
-    for one, other, share in alike(analysis):
+    for one, other, share in alike(analysis.cells, report):
         print(
             f"{one} and {other} see the same: {share:.1%} of the warnings differ by "
             "more than a control step"

@@ -249,13 +249,19 @@ def warning_texts(row: Mapping[str, Any]) -> tuple[str, list[str]]:
     return f"{100 * warning['seen']:.1f} %", times
 
 
-def alike(analysis: Analysis) -> Iterator[tuple[Cell, Cell, float]]:
-    """Yield the pairs of cells that see alike, and their `Analysis.differing_share`."""
-    if analysis.throws.touches.any():
-        shares = analysis.differing_share()
-        for a, b in itertools.combinations(range(len(shares)), 2):
-            if shares[a, b] < _ALIKE:
-                yield analysis.cells[a], analysis.cells[b], float(shares[a, b])
+def alike(
+    cells: Sequence[Cell], report: Mapping[str, Any]
+) -> Iterator[tuple[Cell, Cell, float]]:
+    """Yield the pairs of cells that see alike, and their `Analysis.differing_share`.
+
+    Args:
+        cells: The cells of an analysis.
+        report: Its `Analysis.report`.
+    """
+    shares = report["differing_share"] or []
+    for a, b in itertools.combinations(range(len(shares)), 2):
+        if shares[a][b] < _ALIKE:
+            yield cells[a], cells[b], shares[a][b]
 
 
 def _on_grid(clearance: Tensor, comes: Tensor) -> np.ndarray:
