@@ -108,6 +108,18 @@ def test_masked_sensors_read_nothing_and_others_as_before(session: Session):
     np.testing.assert_array_equal(readings(set()).nonzero()[0], first)
 
 
+def test_a_reset_repeats_the_readings_of_real_sensors():
+    session = Session("field_proximity")
+    sensor = session.readable(corruption="acoustic")
+    assert sensor is not None
+    session.configure(sensor)
+    first, second = (
+        [session.reset().reading, *(frame.reading for frame in play(session, 10))]
+        for _ in range(2)
+    )
+    np.testing.assert_array_equal(first, second)
+
+
 def test_a_ray_meets_the_sensor_that_is_in_its_way(session: Session):
     session.reset()
     session.mask(set())

@@ -307,6 +307,7 @@ class Corruption(StatefulTransform):
     Rows are numbered from ``row_offset``: with the right offset for each worker,
     results do not depend on the number of workers. The episodes of a row are numbered
     from 0, across resets. Two of these transforms in one environment need two seeds.
+    The environment's ``set_seed`` does not reach transforms: see `restart`.
 
     Args:
         models: Imperfections, in the order in which they apply.
@@ -362,6 +363,20 @@ class Corruption(StatefulTransform):
         ]
         super().__init__(in_keys or needed, [out, *state_keys], state_keys)
         self._masked: list[int] = []
+
+    def restart(self, seed: int | None = None) -> None:
+        """Start again at episode 0, from the next reset of all rows.
+
+        Args:
+            seed: New seed of all draws, in [0, 2**32); None keeps the old one.
+
+        Raises:
+            ValueError: If the seed is invalid.
+        """
+        if seed is not None:
+            stream_key(seed, Stream.SENSOR)
+            self._settings["seed"] = seed
+        self._last = None
 
     def mask(self, sensors: Sequence[int]) -> None:
         """Mask some sensors: they read nothing. Replaces the previous mask.

@@ -23,7 +23,7 @@ from egoskin.envs.throws import Draw, Thrower
 from egoskin.make import EnvConfig, make_worker_env
 from egoskin.policies.policy import Policy, load_with_critic
 from egoskin.robots.kinematics import rotate
-from egoskin.sensors import Skin
+from egoskin.sensors import Corruption, Skin
 from egoskin.sensors.config import SensorConfig
 from egoskin.sensors.pipeline import SensorGroup
 from egoskin.viewer.offscreen import closest_point, ending_of
@@ -251,6 +251,10 @@ class Session:
     def reset(self) -> Frame:
         """Start an episode, always from the same state and without a ball in flight."""
         self.env.set_seed(self.seed, static_seed=True)
+        assert isinstance(self.env.transform, Compose)
+        for transform in self.env.transform:
+            if isinstance(transform, Corruption):
+                transform.restart()
         self._root = self.env.reset()
         self.first_throw: int | None = None
         self.frame = self._look(self._root, None)

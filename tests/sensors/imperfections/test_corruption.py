@@ -407,6 +407,32 @@ def test_presets_are_what_they_say():
     assert acoustic.isinf().float().mean().item() == pytest.approx(0.0595, rel=0.05)
 
 
+def test_a_restart_repeats_all_readings():
+    corruption = Corruption(PRESETS["acoustic"](), dt=1 / 60, seed=1)
+    env = TransformedEnv(
+        DodgeballEnv(H1_2, TASK, num_envs=6, seed=0),
+        Compose([FieldSensor(SKIN, H1_2.chain, BALLS, 6.0), corruption]),
+    )
+
+    def readings() -> torch.Tensor:
+        env.set_seed(0, static_seed=True)
+        data = env.rollout(20, lambda td: td.set("action", still), auto_reset=True)
+        return data["reading"]
+
+    still = torch.zeros(6, len(H1_2.joints))
+    first = readings()
+    # The seed of an environment does not reach its transforms.
+    assert not torch.equal(readings(), first)
+    corruption.restart()
+    assert torch.equal(readings(), first)
+    corruption.restart(seed=2)
+    assert not torch.equal(readings(), first)
+    corruption.restart(seed=1)
+    assert torch.equal(readings(), first)
+    with pytest.raises(ValueError, match="seed"):
+        corruption.restart(seed=-1)
+
+
 def test_episode_and_step_are_counted_from_reset_to_reset():
     corruption = Corruption([Noise(constant=0.1)], dt=DT, seed=0)
     done = torch.tensor([0, 0, 1, 0, 0, 0, 1, 0], dtype=torch.bool)[None, :, None]
