@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import base64
 import html
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
+from markdown import markdown
 from matplotlib.figure import Figure
 
 from egoskin.evaluation.visibility import warning_texts
@@ -40,39 +41,6 @@ from egoskin.study.store import Result, RunStatus, StudyFolder
 _SHOWN = [m for m in METRICS if m.name != "share_to_90"]
 
 
-@dataclass(frozen=True)
-class Heading:
-    """The title of a section."""
-
-    text: str
-
-
-@dataclass(frozen=True)
-class Text:
-    """A paragraph."""
-
-    text: str
-
-
-@dataclass(frozen=True)
-class Rows:
-    """A table."""
-
-    head: Sequence[str]
-    rows: Sequence[Sequence[str]]
-
-
-@dataclass(frozen=True)
-class Picture:
-    """A saved figure, by its name."""
-
-    name: str
-    caption: str
-
-
-Block = Heading | Text | Rows | Picture
-
-
 def write_report(folder: StudyFolder, out: Path) -> None:
     """Write the report of a study.
 
@@ -93,12 +61,16 @@ def write_report(folder: StudyFolder, out: Path) -> None:
     pictures = _pictures(manifest, results, values["success_3s"], concerned)
     for name, (figure, _) in pictures.items():
         save(figure, out, name)
-    shown = {name: Picture(name, text) for name, (_, text) in pictures.items()}
-    blocks = list(_blocks(folder, manifest, results, values, concerned, shown))
+    shown = {
+        name: f"![{caption}]({name}.png)\n\n*{caption}*"
+        for name, (_, caption) in pictures.items()
+    }
+    blocks = _blocks(folder, manifest, results, values, concerned, shown)
+    text = "\n\n".join(blocks) + "\n"
     contents = {
         "runs.csv": runs_csv(manifest, results),
-        "report.md": markdown(blocks),
-        "index.html": page(f"Study {manifest.study}", blocks, out),
+        "report.md": text,
+        "index.html": page(f"Study {manifest.study}", text, out),
     }
     for name, content in contents.items():
         write_file(out / name, content.encode())
@@ -146,27 +118,28 @@ def _blocks(
     results: Sequence[Result],
     values: Mapping[str, Table],
     judged: Sequence[Judged],
-    shown: dict[str, Picture],
-) -> Iterable[Block]:
+    shown: Mapping[str, str],
+) -> Iterator[str]:
+    """Yield the parts of the report, in Markdown."""
     plan, total = manifest.evaluation, len(manifest.runs)
-    yield Heading(f"Study {manifest.study}")
+    yield f"# Study {manifest.study}"
     purpose = manifest.purpose and f"{manifest.purpose}. "
-    yield Text(
+    yield (
         f"{purpose[:1].upper()}{purpose[1:]}{len(results)} of "
         f"{total} runs are done. Evaluated on standard {plan.standard}, throw set "
         f"{plan.throw_set} of {plan.episodes:,} sequences, with the mean action. "
         "Intervals are over seeds, not over throws."
     )
     if not results:
-        yield Text("There are no results yet.")
+        yield "There are no results yet."
         return
     if judged:
-        yield Text(_answer(judged))
+        yield _answer(judged)
     if "success-by-range" in shown:
         yield shown["success-by-range"]
     if judged:
-        yield Heading("The findings")
-        yield Text(
+        yield "## The findings"
+        yield (
             "The tests were fixed in code before the runs. A finding is confirmed if "
             "each of its claims lies in its region, and refuted if one lies outside; "
             "p-values are corrected for the number of findings (Holm). The table shows "
@@ -177,8 +150,8 @@ def _blocks(
         )
         yield _finding_rows(judged, results)
         yield shown["findings"]
-    yield Heading("The cells")
-    yield Text(
+    yield "## The cells"
+    yield (
         "Interquartile mean and range over seeds; in brackets the mean with its 95 % "
         "t interval, which needs two seeds or more."
     )
@@ -186,29 +159,29 @@ def _blocks(
     for name in ("equivalence", "learning-curves", "sample-efficiency"):
         if name in shown:
             yield shown[name]
-    yield Heading("How well each metric separates the cells")
-    yield Text(
+    yield "## How well each metric separates the cells"
+    yield (
         "Standard deviation between cells divided by that between the seeds of a cell: "
         "at 1, two cells differ about as much as two seeds of one cell."
     )
     ratios = [(separation(values[m.name]), m) for m in _SHOWN]
     known = sorted((r for r in ratios if r[0] >= 0), key=lambda r: -r[0])
     if known:
-        yield Rows(
+        yield table(
             ("metric", "cells / seeds"), [(m.label, f"{r:.2f}") for r, m in known]
         )
     else:
-        yield Text("Unknown: no cell has two seeds that differ.")
+        yield "Unknown: no cell has two seeds that differ."
     seen = folder.path / "visibility.json"
     if seen.is_file():
-        yield Heading("What the skins see, without training")
+        yield "## What the skins see, without training"
         yield _seen_rows(read_json(seen))
-    yield Heading("Missing runs")
+    yield "## Missing runs"
     missing = [s for s in folder.status(manifest) if s.state != "done"]
-    yield Text(", ".join(map(_missing, missing)) or "None: all runs are done.")
-    yield Heading("The runs")
+    yield (", ".join(map(_missing, missing)) or "None: all runs are done.")
+    yield "## The runs"
     default = manifest.not_default().items()
-    yield Text(
+    yield (
         "Settings that differ from the default, in all runs: "
         + (
             ", ".join(f"{k.removeprefix('env.')} = {brief(v)}" for k, v in default)
@@ -216,7 +189,7 @@ def _blocks(
         )
         + ". All values in full precision: runs.csv."
     )
-    yield Rows(
+    yield table(
         ("run", "success at 3 s", "wall time", "commit", "machine"),
         [
             (
@@ -254,7 +227,7 @@ def _deciding(judged: Judged) -> Tested:
     return max(known, key=lambda c: c.p_confirm)
 
 
-def _finding_rows(judged: Sequence[Judged], results: Sequence[Result]) -> Rows:
+def _finding_rows(judged: Sequence[Judged], results: Sequence[Result]) -> str:
     # Core-hours of a run: its workers are as many as its cores.
     hours = [
         r.stored.record.wall_s / 3600 * (r.stored.config.num_workers or 1)
@@ -304,10 +277,10 @@ def _finding_rows(judged: Sequence[Judged], results: Sequence[Result]) -> Rows:
         "claims with runs",
         "core-hours to decide",
     )
-    return Rows(head, rows)
+    return table(head, rows)
 
 
-def _cell_rows(manifest: Manifest, values: Mapping[str, Table]) -> Rows:
+def _cell_rows(manifest: Manifest, values: Mapping[str, Table]) -> str:
     rows = []
     for cell in manifest.cells:
         success = values["success_3s"].get(cell.name)
@@ -322,7 +295,7 @@ def _cell_rows(manifest: Manifest, values: Mapping[str, Table]) -> Rows:
         if effect.error > 0:
             row[2] += f" [{effect.mean:.1f}, {low:.1f} to {high:.1f}]"
         rows.append(row)
-    return Rows(("cell", "seeds", *(f"{m.label} [{m.unit}]" for m in _SHOWN)), rows)
+    return table(("cell", "seeds", *(f"{m.label} [{m.unit}]" for m in _SHOWN)), rows)
 
 
 def _spread(values: Sequence[float]) -> str:
@@ -334,34 +307,23 @@ def _spread(values: Sequence[float]) -> str:
     return f"{own.iqm:.1f} ({own.low:.1f} to {own.high:.1f})"
 
 
-def _seen_rows(seen: dict) -> Rows:
+def _seen_rows(seen: dict) -> str:
     rows = []
     for row in seen["cells"]:
         share, times = warning_texts(row)
         rows.append((f"{row['coverage']} {row['range']:g} m", share, " / ".join(times)))
     head = ("cell", "hits seen before contact", "warning [ms], 5 / 50 / 95 %")
-    return Rows(head, rows)
+    return table(head, rows)
 
 
 # --- Markdown and HTML --------------------------------------------------------------
 
 
-def markdown(blocks: Iterable[Block]) -> str:
-    """Return blocks as Markdown that refers to the figures in the same folder."""
-    parts = []
-    for number, block in enumerate(blocks):
-        match block:
-            case Heading(text):
-                parts.append(f"{'#' * (2 if number else 1)} {text}")
-            case Text(text):
-                parts.append(text)
-            case Rows(head, rows):
-                lines = [head, ["---"] * len(head), *rows]
-                cells = [[x.replace("|", "\\|") for x in line] for line in lines]
-                parts.append("\n".join(f"| {' | '.join(line)} |" for line in cells))
-            case Picture(name, caption):
-                parts.append(f"![{caption}]({name}.png)\n\n*{caption}*")
-    return "\n\n".join(parts) + "\n"
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a table in Markdown."""
+    lines = [head, ["---"] * len(head), *rows]
+    cells = [[x.replace("|", "\\|") for x in line] for line in lines]
+    return "\n".join(f"| {' | '.join(line)} |" for line in cells)
 
 
 _STYLE = """
@@ -377,54 +339,36 @@ figcaption { color: #555; font-size: 13px; }
 """
 
 
-def page(title: str, blocks: Iterable[Block], folder: Path) -> str:
-    """Return blocks as one self-contained HTML page.
+# A picture and its caption, as `markdown` writes them.
+_FIGURE = re.compile(
+    r'<p><img alt="[^"]*" src="([^"]*)\.png" /></p>\s*<p><em>(.*?)</em></p>'
+)
+
+
+def page(title: str, text: str, folder: Path) -> str:
+    """Return a text in Markdown as one self-contained HTML page.
 
     Args:
-        title: Its title.
-        blocks: The blocks.
+        title: Title of the page.
+        text: The text.
         folder: Folder of the saved figures.
     """
-    parts = []
-    for number, block in enumerate(blocks):
-        match block:
-            case Heading(text):
-                tag = "h2" if number else "h1"
-                parts.append(f"<{tag}>{html.escape(text)}</{tag}>")
-            case Text(text):
-                parts.append(f"<p>{_inline(text)}</p>")
-            case Rows(head, rows):
-                first = "".join(f"<th>{_inline(x)}</th>" for x in head)
-                lines = (
-                    f"<tr>{''.join(f'<td>{_inline(x)}</td>' for x in r)}</tr>"
-                    for r in rows
-                )
-                body = "\n".join([f"<tr>{first}</tr>", *lines])
-                parts.append(f'<div class="wide"><table>\n{body}\n</table></div>')
-            case Picture(name, caption):
-                data = base64.b64encode((folder / f"{name}.svg").read_bytes()).decode()
-                text = html.escape(caption)
-                parts.append(
-                    f'<figure><img alt="{text}" src="data:image/svg+xml;base64,{data}">'
-                    f"<figcaption>{text}</figcaption></figure>"
-                )
-    body = "\n".join(parts)
+
+    def embed(found: re.Match[str]) -> str:
+        name, caption = found.groups()
+        data = base64.b64encode((folder / f"{name}.svg").read_bytes()).decode()
+        return (
+            f'<figure><img alt="{caption}" src="data:image/svg+xml;base64,{data}">'
+            f"<figcaption>{caption}</figcaption></figure>"
+        )
+
+    body = markdown(html.escape(text, quote=False), extensions=["tables"])
+    body = _FIGURE.sub(embed, body)
+    body = body.replace("<table>", '<div class="wide"><table>')
+    body = body.replace("</table>", "</table></div>")
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<title>{html.escape(title)}</title>\n<style>{_STYLE}</style>\n</head>\n"
         f"<body>\n{body}\n</body>\n</html>\n"
     )
-
-
-def _inline(text: str) -> str:
-    """Return a text with its **bold** and *italic* parts as HTML."""
-    result, tags = html.escape(text), {"**": "strong", "*": "em"}
-    for mark, tag in tags.items():
-        pieces = result.split(mark)
-        if len(pieces) % 2:
-            result = "".join(
-                f"<{tag}>{piece}</{tag}>" if i % 2 else piece
-                for i, piece in enumerate(pieces)
-            )
-    return result
