@@ -170,7 +170,7 @@ class FieldSensor(ProximitySensor):
         centre = view.centre[:, self._link] - scene.skin["offset"]
         way = self._to_closest(view, shape, centre)
         x, y, z = (w[sensor, row] for w in way)
-        reach = (x * x + y * y + z * z).sqrt()
+        reach = exact_sqrt(x * x + y * y + z * z)
         way = torch.stack((x, y, z))
         direction = (way / reach.clamp(min=1e-9))[..., None]
         length = reach - shape.radius if isinstance(shape, Sphere) else reach

@@ -227,7 +227,7 @@ class ProximitySensor(RowTransform):
         # No distance is within a negative range.
         self._range[list(sensors)] = -1.0
         if self._kernels is not None:
-            self._kernels.set_constants(range=self._range.numpy())
+            self._kernels.set_constants(range=self._range.cpu().numpy())
 
     @property
     def num_joints(self) -> int:
