@@ -15,6 +15,7 @@ import math
 import typing
 from collections.abc import Mapping
 from dataclasses import dataclass
+from numbers import Integral, Real
 from typing import Any
 
 
@@ -33,7 +34,7 @@ class Interval:
 
     def violation(self, value: float) -> str | None:
         """Return the violated condition as text, or None for a number inside."""
-        if isinstance(value, int):
+        if isinstance(value, Integral):
             # Not converted: an int of 400 digits does not fit into a float.
             if not -(2**63) <= value < 2**63:
                 return "fit into 64 bits"
@@ -78,9 +79,10 @@ def check_bounds(config: Any) -> None:
     for name, interval in _intervals(type(config)).items():
         value = getattr(config, name)
         for number in value if isinstance(value, tuple) else (value,):
-            if not isinstance(number, (int, float)) or isinstance(number, bool):
+            if not isinstance(number, Real) or isinstance(number, bool):
                 continue
-            if wrong := interval.violation(number):
+            # NumPy's numbers are Real too, but no float by their type.
+            if wrong := interval.violation(number):  # pyright: ignore
                 raise BoundsError(type(config), f"{name} must {wrong}, got {value}")
 
 
