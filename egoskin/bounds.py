@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+import sys
 import typing
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -49,6 +50,16 @@ class Interval:
         if self.le is not None and not value <= self.le:
             return f"be at most {self.le:,}"
         return None
+
+
+def is_number(value: object) -> bool:
+    """Whether a value of a file is a finite number.
+
+    Python's JSON allows NaN and 10^400, TOML integers of any size.
+    """
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return False
+    return abs(value) <= sys.float_info.max
 
 
 POSITIVE, NOT_NEGATIVE = Interval(gt=0), Interval(ge=0)
