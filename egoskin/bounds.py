@@ -12,9 +12,11 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+import sys
 import typing
 from collections.abc import Mapping
 from dataclasses import dataclass
+from numbers import Integral, Real
 from typing import Any
 
 
@@ -33,7 +35,7 @@ class Interval:
 
     def violation(self, value: float) -> str | None:
         """Return the violated condition as text, or None for a number inside."""
-        if isinstance(value, int):
+        if isinstance(value, Integral):
             # Not converted: an int of 400 digits does not fit into a float.
             if not -(2**63) <= value < 2**63:
                 return "fit into 64 bits"
@@ -48,6 +50,16 @@ class Interval:
         if self.le is not None and not value <= self.le:
             return f"be at most {self.le:,}"
         return None
+
+
+def is_number(value: object) -> bool:
+    """Whether a value of a file is a finite number.
+
+    Python's JSON allows NaN and 10^400, TOML integers of any size.
+    """
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return False
+    return abs(value) <= sys.float_info.max
 
 
 POSITIVE, NOT_NEGATIVE = Interval(gt=0), Interval(ge=0)
@@ -78,9 +90,10 @@ def check_bounds(config: Any) -> None:
     for name, interval in _intervals(type(config)).items():
         value = getattr(config, name)
         for number in value if isinstance(value, tuple) else (value,):
-            if not isinstance(number, (int, float)) or isinstance(number, bool):
+            if not isinstance(number, Real) or isinstance(number, bool):
                 continue
-            if wrong := interval.violation(number):
+            # NumPy's numbers are Real too, but no float by their type.
+            if wrong := interval.violation(number):  # pyright: ignore
                 raise BoundsError(type(config), f"{name} must {wrong}, got {value}")
 
 

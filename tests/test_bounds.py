@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated, Any
 
+import numpy as np
 import pytest
 
 from egoskin.bounds import Interval, check_bounds, path_to
@@ -56,6 +57,8 @@ def test_what_lies_within_is_taken(values: Any):
         ({"reach": math.nan}, "reach must be a finite number, got nan"),
         ({"reach": -math.inf}, "reach must be a finite number, got -inf"),
         ({"free": math.inf}, "free must be a finite number, got inf"),
+        ({"share": np.float32(-1)}, "share must not be negative, got -1.0"),
+        ({"counts": (np.int64(0),)}, "counts must be at least 1, got"),
         ({"whole": 10**400}, "whole must fit into 64 bits, got 1000"),
         ({"free": 10**400}, "free must fit into 64 bits, got 1000"),
     ],

@@ -26,7 +26,6 @@ from egoskin.policies.policy import (
 from egoskin.robots.config import H1_2
 from egoskin.sensors import Ray, RaySensor, SensorPipeline, place_sensors
 from egoskin.sensors.config import SensorConfig
-from egoskin.sensors.ray import _nearest
 from egoskin.shapes import Sphere
 from egoskin.sparse import SparseRows
 from throwing import TASK
@@ -94,12 +93,8 @@ def test_rows_are_selected_and_joined_like_those_of_the_matrix(seed, rows, wante
 # --- rays -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("on_gpu", [False, True])
 @pytest.mark.parametrize("ray", [Ray(), Ray(measure="depth")])
-def test_hits_are_the_readings_of_the_grid(random_state, ray, on_gpu, monkeypatch):
-    if on_gpu:
-        # As there: PyTorch takes the least of a beam's readings.
-        monkeypatch.setattr("egoskin.sensors.ray._nearest_numpy", _nearest)
+def test_hits_are_the_readings_of_the_grid(random_state, ray):
     state = random_state(300, seed=1, objects=3)
     # Two coincident objects, and a row of NaN.
     state["object_pose"][:50, 1] = state["object_pose"][:50, 0]

@@ -333,7 +333,7 @@ class Report:
 
     def execute(self) -> None:
         """Write the report."""
-        check_packages("a report", "study", "scipy", "matplotlib", "markdown")
+        check_packages("a report", "study", "matplotlib", "markdown")
         # Imported here, because only the report needs these packages.
         from egoskin.study.report import write_report
 

@@ -134,13 +134,10 @@ class HideObjects(RowTransform):
     """Hides all objects from later transforms, which masks every sensor.
 
     Reads ``object_active [*B, O]`` and overwrites it with False.
-
-    Args:
-        keys: Key of the flags.
     """
 
-    def __init__(self, keys: Sequence[NestedKey] = ("object_active",)) -> None:
-        super().__init__(keys, keys)
+    def __init__(self) -> None:
+        super().__init__(["object_active"], ["object_active"])
 
     def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Return the flags, ``[B, O]``."""

@@ -26,7 +26,7 @@ from egoskin.shapes import Sphere
 GRAVITY = 9.81
 # Target points on the body: dense enough that neighbours are 2 cm apart, and fixed, so
 # that a throw set is the same in every run.
-_NUM_AIM_POINTS, _AIM_SEED = 4096, 0
+NUM_AIM_POINTS, _AIM_SEED = 4096, 0
 # The aim leads the robot by at most this share of the ball's speed: no throw could
 # reach a robot that runs away faster than the ball.
 _MAX_LEAD_RATIO = 0.9
@@ -178,7 +178,7 @@ class Thrower:
             aimed_at = set(robot.links) - set(robot.untargeted_links)
         solid = {shape.link for shape in robot.primitives}
         links = [name for name in robot.links if name in aimed_at & solid]
-        points = sample_surface(robot, links, _NUM_AIM_POINTS, _AIM_SEED)
+        points = sample_surface(robot, links, NUM_AIM_POINTS, _AIM_SEED)
         index = [links.index(robot.links[i]) for i in points.link]
         return (
             LinkKinematics(robot.chain, links),
@@ -325,8 +325,8 @@ class Thrower:
         return torch.tensor([[0.0, 0, height, 1, 0, 0, 0]]), joint_pos[None]
 
     def _point_index(self, draw: Draw) -> Tensor:
-        index = (draw.target[:, 0] * _NUM_AIM_POINTS).long()
-        return index.clamp(max=_NUM_AIM_POINTS - 1)
+        index = (draw.target[:, 0] * NUM_AIM_POINTS).long()
+        return index.clamp(max=NUM_AIM_POINTS - 1)
 
     def _target(
         self, draw: Draw, base_pose: Tensor, joint_pos: Tensor, side: Tensor
@@ -341,8 +341,22 @@ class Thrower:
             low, high = self.config.box_height
             z = low + (high - low) * draw.target[:, 1:]
             return torch.cat((base_pose[:, :2] + offset * across, z), -1)
+        return self.points_w(self._point_index(draw), base_pose, joint_pos)
+
+    def points_w(self, index: Tensor, base_pose: Tensor, joint_pos: Tensor) -> Tensor:
+        """Return points that can be aimed at, in the world (not for aim=box).
+
+        There is one pose for each point, or one for all, ``[1, ...]``.
+
+        Args:
+            index: Indices of the points, in [0, `NUM_AIM_POINTS`), ``[n]`` int64.
+            base_pose: Base poses in the world, ``[n, 7]``.
+            joint_pos: Joint positions [rad], ``[n, J]``.
+
+        Returns:
+            The points [m], ``[n, 3]``.
+        """
         kinematics, link, local = self._aim_points
-        index = self._point_index(draw)
         position, rotation = kinematics.poses_b(joint_pos)
         row = torch.arange(len(joint_pos), device=index.device).expand(len(index))
         turn, shift = rotation[row, link[index]], position[row, link[index]]

@@ -24,8 +24,8 @@ from torch import Tensor
 from egoskin.rounding import sincos
 
 
-def pad_rows(rows: Tensor, multiple: int = 32) -> Tensor:
-    """Return row indices padded to a multiple by repeating the first.
+def pad_rows(rows: Tensor) -> Tensor:
+    """Return row indices padded to a multiple of 32 by repeating the first.
 
     Vectorised functions (``atan2``) round differently in the scalar tail of an array
     than in its body, which is processed two vectors at a time: 32 float32 numbers with
@@ -33,12 +33,11 @@ def pad_rows(rows: Tensor, multiple: int = 32) -> Tensor:
 
     Args:
         rows: Indices, ``[n]`` int64, n >= 1.
-        multiple: Number of elements to pad to a multiple of.
 
     Returns:
-        Indices, ``[ceil(n / multiple) * multiple]``.
+        Indices, ``[ceil(n / 32) * 32]``.
     """
-    extra = -rows.shape[0] % multiple
+    extra = -rows.shape[0] % 32
     return torch.cat((rows, rows[:1].expand(extra)))
 
 

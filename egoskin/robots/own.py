@@ -33,6 +33,7 @@ from typing import Annotated, Any
 import mujoco
 from tyro.constructors import PrimitiveConstructorSpec
 
+from egoskin.bounds import is_number
 from egoskin.hints import did_you_mean
 from egoskin.robots.chains import body_id
 from egoskin.robots.config import (
@@ -288,7 +289,7 @@ def _pose(toml: _Toml) -> dict[str, float]:
     """Return the default pose."""
     pose = {}
     for joint, value in toml.content.get("default_pose", {}).items():
-        if not _is_number(value):
+        if not is_number(value):
             raise toml.error(
                 f"the position of {joint!r} must be a number [rad], got {value!r}",
                 *("default_pose", joint),
@@ -310,7 +311,7 @@ def _gains(toml: _Toml) -> dict[str, dict[str, Gain]]:
             if (
                 not isinstance(gain, dict)
                 or gain.keys() != {"kp", "kd"}
-                or not all(map(_is_number, gain.values()))
+                or not all(map(is_number, gain.values()))
                 or gain["kp"] <= 0
                 or gain["kd"] < 0
             ):
@@ -321,13 +322,6 @@ def _gains(toml: _Toml) -> dict[str, dict[str, Gain]]:
                 )
             sets[name][joint] = Gain(kp=float(gain["kp"]), kd=float(gain["kd"]))
     return sets
-
-
-def _is_number(value: object) -> bool:
-    """Return whether a value is a finite number; TOML integers may be of any size."""
-    if not isinstance(value, (int, float)) or isinstance(value, bool):
-        return False
-    return abs(value) <= sys.float_info.max
 
 
 def _links(toml: _Toml, key: str, links: tuple[str, ...]) -> tuple[str, ...]:

@@ -230,11 +230,6 @@ class ProximitySensor(RowTransform):
             self._kernels.set_constants(range=self._range.cpu().numpy())
 
     @property
-    def num_joints(self) -> int:
-        """Number of joint positions read, ``J``."""
-        return self._kinematics.num_joints
-
-    @property
     def ranges(self) -> Tensor:
         """Range of each sensor [m], ``[S]`` float64."""
         return self._range[:, 0].clone()

@@ -576,7 +576,6 @@ def test_bad_input_is_one_line(args, text, tmp_path: Path):
 @pytest.mark.parametrize(
     ("package", "args", "error"),
     [
-        ("scipy", ("report",), "a report needs scipy: `pip install 'egoskin[study]'`"),
         (
             "matplotlib",
             ("report",),

@@ -21,6 +21,7 @@ from tensordict import NestedKey
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 
+from egoskin.bounds import BoundsError, check_bounds
 from egoskin.rng import Stream, halfwords, random_words, stream_key
 from egoskin.transform import StatefulTransform
 
@@ -181,6 +182,13 @@ class Model:
 
     per_speed: float = 0.0
     """Dependence on the speed of the fastest joint [s/rad], if the model has one."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a parameter out of its bounds (`egoskin.bounds`)."""
+        try:
+            check_bounds(self)
+        except BoundsError as error:
+            raise ValueError(f"{type(self).__name__}.{error}") from error
 
 
 class PointModel(Model, ABC):

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from torch import Tensor
 
+from egoskin.bounds import NOT_NEGATIVE, POSITIVE, SHARE, Interval
 from egoskin.rng import halfwords, standard_normal
 from egoskin.sensors.imperfections.corruption import (
     FrameModel,
@@ -26,28 +27,14 @@ from egoskin.sensors.imperfections.corruption import (
 # Ticks per period of a sampling clock; phases and rates are whole ticks.
 _TICKS = 1 << 16
 
+_NotNegative = Annotated[float, NOT_NEGATIVE]
+_Positive = Annotated[float, POSITIVE]
+_Probability = Annotated[float, SHARE]
+
 
 def _hide(distance: Tensor, half: Tensor, probability: Tensor | float) -> Tensor:
     """Return the distances, each infinite with a probability, from 16-bit numbers."""
     return distance.masked_fill((half + 0.5) * 2.0**-16 < probability, torch.inf)
-
-
-def _check_not_negative(model: object, *names: str) -> None:
-    for name in names:
-        value = getattr(model, name)
-        if not 0 <= value < math.inf:
-            wrong = "infinite" if value == math.inf else "negative"
-            raise ValueError(
-                f"{type(model).__name__}.{name} must not be {wrong}, got {value}"
-            )
-
-
-def _check_probability(model: object, name: str) -> None:
-    if not 0 <= getattr(model, name) <= 1:
-        raise ValueError(
-            f"{type(model).__name__}.{name} must be in [0, 1], "
-            f"got {getattr(model, name)}"
-        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,21 +43,12 @@ class Bias(PointModel):
 
     offset: float = 0.0
     """Mean offset over all sensors [m]."""
-    offset_std: float = 0.0
+    offset_std: _NotNegative = 0.0
     """Standard deviation of the offset from sensor to sensor [m]."""
     gain: float = 0.0
     """Mean gain error over all sensors [1]."""
-    gain_std: float = 0.0
+    gain_std: _NotNegative = 0.0
     """Standard deviation of the gain error from sensor to sensor [1]."""
-
-    def __post_init__(self) -> None:
-        """Raise ValueError for negative deviations or values that are not finite."""
-        _check_not_negative(self, "offset_std", "gain_std")
-        if not (math.isfinite(self.offset) and math.isfinite(self.gain)):
-            raise ValueError(
-                f"Bias.offset and gain must be finite, got {self.offset} and "
-                f"{self.gain}"
-            )
 
     def change(self, distance: Tensor, places: Places, moment: Moment) -> Tensor:
         """Return the distances with the errors of their sensors [m], ``[n]``."""
@@ -94,16 +72,12 @@ class _Spread:
     sensor has d = alpha / C, so constant noise of C gives noise quadratic in d.
     """
 
-    constant: float = 0.0
+    constant: _NotNegative = 0.0
     """[m]"""
-    linear: float = 0.0
+    linear: _NotNegative = 0.0
     """[1]"""
-    quadratic: float = 0.0
+    quadratic: _NotNegative = 0.0
     """[1/m]"""
-
-    def __post_init__(self) -> None:
-        """Raise ValueError for a negative parameter."""
-        _check_not_negative(self, "constant", "linear", "quadratic")
 
     def std(self, distance: Tensor) -> Tensor:
         """Return the standard deviation at some distances [m]."""
@@ -115,15 +89,10 @@ class _Spread:
 class Noise(_Spread, PointModel):
     """Gaussian noise, drawn anew for every reading; may depend on d (`_Spread`)."""
 
-    per_speed: float = 0.0
+    per_speed: _NotNegative = 0.0
     """Ego noise: relative increase with the speed of the fastest joint [s/rad]."""
     common: bool = False
     """Whether all sensors of a robot share one draw (hum, power supply)."""
-
-    def __post_init__(self) -> None:
-        """Raise ValueError for a negative parameter."""
-        super().__post_init__()
-        _check_not_negative(self, "per_speed")
 
     def change(self, distance: Tensor, places: Places, moment: Moment) -> Tensor:
         """Return the distances with noise [m], ``[n]``."""
@@ -177,17 +146,12 @@ class Drift(_Spread, FrameModel):
 class Dropout(PointModel):
     """Readings that randomly detect nothing, drawn independently for each reading."""
 
-    probability: float = 0.0
+    probability: _Probability = 0.0
     """Probability at distance 0 and at rest."""
-    per_metre: float = 0.0
+    per_metre: _NotNegative = 0.0
     """Increase with the distance [1/m]."""
-    per_speed: float = 0.0
+    per_speed: _NotNegative = 0.0
     """Increase with the speed of the fastest joint [s/rad]."""
-
-    def __post_init__(self) -> None:
-        """Raise ValueError for an invalid probability or a negative increase."""
-        _check_probability(self, "probability")
-        _check_not_negative(self, "per_metre", "per_speed")
 
     def change(self, distance: Tensor, places: Places, moment: Moment) -> Tensor:
         """Return the distances, infinite where dropped [m], ``[n]``."""
@@ -204,12 +168,8 @@ class Dropout(PointModel):
 class DeadSensors(PointModel):
     """Sensors that never detect anything."""
 
-    probability: float
+    probability: _Probability
     """Probability that a sensor is dead."""
-
-    def __post_init__(self) -> None:
-        """Raise ValueError for an invalid probability."""
-        _check_probability(self, "probability")
 
     def change(self, distance: Tensor, places: Places, moment: Moment) -> Tensor:
         """Return the distances, infinite where the sensor is dead [m], ``[n]``."""
@@ -220,19 +180,10 @@ class DeadSensors(PointModel):
 class FalsePositives(FrameModel):
     """False detections, uniformly distributed over distance."""
 
-    probability: float
+    probability: _Probability
     """Probability of a false detection in a reading that detects nothing."""
-    max_range: float
+    max_range: _Positive
     """False distances are uniform from 0 to this [m]."""
-
-    def __post_init__(self) -> None:
-        """Raise ValueError for an invalid probability or range."""
-        _check_probability(self, "probability")
-        if not 0 < self.max_range < math.inf:
-            raise ValueError(
-                f"FalsePositives.max_range must be positive and finite, got "
-                f"{self.max_range}"
-            )
 
     def apply(
         self, reading: Tensor, state: State, moment: Moment
@@ -274,22 +225,23 @@ class FalsePositives(FrameModel):
 class RangeLimits(PointModel):
     """The smallest and largest distance that a sensor can measure."""
 
-    minimum: float = 0.0
+    minimum: _NotNegative = 0.0
     """Minimum range [m]."""
-    maximum: float = math.inf
+    maximum: Annotated[float, Interval(le=math.inf)] = math.inf
     """Maximum range [m]; beyond it nothing is detected."""
     below: Literal["nothing", "minimum"] = "minimum"
     """Reading of an object nearer than the minimum."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for invalid values."""
+        super().__post_init__()
         if self.below not in ("nothing", "minimum"):
             raise ValueError(
                 f"RangeLimits.below must be 'nothing' or 'minimum', got {self.below!r}"
             )
-        if not 0 <= self.minimum < self.maximum:
+        if not self.minimum < self.maximum:
             raise ValueError(
-                "RangeLimits must have 0 <= minimum < maximum, got "
+                "RangeLimits must have minimum < maximum, got "
                 f"{self.minimum} and {self.maximum}"
             )
 
@@ -304,15 +256,8 @@ class RangeLimits(PointModel):
 class Quantisation(PointModel):
     """Readings are rounded to multiples of a step."""
 
-    step: float
+    step: _Positive
     """Resolution of the readings [m]."""
-
-    def __post_init__(self) -> None:
-        """Raise ValueError for a step that is not positive and finite."""
-        if not 0 < self.step < math.inf:
-            raise ValueError(
-                f"Quantisation.step must be positive and finite, got {self.step}"
-            )
 
     def change(self, distance: Tensor, places: Places, moment: Moment) -> Tensor:
         """Return the nearest multiples [m], ``[n]``."""
@@ -327,15 +272,8 @@ class SampleAndHold(FrameModel):
     at control steps: if the rate is at least the control rate, at every step.
     """
 
-    rate_hz: float
+    rate_hz: _Positive
     """Measurement rate of a sensor [Hz]."""
-
-    def __post_init__(self) -> None:
-        """Raise ValueError for a rate that is not positive and finite."""
-        if not 0 < self.rate_hz < math.inf:
-            raise ValueError(
-                f"SampleAndHold.rate_hz must be positive and finite, got {self.rate_hz}"
-            )
 
     def start(self, reading: Tensor, moment: Moment) -> State:
         """Return the held reading ``[B, S, K]`` and the phases ``[B, S]`` [ticks]."""
@@ -364,12 +302,8 @@ class Latency(FrameModel):
     At the start of an episode, its first reading is repeated until later ones arrive.
     """
 
-    seconds: float
+    seconds: _NotNegative
     """Delay [s], rounded to control steps: less than half a step is no delay."""
-
-    def __post_init__(self) -> None:
-        """Raise ValueError for a negative delay."""
-        _check_not_negative(self, "seconds")
 
     def start(self, reading: Tensor, moment: Moment) -> State:
         """Return the queue of delayed readings, oldest first, ``[B, steps, S, K]``."""

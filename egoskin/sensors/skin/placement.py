@@ -34,48 +34,10 @@ MAX_SENSORS = _MAX_DARTS // _CANDIDATES
 _AREA_POINTS = 4000
 
 
-# Points whose neighbours are looked up at once, and largest number of cells per axis.
+# Points whose neighbours are looked up at once.
 _CHUNK = 4096
-_MOST_CELLS = 1_000_000
-
-
-class _Cells:
-    """A grid of cubic cells for neighbour search.
-
-    Args:
-        points: Points [m], ``[n, 3]``.
-        edge: Edge of a cell [m]; all points nearer than this are found.
-    """
-
-    def __init__(self, points: np.ndarray, edge: float) -> None:
-        edge = max(edge, float(np.ptp(points, axis=0).max()) / _MOST_CELLS)
-        cell = ((points - points.min(axis=0)) // edge).astype(np.int64) + 1
-        across = cell.max(axis=0) + 2
-        # Cells that are consecutive along z have consecutive keys.
-        key = (cell[:, 0] * across[1] + cell[:, 1]) * across[2] + cell[:, 2]
-        self._order = np.argsort(key, kind="stable")
-        self._key, self._sorted = key, key[self._order]
-        x, y = np.meshgrid([-1, 0, 1], [-1, 0, 1], indexing="ij")
-        self._rows = ((x * across[1] + y) * across[2]).ravel()
-
-    def near(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return all pairs of a query point and a point in its or an adjacent cell.
-
-        Args:
-            index: Indices of the query points, ``[m]``.
-
-        Returns:
-            Positions in ``index``, ascending, and indices of points, ``[pairs]`` each.
-        """
-        # Three consecutive cells along z in each of nine columns.
-        middle = self._key[index][:, None] + self._rows
-        low = np.searchsorted(self._sorted, middle.ravel() - 1, "left")
-        number = np.searchsorted(self._sorted, middle.ravel() + 1, "right") - low
-        # Concatenated ranges low, low + 1, ..., low + number - 1.
-        before = np.cumsum(number) - number
-        place = np.arange(number.sum()) + np.repeat(low - before, number)
-        which = np.repeat(np.repeat(np.arange(len(index)), 9), number)
-        return which, self._order[place]
+# The search for neighbours goes a little farther; distances are compared after it.
+_MARGIN = 1 + 1e-9
 
 
 def throw_darts(points: np.ndarray, radius: np.ndarray, most: int) -> np.ndarray:
@@ -91,7 +53,9 @@ def throw_darts(points: np.ndarray, radius: np.ndarray, most: int) -> np.ndarray
     Returns:
         Indices of the points taken, in order.
     """
-    cells = _Cells(points, 2 * radius.max())
+    from scipy.spatial import cKDTree  # Its import takes long.
+
+    tree, reach = cKDTree(points), 2 * radius.max() * _MARGIN
     free = np.ones(len(points), dtype=bool)
     taken: list[int] = []
     for i in range(len(points)):
@@ -100,7 +64,7 @@ def throw_darts(points: np.ndarray, radius: np.ndarray, most: int) -> np.ndarray
         if not free[i]:
             continue
         taken.append(i)
-        _, near = cells.near(np.array([i]))
+        near = tree.query_ball_point(points[i], reach)
         distance = np.linalg.norm(points[near] - points[i], axis=-1)
         free[near] &= distance >= radius[near] + radius[i]
     return np.array(taken)
@@ -125,19 +89,21 @@ def eliminate(
     Source: Yuksel, "Sample Elimination for Generating Poisson Disk Sample Sets",
         Computer Graphics Forum 34(2), 2015.
     """
+    from scipy.spatial import cKDTree  # Its import takes long.
+
     # Largest spacing of count discs in the plane: r_max^2 = A / (2 sqrt(3) N).
     widest = 2 * math.sqrt(area / (2 * math.sqrt(3) * count))
     # r_min = r_max (1 - (N / M)^gamma) beta with gamma = 1.5 and beta = 0.65.
     closest = widest * (1 - (count / len(points)) ** 1.5) * 0.65
 
     total = np.zeros(len(points))
-    cells = _Cells(points, widest * scale.max())
+    tree, reach = cKDTree(points), widest * scale.max() * _MARGIN
     neighbours: list[np.ndarray] = []
     crowding: list[np.ndarray] = []
     for first in range(0, len(points), _CHUNK):
-        index = np.arange(first, min(first + _CHUNK, len(points)))
-        which, near = cells.near(index)
-        point = index[which]
+        found = tree.query_ball_point(points[first : first + _CHUNK], reach)
+        which = np.repeat(np.arange(len(found)), [len(each) for each in found])
+        near, point = np.concatenate(found), first + which
         distance = np.linalg.norm(points[near] - points[point], axis=-1)
         distance = distance * 2 / (scale[near] + scale[point])
         close = distance < widest
@@ -146,7 +112,7 @@ def eliminate(
         weight = (1 - distance.clip(closest, widest) / widest) ** 8
         # In sequence: another order of summation would change the rounding.
         np.add.at(total, near, weight)
-        ends = np.searchsorted(which, np.arange(1, len(index)))
+        ends = np.searchsorted(which, np.arange(1, len(found)))
         neighbours += np.split(near.astype(np.int32), ends)
         crowding += np.split(weight, ends)
 

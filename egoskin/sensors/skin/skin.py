@@ -9,7 +9,6 @@ from __future__ import annotations
 import itertools
 import json
 import math
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
@@ -17,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from egoskin.bounds import is_number
 from egoskin.hints import did_you_mean
 from egoskin.sensors.skin.coverage import KINDS, Coverage, Ray
 from egoskin.storage.files import read_regular
@@ -43,17 +43,10 @@ FARTHEST = 2.0
 """Largest distance of a sensor from its link's origin [m]; beyond, units are wrong."""
 
 
-def _is_number(value: object) -> bool:
-    """Whether a JSON value is a finite number; Python's JSON allows NaN and 10^400."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        return False
-    return abs(value) <= sys.float_info.max
-
-
 def _is_vector(value: object) -> bool:
     """Whether a JSON value is a list of three numbers."""
     return (
-        isinstance(value, Sequence) and len(value) == 3 and all(map(_is_number, value))
+        isinstance(value, Sequence) and len(value) == 3 and all(map(is_number, value))
     )
 
 
@@ -126,7 +119,7 @@ def _check_sensor(index: int, sensor: object, types: Mapping[str, Coverage]) -> 
     for name in ("range", "roll_deg", "radius"):
         if name == "range" and sensor.get(name) == "inf":
             continue
-        if name in sensor and not _is_number(sensor[name]):
+        if name in sensor and not is_number(sensor[name]):
             raise ValueError(
                 f"{where}: {name!r} must be a number, got {sensor[name]!r}"
             )

@@ -19,10 +19,9 @@ from torch import Tensor
 from torchrl.envs import Compose
 
 from egoskin.envs.dodgeball import DodgeballEnv
-from egoskin.envs.throws import Draw, Thrower
+from egoskin.envs.throws import NUM_AIM_POINTS, Draw, Thrower
 from egoskin.make import EnvConfig, make_worker_env
 from egoskin.policies.policy import Policy, load_with_critic
-from egoskin.robots.kinematics import rotate
 from egoskin.sensors import Corruption, Skin
 from egoskin.sensors.config import SensorConfig
 from egoskin.sensors.pipeline import SensorGroup
@@ -100,23 +99,6 @@ class ThrownOnDemand(Thrower):
         if self.wanted.target is not None:
             given["target"] = torch.full((len(row), 2), self.wanted.target)
         return dataclasses.replace(draw, **given)
-
-    def points_w(self, base_pose: Tensor, joint_pos: Tensor) -> Tensor | None:
-        """Return all points that can be aimed at, in the world [m], ``[n, 3]``.
-
-        None if the task aims at a box. A target of (i + 0.5) / n aims at the i-th.
-
-        Args:
-            base_pose: Base pose in the world, ``[7]``.
-            joint_pos: Joint positions [rad], ``[J]``.
-        """
-        if self.config.aim == "box":
-            return None
-        kinematics, link, local = self._aim_points
-        position, rotation = kinematics.poses_b(joint_pos[None])
-        turn, shift = rotation[0, link], position[0, link]
-        point_b = (turn * local[:, None, :]).sum(-1) + shift
-        return base_pose[:3] + rotate(base_pose[3:].expand(len(link), 4), point_b)
 
 
 class Session:
@@ -346,12 +328,14 @@ class Session:
         Args:
             point: Point in the world [m], ``[3]``.
         """
-        pose = torch.from_numpy(self.frame.qpos).float()
-        points = self._thrower.points_w(pose[:7], pose[7:])
-        if points is None:
+        if self._thrower.config.aim == "box":
             return None
+        pose = torch.from_numpy(self.frame.qpos).float()[None]
+        every = torch.arange(NUM_AIM_POINTS)
+        points = self._thrower.points_w(every, pose[:, :7], pose[:, 7:])
         away = (points - torch.from_numpy(point).float()).square().sum(-1)
-        return (int(away.argmin()) + 0.5) / len(points)
+        # The middle of the numbers that aim at this point.
+        return (int(away.argmin()) + 0.5) / NUM_AIM_POINTS
 
     # --- readings and lines ---------------------------------------------------
 
