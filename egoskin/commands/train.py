@@ -13,8 +13,9 @@ from types import FrameType
 
 from egoskin.agents.ppo import NonFiniteError
 from egoskin.commands.errors import check_packages
+from egoskin.envs.physics import engine_of
 from egoskin.interrupts import ENDING, end_next_time, say, take
-from egoskin.make import check_num_workers
+from egoskin.make import check_num_workers, device_of
 from egoskin.parallel import WorkerError
 from egoskin.progress import ProgressLine, counted, duration
 from egoskin.runs.config import TrainConfig, parse_config
@@ -45,7 +46,8 @@ def open_run(config: TrainConfig) -> Run:
     Raises:
         ValueError: If the run cannot be trained on this machine.
     """
-    config.check_machine()
+    device_of(config.device)
+    engine_of(config.engine)
     if config.log == "wandb":
         check_packages("--log wandb", "wandb", "wandb")
     if config.engine == "warp":
