@@ -113,7 +113,9 @@ def posed_mesh(data: mujoco.MjData, directory: Path, links: Sequence[str]) -> Tr
         transform[:3, :3], transform[:3, 3] = frame.xmat.reshape(3, 3), frame.xpos
         mesh = trimesh.load_mesh(mesh_file(directory, link))
         meshes.append(mesh.apply_transform(transform))
-    return trimesh.util.concatenate(meshes)
+    whole = trimesh.util.concatenate(meshes)
+    assert isinstance(whole, Trimesh)
+    return whole
 
 
 def within(points: Array, span: Span) -> NDArray[np.bool_]:

@@ -251,7 +251,7 @@ def main(args: list[str]) -> None:
         "mask": config.masked,
     }
     engine: dict[str, Any] = {"engine": config.engine, "device": config.device}
-    whole = which | {"on_step": on_step}
+    whole: dict[str, Any] = which | {"on_step": on_step}
     subject = policy, env_config, policy.skin
     # For evaluations that are repeated many times.
     episodes, workers = max(config.episodes // 4, 1), config.num_workers
