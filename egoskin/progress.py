@@ -16,10 +16,18 @@ def counted(number: int, noun: str) -> str:
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
-def clock(seconds: float) -> str:
-    """Return a time as hours, minutes and seconds: "2:10:05"."""
-    hours, rest = divmod(round(seconds), 3600)
-    return f"{hours:d}:{rest // 60:02d}:{rest % 60:02d}"
+def duration(seconds: float | None) -> str:
+    """Return a time as text: "3 d 04 h", "2 h 05 min", "40 s", "-" for None."""
+    if seconds is None:
+        return "-"
+    minutes, s = divmod(round(seconds), 60)
+    hours, m = divmod(minutes, 60)
+    days, h = divmod(hours, 24)
+    if days:
+        return f"{days} d {h:02d} h"
+    if hours:
+        return f"{hours} h {m:02d} min"
+    return f"{m} min" if minutes >= 5 else f"{60 * m + s} s"
 
 
 class StatusLine:
@@ -110,5 +118,5 @@ class ProgressLine:
             self.is_unread = True
 
     def _left(self, now: float, frames: float) -> str:
-        done = frames - self._first
-        return clock((now - self._start) * max(self._total - frames, 0) / max(done, 1))
+        left, done = max(self._total - frames, 0), max(frames - self._first, 1)
+        return duration((now - self._start) * left / done)

@@ -22,9 +22,8 @@ if __name__ == "__main__":
 
 # isort: split
 
-import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -35,23 +34,18 @@ import trimesh
 import tyro
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from trimesh import Trimesh
 
 from egoskin.commands.errors import clear_errors
 from egoskin.robots.config import H1_2
 from egoskin.robots.surface import sample_surface
+from egoskin.sensors.skin.mesh_surface import openness
 
 Array = NDArray[np.float64]
-Scene = tuple[mujoco.MjModel, mujoco.MjData]
 Span = tuple[float, float]  # lowest and highest z in the world [m]
 
 # The torso's mesh includes neck and head. Its trunk is a box that ends here [m].
 NECK_HEIGHT = 0.485
-
-# Distance between the start of a ray and the face that it leaves [m].
-CLEARANCE = 1e-4
-
-# Number of rays over the hemisphere of each mesh point.
-RAYS = 48
 
 UPPER_ARM = ("shoulder_pitch_link", "shoulder_roll_link", "shoulder_yaw_link")
 LOWER_ARM = ("elbow_link", "wrist_roll_link", "wrist_pitch_link", "wrist_yaw_link")
@@ -103,53 +97,25 @@ def mesh_file(directory: Path, link: str) -> Path:
     return path
 
 
-def default_pose() -> Scene:
+def default_data() -> mujoco.MjData:
     """Return the robot in its default pose, with its kinematics computed."""
-    model = H1_2.model
-    data = mujoco.MjData(model)
+    data = mujoco.MjData(H1_2.model)
     data.qpos[7:] = H1_2.default_joint_pos
-    mujoco.mj_kinematics(model, data)
-    return model, data
+    mujoco.mj_kinematics(H1_2.model, data)
+    return data
 
 
-def mesh_scene(data: mujoco.MjData, meshes: Path) -> Scene:
-    """Return a static scene of the links' meshes in the pose, for ray casts."""
-    spec = mujoco.MjSpec()
-    for link in H1_2.links:
-        mesh = spec.add_mesh(name=link, file=str(mesh_file(meshes, link).resolve()))
-        # A shell has an inertia even if its surface is not closed.
-        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-        geom = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=link)
-        geom.pos, geom.quat = data.body(link).xpos, data.body(link).xquat
-        geom.contype = geom.conaffinity = 0  # saves computing convex hulls
-    scene = spec.compile()
-    scene_data = mujoco.MjData(scene)
-    mujoco.mj_forward(scene, scene_data)
-    return scene, scene_data
-
-
-def openness(scene: Scene, points: Array, normals: Array) -> Array:
-    """Return the share of cosine-weighted outward rays that hit no mesh, ``[N]``.
-
-    Points on the meshes [m] and unit normals there are ``[N, 3]``, world frame.
-    """
-    # Evenly spread over the unit sphere along a golden-angle spiral.
-    k = np.arange(RAYS) + 0.5
-    z, angle = 1.0 - 2.0 * k / RAYS, k * math.pi * (3.0 - math.sqrt(5.0))
-    ring = np.sqrt(1.0 - z**2)
-    sphere = np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=-1)
-    share = np.empty(len(points))
-    geom, distance = np.empty(RAYS, dtype=np.int32), np.empty(RAYS)
-    for i, (point, normal) in enumerate(zip(points, normals, strict=True)):
-        # Lambert: normal + uniform unit vector gives a cosine-weighted direction.
-        ray = normal + sphere
-        ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-        start = point + CLEARANCE * normal
-        mujoco.mj_multiRay(
-            *scene, start, ray.ravel(), None, 1, -1, geom, distance, None, RAYS, 10.0
-        )
-        share[i] = np.mean(geom < 0)
-    return share
+def posed_mesh(data: mujoco.MjData, directory: Path, links: Sequence[str]) -> Trimesh:
+    """Return the meshes of some links in the pose, in the world [m], as one."""
+    meshes = []
+    for link in links:
+        frame, transform = data.body(link), np.eye(4)
+        transform[:3, :3], transform[:3, 3] = frame.xmat.reshape(3, 3), frame.xpos
+        mesh = trimesh.load_mesh(mesh_file(directory, link))
+        meshes.append(mesh.apply_transform(transform))
+    whole = trimesh.util.concatenate(meshes)
+    assert isinstance(whole, Trimesh)
+    return whole
 
 
 def within(points: Array, span: Span) -> NDArray[np.bool_]:
@@ -171,41 +137,35 @@ def primitive_points(
 
 
 def mesh_points(
-    data: mujoco.MjData, scene: Scene, links: list[str], span: Span, options: Options
+    mesh: Trimesh, robot: Trimesh, span: Span, options: Options
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Return points of the links' meshes, uniform, world [m], and which are outer."""
-    meshes = []
-    for link in links:
-        frame, transform = data.body(link), np.eye(4)
-        transform[:3, :3], transform[:3, 3] = frame.xmat.reshape(3, 3), frame.xpos
-        mesh = trimesh.load_mesh(mesh_file(options.meshes, link))
-        meshes.append(mesh.apply_transform(transform))
-    mesh = trimesh.util.concatenate(meshes)
+    """Return points of a mesh, uniform [m], and which are outer points of the robot."""
     # Enough for a span with a tenth of the area.
     count, seed = 10 * options.samples, options.seed
     points, faces = trimesh.sample.sample_surface(mesh, count, seed=seed)[:2]
     kept = np.flatnonzero(within(points, span))[: options.samples]
     points, normals = points[kept], mesh.face_normals[faces[kept]]
-    return points, openness(scene, points, normals) >= options.min_openness
+    return points, openness(robot, points, normals) >= options.min_openness
 
 
 def measure(options: Options) -> Iterator[Fit]:
     """Yield the fit of each region."""
-    model, data = default_pose()
-    scene = mesh_scene(data, options.meshes)
+    model, data = H1_2.model, default_data()
+    robot = posed_mesh(data, options.meshes, H1_2.links)
     # The pose is upright, so heights in the torso's frame are heights in the world.
     neck = data.body("torso_link").xpos[2] + NECK_HEIGHT
     spans = {"torso": (-np.inf, neck), "head": (neck, np.inf)}
     for region, links in REGIONS.items():
         span = spans.get(region, (-np.inf, np.inf))
         ours = primitive_points(data, links, span, options)
-        points, outer = mesh_points(data, scene, links, span, options)
-        mesh = points[outer]
+        mesh = posed_mesh(data, options.meshes, links)
+        points, outer = mesh_points(mesh, robot, span, options)
+        theirs = points[outer]
         on_links = np.isin(model.geom_bodyid, [model.body(k).id for k in links])
         yield Fit(
             region=region,
-            ours_to_mesh=cKDTree(mesh).query(ours)[0],
-            mesh_to_ours=cKDTree(ours).query(mesh)[0],
+            ours_to_mesh=cKDTree(theirs).query(ours)[0],
+            mesh_to_ours=cKDTree(ours).query(theirs)[0],
             inner_share=1.0 - float(outer.mean()),
             num_primitives=int((on_links & within(data.geom_xpos, span)).sum()),
         )

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from egoskin.progress import ProgressLine
+from egoskin.progress import ProgressLine, duration
 
 METRICS = {
     "episode/success": float("nan"),
@@ -15,6 +15,14 @@ METRICS = {
     "time/steps_per_s": 1e4,
     "reward/mean": 0.0,
 }
+
+
+def test_durations_are_readable():
+    assert duration(None) == "-"
+    assert duration(299) == "299 s"
+    assert duration(300) == "5 min"
+    assert duration(3 * 3600 + 60) == "3 h 01 min"
+    assert duration(50 * 3600) == "2 d 02 h"
 
 
 def test_few_frames_of_many_are_not_none(capsys):

@@ -241,37 +241,31 @@ def main(args: list[str]) -> None:
     def on_step(step: int, running: int) -> None:
         line.show(f"{step / hz:.2f} s played, {running} episodes still running")
 
-    def on_point(done: int, total: int) -> None:
-        line.show(f"map: {done} of {total} points")
-
-    def on_perturbed(done: int, total: int) -> None:
-        line.show(f"perturbed: {done} of {total}")
+    def counting(what: str) -> Callable[[int, int], None]:
+        return lambda done, total: line.show(f"{what}: {done} of {total}")
 
     which: dict[str, Any] = {
         "throw_set": config.throw_set,
         "episodes": config.episodes,
         "num_workers": config.num_workers,
         "mask": config.masked,
-        "on_step": on_step,
     }
     engine: dict[str, Any] = {"engine": config.engine, "device": config.device}
+    whole: dict[str, Any] = which | {"on_step": on_step}
+    subject = policy, env_config, policy.skin
     # For evaluations that are repeated many times.
     episodes, workers = max(config.episodes // 4, 1), config.num_workers
-    quarter: dict[str, Any] = {
-        "throw_set": config.throw_set,
-        "episodes": episodes,
-        "num_workers": workers and default_num_workers(episodes, workers),
-        "mask": config.masked,
-    }
+    workers = workers and default_num_workers(episodes, workers)
+    quarter = which | {"episodes": episodes, "num_workers": workers}
     behaviour = checked = None
     substeps = config.check_substeps or env_config.task.physics.substeps
     finer = with_substeps(env_config, substeps)
     if config.behaviour:
-        result, behaviour = behave(policy, env_config, policy.skin, **which)
+        result, behaviour = behave(*subject, **whole)
     else:
-        result = evaluate(policy, env_config, policy.skin, **which, **engine)
+        result = evaluate(*subject, **whole, **engine)
     if config.check_substeps is not None:
-        checked = evaluate(policy, finer, policy.skin, **which, **engine)
+        checked = evaluate(policy, finer, policy.skin, **whole, **engine)
     line.finish()
     trained = policy.env_config.standard
     played = trained if config.standard == "run" else config.standard
@@ -307,16 +301,12 @@ def main(args: list[str]) -> None:
         content["check_substeps"] = config.check_substeps
         content["checked"] = dataclasses.asdict(checked)
     if config.perturbed:
-        rows = perturb(
-            policy, env_config, policy.skin, **quarter, on_point=on_perturbed
-        )
+        rows = perturb(*subject, **quarter, on_point=counting("perturbed"))
         line.finish()
         print(perturbed_table(rows, task.success_s))
         content["perturbed"] = [dataclasses.asdict(row) for row in rows]
     if config.map is not None:
-        lines = operating_map(
-            policy, env_config, policy.skin, **quarter, on_point=on_point
-        )
+        lines = operating_map(*subject, **quarter, on_point=counting("map"))
         line.finish()
         draw_map(config.map, lines, title.removesuffix(", physics at "))
         content["map"] = [dataclasses.asdict(line) for line in lines]

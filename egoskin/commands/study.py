@@ -25,14 +25,14 @@ from egoskin.bounds import COUNT, POSITIVE, check_bounds
 from egoskin.commands.errors import check_packages, parse_subcommand
 from egoskin.evaluation.visibility import alike, analyse, warning_texts
 from egoskin.parallel import available_cores
-from egoskin.progress import counted
+from egoskin.progress import counted, duration
 from egoskin.storage.serialization import to_plain
 from egoskin.storage.tensor_file import write_file
 from egoskin.study.cost import Speed, cost, measure_all
-from egoskin.study.manifest import Manifest, brief, load_study, resolve
+from egoskin.study.manifest import Manifest, load_study, resolve, settings
 from egoskin.study.runner import LocalRunner, Progress, Runner, slurm_script
 from egoskin.study.shipped import STUDIES
-from egoskin.study.store import RunStatus, StudyFolder, duration
+from egoskin.study.store import RunStatus, StudyFolder
 
 # Cores of a common server.
 _MANY_CORES = 64
@@ -140,11 +140,10 @@ class Plan:
 def describe(manifest: Manifest) -> None:
     """Print the content of a study."""
     print(f"study {manifest.study}: {manifest.purpose}")
-    for name, value in manifest.not_default().items():
-        print(f"  not the default: {name.removeprefix('env.')} = {brief(value)}")
+    for setting in settings(manifest.not_default()):
+        print(f"  not the default: {setting}")
     for cell in manifest.cells:
-        own = manifest.overrides(cell).items()
-        text = ", ".join(f"{k.removeprefix('env.')}={brief(v)}" for k, v in own)
+        text = ", ".join(settings(manifest.overrides(cell)))
         print(f"  {cell.name:<32} {text or 'no other changes'}")
     seeds = ", ".join(map(str, manifest.seeds))
     print(

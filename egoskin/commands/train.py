@@ -13,10 +13,11 @@ from types import FrameType
 
 from egoskin.agents.ppo import NonFiniteError
 from egoskin.commands.errors import check_packages
+from egoskin.envs.physics import engine_of
 from egoskin.interrupts import ENDING, end_next_time, say, take
-from egoskin.make import check_num_workers
+from egoskin.make import check_num_workers, device_of
 from egoskin.parallel import WorkerError
-from egoskin.progress import ProgressLine, clock, counted
+from egoskin.progress import ProgressLine, counted, duration
 from egoskin.runs.config import TrainConfig, parse_config
 from egoskin.runs.estimate import estimate_seconds
 from egoskin.runs.run import Run
@@ -45,7 +46,8 @@ def open_run(config: TrainConfig) -> Run:
     Raises:
         ValueError: If the run cannot be trained on this machine.
     """
-    config.check_machine()
+    device_of(config.device)
+    engine_of(config.engine)
     if config.log == "wandb":
         check_packages("--log wandb", "wandb", "wandb")
     if config.engine == "warp":
@@ -69,7 +71,7 @@ def announce(trainer: Trainer) -> None:
         where = f"MuJoCo Warp, {config.device}"
     elif to_do > _SOON_DONE:
         seconds = estimate_seconds(config, trainer.run.load_skin(), to_do)
-        time = f"; about {_rough_time(seconds)} on this machine"
+        time = f"; about {duration(seconds)} on this machine"
     print(
         f"{to_do:,} frames{f' after {done:,}' if done else ''}: "
         f"{counted(config.num_envs, 'agent')} on {where}, "
@@ -78,16 +80,6 @@ def announce(trainer: Trainer) -> None:
         f"curves while it trains: tensorboard --logdir {trainer.run.path}",
         flush=True,
     )
-
-
-def _rough_time(seconds: float) -> str:
-    """Return an estimated time as text: "2 h 10 min", "7 min", "20 s"."""
-    if seconds < 60:
-        return f"{max(round(seconds, -1), 10):.0f} s"
-    hours, minutes = divmod(round(seconds / 60), 60)
-    if hours:
-        return f"{hours} h {round(minutes, -1)} min"
-    return f"{minutes} min"
 
 
 def what_came_out(trainer: Trainer, metrics: Mapping[str, float]) -> str:
@@ -100,7 +92,7 @@ def what_came_out(trainer: Trainer, metrics: Mapping[str, float]) -> str:
     path, task = trainer.run.path, trainer.config.env.task
     summary = f"done: {trainer.frames:,} frames"
     if metrics:
-        summary += f" in {clock(metrics['time/wall_s'])}; with exploration "
+        summary += f" in {duration(metrics['time/wall_s'])}; with exploration "
         # NaN if no episode could last long enough.
         if not math.isnan(success := metrics["episode/success"]):
             summary += f"{success:.1%} untouched for {task.success_s:g} s, "

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import cast
+from typing import Annotated, cast
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import Compose, TransformedEnv
 
+from egoskin.bounds import COUNT, POSITIVE, Interval, check_bounds
 from egoskin.envs.dodgeball import DodgeballEnv
 from egoskin.evaluation.throw_set import throw_seed
 from egoskin.make import EnvConfig, default_num_workers, make_worker_env
@@ -23,11 +24,14 @@ from egoskin.sensors import Skin
 from egoskin.sensors.config import SensorConfig
 from egoskin.sensors.pipeline import SensorPipeline
 
+# Consecutive entries of a plan, and control steps for which each is held.
+_ENTRIES, _HELD = 8, 4
 # Share of elite plans, and weight of the previous mean and standard deviation in each
 # update.
 _ELITE, _KEPT = 0.1, 0.25
-# Lower bound on the standard deviation of the entries, to keep exploring.
-_LEAST_SPREAD = 0.1
+# Standard deviation of the entries, in units of the action: at first, and at least, to
+# keep exploring.
+_FIRST_SPREAD, _LEAST_SPREAD = 1.2, 0.1
 # Cost of a plan's size: of two plans with the same outcome, the smaller is better.
 _SIZE_COST = 1e-3
 # A step that no episode reaches.
@@ -36,19 +40,13 @@ _NEVER = 2**31
 
 @dataclass(frozen=True, kw_only=True)
 class SearchConfig:
-    """Form of the plans, and settings of the search."""
+    """Settings of the search."""
 
-    samples: int = 128
+    samples: Annotated[int, Interval(ge=4)] = 128
     """Plans per throw and iteration."""
-    iterations: int = 20
+    iterations: Annotated[int, COUNT] = 20
     """Iterations of the search."""
-    entries: int = 8
-    """Number of consecutive entries of a plan."""
-    hold: int = 4
-    """Control steps for which each entry is held."""
-    spread: float = 1.2
-    """Initial standard deviation of the entries, in units of the action."""
-    stand_s: float = 1.25
+    stand_s: Annotated[float, POSITIVE] = 1.25
     """Time simulated from the start of a plan [s]: longer than the ball takes to pass;
     the robot must not fall."""
     seed: int = 0
@@ -56,11 +54,7 @@ class SearchConfig:
 
     def __post_init__(self) -> None:
         """Raise ValueError for invalid values."""
-        for name in ("iterations", "entries", "hold", "spread", "stand_s"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        if self.samples < 4:
-            raise ValueError(f"samples must be at least 4, got {self.samples}")
+        check_bounds(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,7 +120,7 @@ def find_upper_bound(
     Args:
         policy: Writes the mean action.
         config: Robot, task (its throws are those of the throw set), sensors.
-        search: Settings of plans and search.
+        search: Settings of the search.
         throw_set: Seed of the throw set.
         throws: Number of episodes of the throw set.
         reach: Distance from a sensor to the ball's surface at which plans start [m].
@@ -171,8 +165,8 @@ def find_upper_bound(
         raise ValueError(f"none of {throws} balls came within {reach:g} m of a sensor")
     env, starts = make(n * samples, longer), start.repeated(samples)
     env.reset()
-    mean = torch.zeros(n, search.entries, len(config.robot_config.joints))
-    spread = torch.full_like(mean, search.spread)
+    mean = torch.zeros(n, _ENTRIES, len(config.robot_config.joints))
+    spread = torch.full_like(mean, _FIRST_SPREAD)
     generator = torch.Generator().manual_seed(search.seed)
     elite = max(2, round(_ELITE * samples))
     every = torch.arange(n)
@@ -182,7 +176,7 @@ def find_upper_bound(
         noise = torch.randn(n, samples, *mean.shape[1:], generator=generator)
         plans = mean[:, None] + spread[:, None] * noise
         plans[:, 0], plans[:, 1] = 0.0, mean
-        plan = plans.flatten(0, 1).repeat_interleave(search.hold, 1)
+        plan = plans.flatten(0, 1).repeat_interleave(_HELD, 1)
         avoided, age = (
             x.reshape(n, samples) for x in _play(env, policy, starts, plan, steps)
         )

@@ -7,15 +7,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
-import torch
 import tyro
 
 from egoskin.agents.ppo import PPOConfig
 from egoskin.bounds import COUNT, POSITIVE, check_bounds
 from egoskin.envs.dodgeball import DodgeballConfig
-from egoskin.envs.physics import Engine, engine_of
+from egoskin.envs.physics import Engine
 from egoskin.envs.standards import CUSTOM, Standard, training_task
-from egoskin.make import EnvConfig, check_num_workers, device_of
+from egoskin.make import EnvConfig, check_num_workers
 from egoskin.parallel import available_cores
 from egoskin.rng import check_seed
 from egoskin.storage.formats import present_config, read_sealed
@@ -108,19 +107,6 @@ class TrainConfig:
         """Threads of the learner on this machine; results do not depend on it."""
         return self.learner_threads or available_cores()
 
-    def check_machine(self) -> None:
-        """Raise ValueError if this machine lacks the device or the engine."""
-        self.learner_device()
-        engine_of(self.engine)
-
-    def learner_device(self) -> torch.device:
-        """Return the device of the learner.
-
-        Raises:
-            ValueError: If there is no such device.
-        """
-        return device_of(self.device)
-
 
 CALL_FIELDS = ("run_dir", "resume", "config", "standard")
 """Fields of the command line only; the stored configuration omits their values."""
@@ -135,9 +121,11 @@ MACHINE_FIELDS = frozenset(
         "checkpoint_interval",
     )
 )
-"""Fields for the call, the machine and the saved files of a run. They may change on
-resume, because results do not depend on them, bit for bit. The device is not included:
-rounding of sums differs between devices."""
+"""Fields for the call, the machine and the saved files of a run. Results do not depend
+on them, bit for bit. The device is not included: rounding of sums differs between
+devices."""
+RESUME_FIELDS = MACHINE_FIELDS | {"total_frames"}
+"""Fields that may change on resume."""
 SKIN_HASH = "skin_sha256"
 """Key of the hash of the skin in config.json, beside the configuration."""
 
@@ -146,8 +134,8 @@ def parse_config(args: list[str]) -> TrainConfig:
     """Return the configuration of a command line.
 
     With ``--config FILE``, the defaults come from a stored configuration. With
-    ``--resume RUN``, they come from the run, and only ``total_frames`` and
-    `MACHINE_FIELDS` may differ from it.
+    ``--resume RUN``, they come from the run, and only `RESUME_FIELDS` may differ from
+    it.
 
     Args:
         args: Arguments, without the program's name.
@@ -179,11 +167,10 @@ def parse_config(args: list[str]) -> TrainConfig:
     config = tyro.cli(TrainConfig, args=args, default=stored)
     if config.run_dir is not None:
         raise ValueError("--run-dir cannot be changed on resume")
-    free = MACHINE_FIELDS | {"total_frames"}
-    changed = [n for n in changed_fields(before, to_plain(config)) if n not in free]
-    if changed:
+    changed = changed_fields(before, to_plain(config))
+    if changed := [name for name in changed if name not in RESUME_FIELDS]:
         names = ", ".join(n.removeprefix("env.") for n in changed)
-        may = sorted(free - set(CALL_FIELDS))
+        may = sorted(RESUME_FIELDS - set(CALL_FIELDS))
         raise ValueError(
             f"a resumed run keeps its configuration; changed: {names}. Only "
             f"{', '.join(map(_option, may))} may change"

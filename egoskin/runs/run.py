@@ -48,7 +48,7 @@ from egoskin.policies.policy import (
 )
 from egoskin.runs.config import (
     CALL_FIELDS,
-    MACHINE_FIELDS,
+    RESUME_FIELDS,
     SKIN_HASH,
     TrainConfig,
     load_config,
@@ -178,8 +178,8 @@ class Run:
 
     def _trained_with(self) -> dict[str, Any]:
         """Return the configuration and skin hash that determine the results."""
-        free = MACHINE_FIELDS | {"total_frames"}
-        content = {k: v for k, v in to_plain(self.config).items() if k not in free}
+        plain = to_plain(self.config)
+        content = {k: v for k, v in plain.items() if k not in RESUME_FIELDS}
         return {**content, SKIN_HASH: self._skin_hash}
 
     def _check_trained_with(self, before: Mapping[str, Any]) -> None:

@@ -28,6 +28,7 @@ from egoskin.envs.rewards import TERMS
 from egoskin.envs.state import keys_read_by
 from egoskin.make import (
     Trainable,
+    device_of,
     load_env_state,
     make_env,
     make_worker_env,
@@ -92,7 +93,7 @@ class Trainer:
         sources: Mapping[str, SparseSource],
     ) -> None:
         self.config, self.run, self.env = run.config, run, env
-        self.device = self.config.learner_device()
+        self.device = device_of(self.config.device)
         config = self.config
         spec = PolicySpec.of(config.env, skin, config.ppo.network, env, sources)
         self.spec = dataclasses.replace(spec, engine=config.engine)
@@ -332,7 +333,7 @@ def make_training_env(
         config.env,
         skin,
         engine=config.engine,
-        device=config.learner_device(),
+        device=device_of(config.device),
         **shared,
     )
     assert isinstance(env.base_env, DodgeballEnv)

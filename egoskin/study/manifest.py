@@ -26,7 +26,7 @@ from egoskin.hints import did_you_mean
 from egoskin.make import EnvConfig
 from egoskin.rng import check_seed
 from egoskin.robots.own import kept_robot
-from egoskin.runs.config import MACHINE_FIELDS, TrainConfig
+from egoskin.runs.config import MACHINE_FIELDS, RESUME_FIELDS, TrainConfig
 from egoskin.sensors import Skin
 from egoskin.storage.formats import (
     content_hash,
@@ -46,7 +46,7 @@ Overrides = Mapping[str, Any]
 """Values by dotted field names, as on the command line: ``sensor.range``."""
 
 # Fields that a study sets itself, and fields that are the same in all its cells.
-_NOT_OF_A_STUDY = MACHINE_FIELDS | {"seed", "total_frames", "device", "engine"}
+_NOT_OF_A_STUDY = RESUME_FIELDS | {"seed", "device", "engine"}
 _OF_ALL_CELLS = {"snapshot_frames", "checkpoint_interval"}
 # Compared as a whole: a robot is either a name or data.
 _ROBOT = "env.robot"
@@ -153,8 +153,7 @@ class PlannedRun:
         The length is not compared: a shorter run can be continued.
         """
         names = changed_fields(to_plain(self.config), to_plain(other))
-        free = MACHINE_FIELDS | {"total_frames"}
-        return [name.removeprefix("env.") for name in names if name not in free]
+        return [n.removeprefix("env.") for n in names if n not in RESUME_FIELDS]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -241,7 +240,7 @@ class Manifest:
             "cells": [
                 {
                     "name": cell.name,
-                    "overrides": _plain_differences(self.base, cell.config),
+                    "overrides": self.overrides(cell),
                     "skin_sha256": cell.skin_sha256,
                 }
                 for cell in self.cells
@@ -379,23 +378,23 @@ def cell_name(base: TrainConfig, config: TrainConfig) -> str:
     parts = [config.env.sensor.label()]
     for name, value in _differences(base, config).items():
         if name not in _LABEL:
-            words = [name.rpartition(".")[2], brief(value)]
+            words = [name.rpartition(".")[2], _brief(value)]
             parts += [re.sub(r"[^\w.]+", "-", word).strip("-") for word in words]
     return "-".join(parts)
 
 
-def brief(value: Any) -> str:
+def settings(values: Mapping[str, Any]) -> list[str]:
+    """Return the values of fields as text: "sensor.range = 0.5"."""
+    return [f"{k.removeprefix('env.')} = {_brief(v)}" for k, v in values.items()]
+
+
+def _brief(value: Any) -> str:
     """Return the value of a field as text; for a robot given as data, its name."""
     return str(value.get("name", value) if isinstance(value, dict) else value)
 
 
 def _differences(base: TrainConfig, config: TrainConfig) -> dict[str, Any]:
-    """Return the values in which a configuration differs, except its seed."""
-    found = _plain_differences(base, config)
-    return {name: value for name, value in found.items() if name != "seed"}
-
-
-def _plain_differences(base: TrainConfig, config: TrainConfig) -> dict[str, Any]:
+    """Return the plain values in which a configuration differs, by field."""
     old, new = to_plain(base), to_plain(config)
     names = (
         _ROBOT if name.startswith(f"{_ROBOT}.") else name

@@ -27,7 +27,7 @@ from egoskin.study.figures import (
     success_by_range,
 )
 from egoskin.study.findings import Judged, Tested, judge_findings
-from egoskin.study.manifest import Manifest, brief
+from egoskin.study.manifest import Manifest, settings
 from egoskin.study.metrics import METRICS, runs_csv, tables
 from egoskin.study.statistics import (
     Table,
@@ -178,16 +178,12 @@ def _blocks(
         yield _seen_rows(read_json(seen))
     yield "## Missing runs"
     missing = [s for s in folder.status(manifest) if s.state != "done"]
-    yield (", ".join(map(_missing, missing)) or "None: all runs are done.")
+    yield ", ".join(map(_missing, missing)) or "None: all runs are done."
     yield "## The runs"
-    default = manifest.not_default().items()
     yield (
         "Settings that differ from the default, in all runs: "
-        + (
-            ", ".join(f"{k.removeprefix('env.')} = {brief(v)}" for k, v in default)
-            or "none"
-        )
-        + ". All values in full precision: runs.csv."
+        f"{', '.join(settings(manifest.not_default())) or 'none'}. All values in full "
+        "precision: runs.csv."
     )
     yield table(
         ("run", "success at 3 s", "wall time", "commit", "machine"),

@@ -20,9 +20,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from egoskin.progress import duration
 from egoskin.study.job import CLAIMED, STOPPED, command
 from egoskin.study.manifest import Manifest, PlannedRun
-from egoskin.study.store import START, RunStatus, StudyFolder, duration, now
+from egoskin.study.store import START, RunStatus, StudyFolder, now
 
 # Intervals at which processes are polled, and a claimed run is tried again [s].
 _POLL, _AGAIN = 0.2, 5.0

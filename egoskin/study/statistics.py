@@ -39,12 +39,6 @@ def interquartile_mean(values: Sequence[float] | np.ndarray) -> float:
     return float((weight * x).sum() / weight.sum())
 
 
-def interquartile_range(values: Sequence[float] | np.ndarray) -> tuple[float, float]:
-    """Return the quantiles at 25 % and 75 %, interpolated between values."""
-    low, high = np.quantile(np.asarray(values, dtype=float), [0.25, 0.75])
-    return float(low), float(high)
-
-
 @dataclass(frozen=True, kw_only=True)
 class Spread:
     """Summary of values over the seeds of a cell, as in the paper."""
@@ -129,7 +123,8 @@ class Region:
 
 def spread(values: Sequence[float]) -> Spread:
     """Return the interquartile mean and range of values over seeds."""
-    low, high = interquartile_range(values)
+    # Interpolated between values.
+    low, high = np.quantile(values, [0.25, 0.75]).tolist()
     return Spread(iqm=interquartile_mean(values), low=low, high=high, seeds=len(values))
 
 

@@ -478,20 +478,6 @@ def _last_row(path: Path) -> dict[str, float]:
     return {}
 
 
-def duration(seconds: float | None) -> str:
-    """Return a time as text: "3 d 04 h", "2 h 05 min", "40 s", "-" for None."""
-    if seconds is None:
-        return "-"
-    minutes, s = divmod(round(seconds), 60)
-    hours, m = divmod(minutes, 60)
-    days, h = divmod(hours, 24)
-    if days:
-        return f"{days} d {h:02d} h"
-    if hours:
-        return f"{hours} h {m:02d} min"
-    return f"{m} min" if minutes >= 5 else f"{60 * m + s} s"
-
-
 def now() -> str:
     """Return the time of day, for logs."""
     return time.strftime("%Y-%m-%d %H:%M:%S")

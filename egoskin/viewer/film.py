@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import os
 from collections.abc import Sequence
@@ -14,6 +15,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from egoskin.storage.files import check_output
+from egoskin.storage.tensor_file import write_file
 
 # Time for which the last picture is held [s].
 _LAST_PICTURE = 1.0
@@ -203,9 +205,6 @@ def save_picture(path: Path, image: np.ndarray) -> None:
         ValueError: If the suffix is wrong, or the folder does not exist.
     """
     check_path(path, (".png",))
-    part = path.with_name(f".{path.stem}.part{path.suffix}")
-    try:
-        Image.fromarray(image).save(part)
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
+    file = io.BytesIO()
+    Image.fromarray(image).save(file, "png")
+    write_file(path, file.getvalue())

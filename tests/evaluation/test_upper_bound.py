@@ -196,7 +196,9 @@ def test_a_plan_lasts_a_control_step_at_least(policy: Policy):
         find_upper_bound(policy, task(policy), short, throw_set=0, throws=1, reach=2.0)
 
 
-@pytest.mark.parametrize("change", [{"samples": 3}, {"hold": 0}, {"stand_s": -1.0}])
+@pytest.mark.parametrize(
+    "change", [{"samples": 3}, {"iterations": 0}, {"stand_s": -1.0}]
+)
 def test_searches_that_cannot_be_are_refused(change: dict):
     with pytest.raises(ValueError, match=next(iter(change))):
         SearchConfig(**change)

@@ -14,6 +14,7 @@ from calling import call
 from egoskin.robots.config import H1_2
 
 trimesh = pytest.importorskip("trimesh")
+pytest.importorskip("embreex")
 
 SCRIPT = Path(__file__).parents[2] / "scripts" / "fit_shell.py"
 spec = importlib.util.spec_from_file_location("fit_shell", SCRIPT)
@@ -98,38 +99,17 @@ def test_sphere_inside_a_box_is_no_outer_shell(tmp_path):
     for mesh in (box, ball):
         mesh.apply_translation((0.0, 0.0, 0.25))
     trimesh.util.concatenate([box, ball]).export(tmp_path / "torso_link.STL")
-    _, data = fit_shell.default_pose()
-    scene = fit_shell.mesh_scene(data, tmp_path)
+    data = fit_shell.default_data()
+    torso = fit_shell.posed_mesh(data, tmp_path, ["torso_link"])
+    robot = fit_shell.posed_mesh(data, tmp_path, H1_2.links)
     options = fit_shell.Options(meshes=tmp_path, samples=1000)
-    points, outer = fit_shell.mesh_points(
-        data, scene, ["torso_link"], (-np.inf, np.inf), options
-    )
+    points, outer = fit_shell.mesh_points(torso, robot, (-np.inf, np.inf), options)
     local = points - data.body("torso_link").xpos - (0.0, 0.0, 0.25)
     on_ball = np.linalg.norm(local, axis=1) < 0.101
     # Areas 4 pi 0.1^2 = 0.126 and 6 x 0.3^2 = 0.54: 19 % of the points are the ball's.
     assert 0.15 < on_ball.mean() < 0.23
     assert not outer[on_ball].any()
     assert outer[~on_ball].mean() > 0.7
-
-
-def test_openness_of_a_plane_is_one_and_of_a_pit_its_sky(tmp_path):
-    plate = trimesh.creation.box((2.0, 2.0, 0.1))
-    tube = trimesh.creation.annulus(r_min=0.1, r_max=0.2, height=0.2)
-    trimesh.util.concatenate([plate, tube]).export(tmp_path / "pit.STL")
-    spec = mujoco.MjSpec()
-    mesh = spec.add_mesh(name="pit", file=str(tmp_path / "pit.STL"))
-    mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-    geom = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="pit")
-    geom.contype = geom.conaffinity = 0
-    model = spec.compile()
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    # Plate's top and pit's floor at z = 0.05, the pit's rim at 0.1, its radius 0.1:
-    # cosine-weighted sky from the floor's centre r^2 / (r^2 + h^2) = 0.8.
-    points = np.array([[0.0, 0.0, 0.05], [0.9, 0.9, -0.05]])
-    normals = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
-    share = fit_shell.openness((model, data), points, normals)
-    assert share == pytest.approx([0.8, 1.0], abs=0.05)
 
 
 def test_missing_directory_is_one_line_and_status_2(tmp_path):

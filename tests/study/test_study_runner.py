@@ -28,7 +28,7 @@ from egoskin.study.job import CLAIMED, STOPPED, Stop, work
 from egoskin.study.manifest import EvaluationPlan, Manifest, PlannedRun, Study, resolve
 from egoskin.study.metrics import runs_csv
 from egoskin.study.runner import LocalRunner, Progress, slurm_script
-from egoskin.study.store import Failure, RunStatus, StudyFolder, duration
+from egoskin.study.store import Failure, RunStatus, StudyFolder
 
 # 16 agents x 16 steps are 256 frames a rollout.
 BATCH = 256
@@ -314,14 +314,6 @@ def test_the_speed_is_measured_and_nothing_is_left(
     assert 10 < speed.per_s < 1e6
     assert str(speed).startswith("1 run side by side on 2 cores each: ")
     assert not list(tmp_path.glob("egoskin-*"))
-
-
-def test_durations_are_readable():
-    assert duration(None) == "-"
-    assert duration(299) == "299 s"
-    assert duration(300) == "5 min"
-    assert duration(3 * 3600 + 60) == "3 h 01 min"
-    assert duration(50 * 3600) == "2 d 02 h"
 
 
 def test_the_slurm_script_shares_the_folder_among_its_elements():

@@ -15,7 +15,6 @@ from egoskin.study.statistics import (
     contrast,
     holm,
     interquartile_mean,
-    interquartile_range,
     mean_effect,
     seed_sd,
     seeds_needed,
@@ -45,8 +44,10 @@ def test_interquartile_statistics_by_hand():
     assert interquartile_mean([100.0, 1.0, 2.0, -50.0]) == 1.5
     ten = [0.0, 0, 2, 4, 4, 4, 4, 8, 99, 99]
     assert interquartile_mean(ten) == pytest.approx((1 + 16 + 4) / 5)
-    assert interquartile_range([0.0, 1, 2, 3, 4]) == (1.0, 3.0)
-    assert interquartile_range([5.0]) == (5.0, 5.0)
+    own = spread([0.0, 1, 2, 3, 4])
+    assert (own.low, own.high) == (1.0, 3.0)
+    own = spread([5.0])
+    assert (own.low, own.high) == (5.0, 5.0)
 
 
 def test_a_mean_has_scipys_t_interval():

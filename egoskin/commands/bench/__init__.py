@@ -11,43 +11,35 @@ egoskin bench gymnasium
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 from egoskin.commands.bench.accuracy import AccuracyBench, accuracy_rows
 from egoskin.commands.bench.engine import EngineBench, engine_rows
 from egoskin.commands.bench.gradients import GradientBench, gradient_rows
 from egoskin.commands.bench.gymnasium import GymnasiumBench, gymnasium_rows
 from egoskin.commands.bench.loop import LoopConfig, loop
 from egoskin.commands.bench.physics import PhysicsBench, physics_rows
-from egoskin.commands.bench.report import report
+from egoskin.commands.bench.report import Row, report
 from egoskin.commands.bench.sensors import SensorBench, sensor_rows
 from egoskin.commands.errors import parse_subcommand
 from egoskin.storage.files import check_output
 
+# Options of each benchmark, and the function that measures.
+_BENCHES: dict[str, tuple[type, Callable[[Any], list[Row]]]] = {
+    "loop": (LoopConfig, loop),
+    "physics": (PhysicsBench, physics_rows),
+    "engine": (EngineBench, engine_rows),
+    "sensors": (SensorBench, sensor_rows),
+    "accuracy": (AccuracyBench, accuracy_rows),
+    "gradients": (GradientBench, gradient_rows),
+    "gymnasium": (GymnasiumBench, gymnasium_rows),
+}
+
 
 def main(args: list[str]) -> None:
     """Run the command."""
-    benches = {
-        "loop": LoopConfig,
-        "physics": PhysicsBench,
-        "engine": EngineBench,
-        "sensors": SensorBench,
-        "accuracy": AccuracyBench,
-        "gradients": GradientBench,
-        "gymnasium": GymnasiumBench,
-    }
-    config = parse_subcommand(benches, args)
+    config = parse_subcommand({k: kind for k, (kind, _) in _BENCHES.items()}, args)
     check_output(config.json, "--json")
-    if isinstance(config, LoopConfig):
-        rows = loop(config)
-    elif isinstance(config, PhysicsBench):
-        rows = physics_rows(config)
-    elif isinstance(config, EngineBench):
-        rows = engine_rows(config)
-    elif isinstance(config, AccuracyBench):
-        rows = accuracy_rows(config)
-    elif isinstance(config, GradientBench):
-        rows = gradient_rows(config)
-    elif isinstance(config, GymnasiumBench):
-        rows = gymnasium_rows(config)
-    else:
-        rows = sensor_rows(config)
-    report(rows, config.json)
+    measure = dict(_BENCHES.values())[type(config)]
+    report(measure(config), config.json)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import mujoco
 import numpy as np
 import torch
 
+from egoskin.bounds import COUNT, Interval, check_bounds
 from egoskin.commands.bench.report import Row, show
 from egoskin.envs.physics import OBJECT_MASS, PhysicsConfig, Scene
 from egoskin.envs.physics.model import build_scene
@@ -28,9 +29,9 @@ _LONGEST_FLIGHT = 2.0
 class AccuracyBench:
     """Differences between the default physics rate and a finer one."""
 
-    finer: int = 4
+    finer: Annotated[int, Interval(ge=2)] = 4
     """Factor by which the steps of the finer rate are smaller."""
-    throws: int = 200
+    throws: Annotated[int, COUNT] = 200
     """Balls thrown at the robot, one for each impact."""
     seed: int = 0
     """Seed of the throws."""
@@ -41,8 +42,7 @@ class AccuracyBench:
 
     def __post_init__(self) -> None:
         """Raise ValueError for invalid values."""
-        if self.finer < 2 or self.throws < 1:
-            raise ValueError("finer must be at least 2 and throws at least 1")
+        check_bounds(self)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -9,6 +9,7 @@ import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from operator import truediv
 from pathlib import Path
 from typing import Annotated
 
@@ -92,9 +93,7 @@ def _rows(config: EngineBench, worlds: int) -> list[Row]:
             name=f"{name}_{worlds}",
             value=worlds * steps / statistics.median(spent),
             unit="environment steps/s",
-            ratio=statistics.median(
-                a / b for a, b in zip(times["physics"], spent, strict=False)
-            ),
+            ratio=statistics.median(map(truediv, times["physics"], spent)),
         )
         for name, spent in times.items()
     ] + memory

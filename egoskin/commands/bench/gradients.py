@@ -7,6 +7,7 @@ import shutil
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import torch
 from tensordict import TensorDict
@@ -14,6 +15,7 @@ from torch import Tensor
 
 from egoskin.agents.ppo import PPO, add_advantages
 from egoskin.agents.rollout import collect
+from egoskin.bounds import SHARE, Interval, check_bounds
 from egoskin.commands.bench.report import Row, show
 from egoskin.runs.run import Run
 from egoskin.runs.trainer import open_trainer
@@ -25,19 +27,16 @@ class GradientBench:
 
     run: Path
     """Run folder; a copy of it is resumed from its checkpoint, without learning."""
-    rollouts: int = 8
+    rollouts: Annotated[int, Interval(ge=3)] = 8
     """Rollouts to compare."""
-    lambdas: tuple[float, ...] = (0.0, 0.5, 0.8, 0.9, 0.95, 1.0)
+    lambdas: Annotated[tuple[float, ...], SHARE] = (0.0, 0.5, 0.8, 0.9, 0.95, 1.0)
     """Decays of the advantage estimate (GAE lambda), in addition to the run's own."""
     json: Path | None = None
     """File to write the rows to."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for invalid values."""
-        if self.rollouts < 3:
-            raise ValueError(f"rollouts must be at least 3, got {self.rollouts}")
-        if not all(0 <= decay <= 1 for decay in self.lambdas):
-            raise ValueError(f"lambdas must be between 0 and 1, got {self.lambdas}")
+        check_bounds(self)
 
 
 def gradient_rows(config: GradientBench) -> list[Row]:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from operator import truediv
 from pathlib import Path
 from typing import Annotated
 
@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from egoskin.bounds import COUNT, check_bounds
-from egoskin.commands.bench.report import Row, show
+from egoskin.commands.bench.report import Row, median_row, show
 from egoskin.gym import ENV_ID
 from egoskin.make import EnvConfig, check_num_workers, make_env
 
@@ -92,11 +92,6 @@ def gymnasium_rows(config: GymnasiumBench) -> list[Row]:
     show("")
     base = speeds["torchrl"]
     return [
-        Row(
-            name=name,
-            value=statistics.median(values),
-            unit="environment steps/s",
-            ratio=statistics.median(v / b for v, b in zip(values, base, strict=True)),
-        )
-        for name, values in speeds.items()
+        median_row(name, each, map(truediv, each, base), "environment steps/s")
+        for name, each in speeds.items()
     ]

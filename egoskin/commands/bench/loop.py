@@ -8,8 +8,9 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
+from operator import truediv
 from pathlib import Path
-from typing import Any, cast
+from typing import Annotated, Any, cast
 
 import psutil
 import torch
@@ -20,7 +21,8 @@ from torchrl.envs import EnvBase
 from egoskin.agents.normalizers import RunningNorm
 from egoskin.agents.ppo import PPO, PPOConfig
 from egoskin.agents.rollout import collect
-from egoskin.commands.bench.report import Row, show
+from egoskin.bounds import COUNT, NOT_NEGATIVE, check_bounds
+from egoskin.commands.bench.report import Row, median_row, show
 from egoskin.envs.dodgeball import DodgeballEnv
 from egoskin.envs.physics.mujoco import MujocoPhysics
 from egoskin.make import (
@@ -50,9 +52,9 @@ class LoopConfig:
     """Agents."""
     num_workers: int | None = None
     """Processes; None: the largest divisor of num_envs <= cores."""
-    warmup: int = 8
+    warmup: Annotated[int, NOT_NEGATIVE] = 8
     """Rollouts to train before the recording, so that it is typical."""
-    rounds: int = 5
+    rounds: Annotated[int, COUNT] = 5
     """How often each layer is measured, in turn."""
     seed: int = 0
     """Seed of the training."""
@@ -65,8 +67,7 @@ class LoopConfig:
 
     def __post_init__(self) -> None:
         """Raise ValueError for invalid values."""
-        if self.rounds < 1 or self.warmup < 0:
-            raise ValueError("rounds must be at least 1 and warmup at least 0")
+        check_bounds(self)
         check_num_workers(self.num_envs, self.num_workers)
 
 
@@ -224,22 +225,18 @@ class _Loop:
         time of all workers.
         """
         pool, serial, ratios = self._pool, [], []
+        frames = self._steps * self.config.num_envs
         for i in range(self.config.rounds):
             show(f"round {i + 1}/{self.config.rounds}: serial share")
             root = self._restore(pool)
             alone, others = time.thread_time(), _cpu_time(_processes()[1:])
             self._train(root)
-            serial.append(time.thread_time() - alone)
-            ratios.append(serial[-1] / (_cpu_time(_processes()[1:]) - others))
+            spent = time.thread_time() - alone
+            serial.append(1e6 * spent / frames)
+            ratios.append(spent / (_cpu_time(_processes()[1:]) - others))
         show("")
-        return Row(
-            name=f"serial_{self._coverage}",
-            value=1e6
-            * statistics.median(serial)
-            / (self._steps * self.config.num_envs),
-            unit="us of CPU time per environment step, the first thread alone",
-            ratio=statistics.median(ratios),
-        )
+        unit = "us of CPU time per environment step, the first thread alone"
+        return median_row(f"serial_{self._coverage}", serial, ratios, unit)
 
     def _normalise(self, _: None) -> None:
         """Update the normalisers with a rollout, as in training, and restore them."""
@@ -312,9 +309,7 @@ class _Loop:
                 name=name if name != "raw" or self._coverage == "field" else "raw_ray",
                 value=1e6 / statistics.median(values),
                 unit="environment steps/s",
-                ratio=statistics.median(
-                    r / v for r, v in zip(raw, values, strict=True)
-                ),
+                ratio=statistics.median(map(truediv, raw, values)),
             )
             for name, values in wall.items()
             if name != "normalisation"

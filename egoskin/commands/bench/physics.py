@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import statistics
 import time
 from dataclasses import dataclass
+from operator import truediv
 from pathlib import Path
 from typing import Annotated
 
@@ -12,7 +12,7 @@ import mujoco
 import torch
 
 from egoskin.bounds import COUNT, check_bounds
-from egoskin.commands.bench.report import Row, show
+from egoskin.commands.bench.report import Row, median_row, show
 from egoskin.envs.physics import PhysicsConfig, Scene
 from egoskin.envs.physics.model import build_scene
 from egoskin.envs.physics.mujoco import MujocoPhysics
@@ -92,16 +92,11 @@ def physics_rows(config: PhysicsBench) -> list[Row]:
                 speeds.setdefault(f"{motion}_{name}", []).append(speed)
     show("")
     return [
-        Row(
-            name=name,
-            value=statistics.median(values),
-            unit="environment steps/s of one core",
-            ratio=statistics.median(
-                v / base
-                for v, base in zip(
-                    values, speeds[f"{name.split('_')[0]}_shipped"], strict=True
-                )
-            ),
+        median_row(
+            name,
+            each,
+            map(truediv, each, speeds[f"{name.split('_')[0]}_shipped"]),
+            "environment steps/s of one core",
         )
-        for name, values in speeds.items()
+        for name, each in speeds.items()
     ]

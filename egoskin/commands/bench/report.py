@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import statistics
 import sys
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -20,6 +22,14 @@ class Row:
     """Unit of the value."""
     ratio: float
     """Median ratio to the first row, over pairs measured in turn."""
+
+
+def median_row(
+    name: str, values: Iterable[float], ratios: Iterable[float], unit: str
+) -> Row:
+    """Return the row of a benchmark's measurements."""
+    value, ratio = statistics.median(values), statistics.median(ratios)
+    return Row(name=name, value=value, unit=unit, ratio=ratio)
 
 
 def show(text: str) -> None:

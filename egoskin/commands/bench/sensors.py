@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ import torch
 from torch import Tensor
 
 from egoskin.bounds import COUNT, check_bounds
-from egoskin.commands.bench.report import Row, show
+from egoskin.commands.bench.report import Row, median_row, show
 from egoskin.make import EnvConfig, make_worker_env
 from egoskin.parallel import keep_freed_memory
 from egoskin.robots.config import H1_2
@@ -212,9 +211,4 @@ def _row(
             times.append(1e3 * (end - middle))
             ratios.append((end - middle) / (middle - begin))
     show("")
-    return Row(
-        name=name,
-        value=statistics.median(times),
-        unit="ms",
-        ratio=statistics.median(ratios),
-    )
+    return median_row(name, times, ratios, "ms")
