@@ -8,7 +8,7 @@ every policy.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -136,7 +136,8 @@ def behave(
     throw_set: int,
     episodes: int,
     num_workers: int | None = None,
-    **policy_only: Any,
+    mask: Sequence[str] = (),
+    on_step: Callable[[int, int], None] | None = None,
 ) -> tuple[Evaluation, Behaviour]:
     """Return the evaluation and the behaviour of a policy on a throw set.
 
@@ -147,13 +148,18 @@ def behave(
         throw_set: Seed of the throw set.
         episodes: Size of the throw set.
         num_workers: Physics threads; the result does not depend on it.
-        policy_only: ``mask`` and ``on_step`` of `evaluate`.
+        mask: Links whose sensors detect nothing, or `egoskin.sensors.MASK_ALL`.
+        on_step: Called with (steps done, episodes still running).
     """
+    which: dict[str, Any] = {
+        "throw_set": throw_set,
+        "episodes": episodes,
+        "num_workers": num_workers,
+    }
     seen, still = (Watcher(config, throw_set, episodes) for _ in range(2))
-    which: dict[str, Any] = {"throw_set": throw_set, "episodes": episodes}
-    which["num_workers"] = num_workers
-    result = evaluate(policy, config, skin, watch=seen, **policy_only, **which)
-    play_throws(None, config, skin, watch=still, **which)
+    watching: dict[str, Any] = {"mask": mask, "on_step": on_step, "watch": seen}
+    result = evaluate(policy, config, skin, **which, **watching)
+    play_throws(None, config, skin, **which, watch=still)
     behaviour = Behaviour(
         throws=seen.groups(),
         waiting=seen.waiting(),

@@ -144,8 +144,11 @@ def operating_map(
     config: EnvConfig,
     skin: Skin,
     *,
+    throw_set: int,
+    episodes: int,
+    num_workers: int | None = None,
+    mask: Sequence[str] = (),
     on_point: Callable[[int, int], None] | None = None,
-    **which: Any,
 ) -> list[Line]:
     """Return the results of a policy on throws within and beyond its training range.
 
@@ -153,9 +156,11 @@ def operating_map(
         policy: Writes ``action`` into a TensorDict; None is the zero action.
         config: Robot, task, sensors.
         skin: The skin.
+        throw_set: Seed of the throws.
+        episodes: Episodes per point.
+        num_workers: Processes; the result does not depend on it.
+        mask: Links whose sensors detect nothing, or `egoskin.sensors.MASK_ALL`.
         on_point: Called with (points done, total points).
-        which: ``throw_set``, ``episodes`` (for each point), ``num_workers`` and
-            ``mask`` of `play_throws`.
 
     Returns:
         Success against speed, interval, height, direction, and speed with interval.
@@ -175,8 +180,15 @@ def operating_map(
                 throws = what.vary(throws, value)
             throws = _with_enough_balls(throws)
             task = dataclasses.replace(config.task, throws=throws)
-            varied = dataclasses.replace(config, task=task)
-            played = play_throws(policy, varied, skin, **which)
+            played = play_throws(
+                policy,
+                dataclasses.replace(config, task=task),
+                skin,
+                throw_set=throw_set,
+                episodes=episodes,
+                num_workers=num_workers,
+                mask=mask,
+            )
             arrived = float(played.arrived.sum())
             points.append(
                 Point(

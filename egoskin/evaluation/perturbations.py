@@ -67,8 +67,7 @@ def perturb(
         config: Robot, task, sensors; its own randomization is replaced.
         skin: The skin.
         on_point: Called with (perturbations done, total perturbations).
-        which: ``throw_set``, ``episodes`` (for each perturbation), ``num_workers`` and
-            ``mask`` of `play_throws`.
+        which: Throw set, episodes, workers and mask; passed to `play_throws`.
     """
     found = []
     for number, (name, ranges) in enumerate(PERTURBATIONS.items(), 1):

@@ -311,10 +311,14 @@ def evaluate(
     config: EnvConfig,
     skin: Skin,
     *,
+    throw_set: int,
+    episodes: int,
+    num_workers: int | None = None,
     mask: Sequence[str] = (),
     on_step: Callable[[int, int], None] | None = None,
     watch: Watch | None = None,
-    **which: Any,
+    engine: Engine = "mujoco",
+    device: torch.device | str = "cpu",
 ) -> Evaluation:
     """Return the results of a policy on a throw set, with those of the rigid robot.
 
@@ -322,13 +326,30 @@ def evaluate(
         policy: Writes ``action`` into a TensorDict; None is the zero action.
         config: Robot, task (its throws are those of the throw set), sensors.
         skin: The skin.
+        throw_set: Seed of the throw set.
+        episodes: Size of the throw set.
+        num_workers: Processes; the result does not depend on it.
         mask: Links whose sensors detect nothing, or `egoskin.sensors.MASK_ALL`.
         on_step: Called with (steps done, episodes still running).
         watch: Called after every step of the policy's episodes, see `play_throws`.
-        which: ``throw_set``, ``episodes``, ``num_workers``, ``engine`` and ``device``
-            of `play_throws`.
+        engine: Physics engine.
+        device: Device of engine warp.
     """
-    seen: dict[str, Any] = {"mask": mask, "on_step": on_step, "watch": watch}
-    played = play_throws(policy, config, skin, **seen, **which)
-    rigid = play_throws(None, config, skin, hold=True, **which)
-    return summarize(played, rigid, config.task)
+
+    def play(who: Any, hold: bool) -> Episodes:
+        return play_throws(
+            who,
+            config,
+            skin,
+            throw_set=throw_set,
+            episodes=episodes,
+            num_workers=num_workers,
+            hold=hold,
+            mask=() if hold else mask,
+            on_step=None if hold else on_step,
+            watch=None if hold else watch,
+            engine=engine,
+            device=device,
+        )
+
+    return summarize(play(policy, False), play(None, True), config.task)
