@@ -415,6 +415,27 @@ def load_with_critic(path: str | Path) -> tuple[Policy, Critic | None]:
     return Policy(agent, spec), Critic(agent) if has_critic else None
 
 
+def load_networks(path: str | Path) -> tuple[dict[str, Tensor], PolicySpec]:
+    """Return the networks and normalisers of a policy or run, to train them further.
+
+    Args:
+        path: As in `load_policy`. Only the checkpoint of a run includes the critic.
+
+    Returns:
+        Tensors for `load_agent_tensors`, and the specification of their agent.
+
+    Raises:
+        ValueError: As in `load_policy`.
+    """
+    agent, spec, has_critic = _load_agent(policy_file(path))
+    tensors = {
+        name: value.detach()
+        for name, value in agent_tensors(agent).items()
+        if has_critic or not name.startswith(_CRITIC)
+    }
+    return tensors, spec
+
+
 def policy_file(path: str | Path) -> Path:
     """Return the file that `load_policy` reads.
 

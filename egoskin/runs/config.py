@@ -64,6 +64,9 @@ class TrainConfig:
     (extra wandb)."""
     checkpoint_interval: Annotated[float, POSITIVE] = 60.0
     """Maximum age of the latest checkpoint [s]."""
+    init_from: Path | None = None
+    """Policy, or run with its critic, whose networks are trained further, as on another
+    task or range. Only the networks and normalisers are taken. None: new networks."""
     config: Path | None = None
     """config.json of a run to repeat: its values are the defaults, and the skin must be
     the same."""
@@ -128,6 +131,8 @@ RESUME_FIELDS = MACHINE_FIELDS | {"total_frames"}
 """Fields that may change on resume."""
 SKIN_HASH = "skin_sha256"
 """Key of the hash of the skin in config.json, beside the configuration."""
+INIT_HASH = "init_sha256"
+"""Key of the hash of the networks that ``init_from`` named, if it did."""
 
 
 def parse_config(args: list[str]) -> TrainConfig:
@@ -227,8 +232,8 @@ def load_config(path: Path, *, quiet: bool = False) -> TrainConfig:
 
 def read_config(
     file: Path, *, quiet: bool = False
-) -> tuple[dict[str, Any], str | None]:
-    """Return (configuration in the current format, hash of the skin or None).
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return (configuration in the current format, hashes by `SKIN_HASH`, `INIT_HASH`).
 
     Args:
         file: The file.
@@ -238,5 +243,6 @@ def read_config(
         ValueError: If it is damaged, or has options that no longer exist.
     """
     content, number = read_sealed(file, quiet=quiet)
-    skin = content.pop(SKIN_HASH, None)
-    return present_config(content, number, str(file)), skin
+    names = [name for name in (SKIN_HASH, INIT_HASH) if name in content]
+    hashes = {name: content.pop(name) for name in names}
+    return present_config(content, number, str(file)), hashes

@@ -39,15 +39,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from egoskin.agents.networks import Agent
 from egoskin.make import check_fits, make_worker_env
 from egoskin.policies.policy import (
     CHECKPOINT_NAME,
     PolicySpec,
     agent_tensors,
+    check_agent_tensors,
+    load_networks,
     sparse_sources,
 )
 from egoskin.runs.config import (
     CALL_FIELDS,
+    INIT_HASH,
     RESUME_FIELDS,
     SKIN_HASH,
     TrainConfig,
@@ -105,7 +109,8 @@ class Run:
         self.path, self.config = path, config
         self._events: EventFile | None = None
         self._wandb: WandbLog | None = None
-        self._skin_hash = ""
+        # By `SKIN_HASH` and `INIT_HASH`.
+        self._hashes: dict[str, str] = {}
         # The logs so far: a line for each rollout, an entry for each start.
         self._metrics = ""
         self._starts: list[dict[str, Any]] = []
@@ -115,12 +120,16 @@ class Run:
         """Create a run folder with the configuration and the skin; return the run.
 
         Raises:
-            ValueError: If the folder is not empty, the skin is not valid or not that of
-                the run to repeat, or there is too little memory.
+            ValueError: If the folder is not empty, the skin or the networks to start
+                from are not valid, do not fit, or are not those of the run to repeat,
+                or there is too little memory.
         """
         skin = config.env.skin.build(config.env.robot_config)
-        _check_repeats(config, skin)
+        hashes = {SKIN_HASH: content_hash(_as_stored(skin))}
         _check_fits(config, skin)
+        if config.init_from is not None:
+            hashes[INIT_HASH] = content_hash({}, load_networks(config.init_from)[0])
+        _check_repeats(config, hashes)
         path = config.run_dir
         if path is None:
             kind = config.env.sensor.label()
@@ -138,7 +147,7 @@ class Run:
             skin.save(run.skin_path)
         except OSError as error:
             raise named(error, run.skin_path) from error
-        run._skin_hash = content_hash(read_json(run.skin_path))
+        run._hashes = hashes
         # Written last, because a folder with a configuration can be resumed.
         run.write_config()
         return run
@@ -153,12 +162,11 @@ class Run:
         return cls(path, load_config(path))
 
     def write_config(self) -> None:
-        """Write the configuration (again with a later end) and the skin's hash."""
+        """Write the configuration (again with a later end) and hashes of its files."""
         content = to_plain(self.config)
         for name in CALL_FIELDS:
             content[name] = None
-        content[SKIN_HASH] = self._skin_hash
-        write_file(self.path / "config.json", sealed_json(content))
+        write_file(self.path / "config.json", sealed_json({**content, **self._hashes}))
 
     def load_skin(self) -> Skin:
         """Return the skin the run was started with.
@@ -167,20 +175,38 @@ class Run:
             ValueError: If it is missing or has changed.
         """
         skin = Skin.load(self.skin_path)
-        self._skin_hash = content_hash(read_json(self.skin_path))
+        now = content_hash(read_json(self.skin_path))
         _, written = read_config(self.path / "config.json")
-        if written not in (None, self._skin_hash):
+        self._hashes = {**written, SKIN_HASH: now}
+        if written.get(SKIN_HASH, now) != now:
             raise ValueError(
                 f"{self.skin_path} is damaged or was edited: it is not the skin that "
                 "the run was started with; restore the original"
             )
         return skin
 
+    def initial_networks(self) -> dict[str, Tensor] | None:
+        """Return the tensors that the training starts from; None: new networks.
+
+        Raises:
+            ValueError: If they cannot be read or have changed.
+        """
+        path = self.config.init_from
+        if path is None:
+            return None
+        tensors, _ = load_networks(path)
+        _, written = read_config(self.path / "config.json")
+        if content_hash({}, tensors) != written[INIT_HASH]:
+            raise ValueError(
+                f"{path} is not what {self.path} was to start from: restore that file"
+            )
+        return tensors
+
     def _trained_with(self) -> dict[str, Any]:
-        """Return the configuration and skin hash that determine the results."""
+        """Return the configuration and hashes that determine the results."""
         plain = to_plain(self.config)
         content = {k: v for k, v in plain.items() if k not in RESUME_FIELDS}
-        return {**content, SKIN_HASH: self._skin_hash}
+        return {**content, **self._hashes}
 
     def _check_trained_with(self, before: Mapping[str, Any]) -> None:
         """Raise ValueError if a checkpoint was trained with another setup."""
@@ -223,7 +249,10 @@ class Run:
             self._starts = starts
         except ValueError as error:
             self._put_aside(self._versions_path, str(error))
-        packages = _PACKAGES + _WARP_PACKAGES * (self.config.engine == "warp")
+        names = _PACKAGES + _WARP_PACKAGES * (self.config.engine == "warp")
+        # The version of torch names its build; that of the installed package may not.
+        packages = {p: package_version(p) for p in names}
+        packages["torch"] = str(torch.__version__)
         self._starts.append(
             {
                 "time": datetime.datetime.now(datetime.timezone.utc).isoformat(),
@@ -231,7 +260,7 @@ class Run:
                 "python": platform.python_version(),
                 "machine": f"{platform.system()} {platform.machine()}",
                 "cores": os.cpu_count(),
-                "packages": {p: package_version(p) for p in packages},
+                "packages": packages,
                 "git": git_state(Path(__file__)),
             }
         )
@@ -419,27 +448,39 @@ class Run:
             self._wandb.close()
 
 
-def _check_repeats(config: TrainConfig, skin: Skin) -> None:
-    """Raise ValueError if the run to repeat had another skin with the same options."""
+def _as_stored(skin: Skin) -> Any:
+    """Return a skin as JSON values, as its file holds them."""
+    return json.loads(json.dumps(skin.to_dict(), default=str))
+
+
+def _check_repeats(config: TrainConfig, hashes: Mapping[str, str]) -> None:
+    """Raise ValueError if the run to repeat had other files with the same options."""
     if config.config is None:
         return
     content, before = read_config(config.config)
-    if content["env"]["skin"] != to_plain(config.env.skin):
-        return
-    # In the form of a stored file.
-    now = json.loads(json.dumps(skin.to_dict(), default=str))
-    if before not in (None, content_hash(now)):
+    if (
+        content["env"]["skin"] == to_plain(config.env.skin)
+        and before.get(SKIN_HASH, hashes[SKIN_HASH]) != hashes[SKIN_HASH]
+    ):
         raise ValueError(
             f"the skin differs from that of {config.config}: its file was changed, or "
             "sensors are placed differently here; use that run's skin: --skin.path "
             f"{config.config.parent / 'skin.json'}"
+        )
+    if content["init_from"] == to_plain(config)["init_from"] and before.get(
+        INIT_HASH
+    ) != hashes.get(INIT_HASH):
+        raise ValueError(
+            f"{config.init_from} has changed since the run of {config.config} started "
+            "from it"
         )
 
 
 def _check_fits(config: TrainConfig, skin: Skin) -> None:
     """Raise ValueError if sensors do not fit the skin or memory is too small.
 
-    This is checked here, before the workers start.
+    So if the networks to start from do not fit. This is checked here, before the
+    workers start.
     """
     sources = sparse_sources(config.env, skin)
     one = make_worker_env(
@@ -448,6 +489,8 @@ def _check_fits(config: TrainConfig, skin: Skin) -> None:
     spec = PolicySpec.of(config.env, skin, config.ppo.network, one, sources)
     with torch.device("meta"):
         agent = spec.build_agent()
+    if config.init_from is not None:
+        _check_init(agent, spec, config.init_from)
     weights = sum(value.numel() for value in agent_tensors(agent).values())
     read = sum(size for key, size in spec.sizes.items() if key not in sources)
     others = {
@@ -459,6 +502,25 @@ def _check_fits(config: TrainConfig, skin: Skin) -> None:
     }
     if config.engine == "mujoco":
         check_fits(one, config.num_envs, others)
+
+
+def _check_init(agent: Agent, spec: PolicySpec, path: Path) -> None:
+    """Raise ValueError unless an agent can start from the networks of a policy."""
+    tensors, other = load_networks(path)
+    robot, theirs = (s.env.robot_config.name for s in (spec, other))
+    if robot != theirs:
+        raise ValueError(f"{path} is a policy for {theirs}, not for {robot}")
+    if other.network.hidden != spec.network.hidden:
+        raise ValueError(
+            f"{path} has layers of {list(other.network.hidden)}, not of "
+            f"{list(spec.network.hidden)} (ppo.network.hidden)"
+        )
+    for key, size in spec.sizes.items():
+        if (given := other.sizes.get(key, 0)) != size:
+            raise ValueError(
+                f"{path} reads {given} values of {key!r}, but here there are {size}"
+            )
+    check_agent_tensors(agent_tensors(agent), tensors, str(path))
 
 
 def _a(kind: type[T], value: Any, name: str, what: str) -> T:

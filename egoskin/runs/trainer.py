@@ -106,7 +106,13 @@ class Trainer:
         self.root: TensorDictBase = TensorDict()
 
     def start(self) -> None:
-        """Start a new run: reset, and save the first policy and checkpoint."""
+        """Start a new run: reset, and save the first policy and checkpoint.
+
+        Raises:
+            ValueError: If the networks to start from cannot be read or have changed.
+        """
+        if (initial := self.run.initial_networks()) is not None:
+            load_agent_tensors(self.agent, initial, str(self.config.init_from))
         self.root = self.env.reset()
         self.keep_policy()
         self.save()

@@ -330,6 +330,20 @@ def test_a_run_of_format_4_was_simulated_by_mujoco(run: Path, monkeypatch):
     assert egoskin.load_policy(run).policy_spec.engine == "mujoco"
 
 
+def test_a_run_of_format_5_started_from_new_networks(run: Path, monkeypatch):
+    config, checkpoint = run / "config.json", run / "checkpoint.safetensors"
+    content, _ = read_sealed(config)
+    tensors, header = load_tensors(checkpoint)
+    for part in (content, header["config"]):
+        assert part.pop("init_from") is None
+    with monkeypatch.context() as patch:
+        patch.setattr("egoskin.storage.formats.FORMAT", 5)
+        config.write_bytes(sealed_json(content))
+        save_tensors(checkpoint, tensors, header)
+    assert read_sealed(config)[1] == 5
+    resume(run)
+
+
 @pytest.mark.parametrize(
     ("name", "gone", "effect"),
     [
