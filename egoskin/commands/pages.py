@@ -24,12 +24,12 @@ Train a robot to dodge balls with a skin of proximity sensors.
   --seed INT              seed of all random numbers (0)
   --total-frames INT      environment steps of the whole run (65536000)
   --run-dir PATH          folder of the run; else a new one under runs/
-  --init-from PATH        run or policy whose networks are trained further
   --resume PATH           run folder to resume, bit for bit
 
   egoskin train --sensor.signal binary --sensor.range 1 --seed 1
   egoskin train --resume runs/NAME --total-frames 100e6
   egoskin train --config runs/NAME/config.json --seed 2
+  egoskin train --init-from field_proximity --task.randomization.friction 0.4 1
   egoskin train --film-every 5e6 --log wandb
   egoskin train --engine warp --device cuda
 """,

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
 import math
-import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Annotated
@@ -383,6 +383,7 @@ class DodgeballEnv(EnvBase):
 
 
 if DodgeballEnv.__doc__:
-    DodgeballEnv.__doc__ = DodgeballEnv.__doc__.replace(
-        "    STATE\n", textwrap.indent(state_table(), "    ") + "\n"
+    # Python removes the indentation of docstrings, from 3.13 on.
+    DodgeballEnv.__doc__ = inspect.cleandoc(DodgeballEnv.__doc__).replace(
+        "STATE", state_table()
     )
