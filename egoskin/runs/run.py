@@ -126,9 +126,11 @@ class Run:
         """
         skin = config.env.skin.build(config.env.robot_config)
         hashes = {SKIN_HASH: content_hash(_as_stored(skin))}
-        _check_fits(config, skin)
+        initial = None
         if config.init_from is not None:
-            hashes[INIT_HASH] = content_hash({}, load_networks(config.init_from)[0])
+            initial = load_networks(config.init_from)
+            hashes[INIT_HASH] = content_hash({}, initial[0])
+        _check_fits(config, skin, initial)
         _check_repeats(config, hashes)
         path = config.run_dir
         if path is None:
@@ -476,7 +478,11 @@ def _check_repeats(config: TrainConfig, hashes: Mapping[str, str]) -> None:
         )
 
 
-def _check_fits(config: TrainConfig, skin: Skin) -> None:
+def _check_fits(
+    config: TrainConfig,
+    skin: Skin,
+    initial: tuple[dict[str, Tensor], PolicySpec] | None,
+) -> None:
     """Raise ValueError if sensors do not fit the skin or memory is too small.
 
     So if the networks to start from do not fit. This is checked here, before the
@@ -489,8 +495,8 @@ def _check_fits(config: TrainConfig, skin: Skin) -> None:
     spec = PolicySpec.of(config.env, skin, config.ppo.network, one, sources)
     with torch.device("meta"):
         agent = spec.build_agent()
-    if config.init_from is not None:
-        _check_init(agent, spec, config.init_from)
+    if initial is not None:
+        _check_init(agent, spec, *initial, str(config.init_from))
     weights = sum(value.numel() for value in agent_tensors(agent).values())
     read = sum(size for key, size in spec.sizes.items() if key not in sources)
     others = {
@@ -504,9 +510,14 @@ def _check_fits(config: TrainConfig, skin: Skin) -> None:
         check_fits(one, config.num_envs, others)
 
 
-def _check_init(agent: Agent, spec: PolicySpec, path: Path) -> None:
-    """Raise ValueError unless an agent can start from the networks of a policy."""
-    tensors, other = load_networks(path)
+def _check_init(
+    agent: Agent,
+    spec: PolicySpec,
+    tensors: Mapping[str, Tensor],
+    other: PolicySpec,
+    path: str,
+) -> None:
+    """Raise ValueError unless an agent can start from what `load_networks` returned."""
     robot, theirs = (s.env.robot_config.name for s in (spec, other))
     if robot != theirs:
         raise ValueError(f"{path} is a policy for {theirs}, not for {robot}")
@@ -520,7 +531,7 @@ def _check_init(agent: Agent, spec: PolicySpec, path: Path) -> None:
             raise ValueError(
                 f"{path} reads {given} values of {key!r}, but here there are {size}"
             )
-    check_agent_tensors(agent_tensors(agent), tensors, str(path))
+    check_agent_tensors(agent_tensors(agent), tensors, path)
 
 
 def _a(kind: type[T], value: Any, name: str, what: str) -> T:

@@ -314,33 +314,33 @@ def test_a_migration_leaves_alone_what_is_there_and_makes_no_parts():
     assert migrate(now, FORMAT) == (now, {})
 
 
-def test_a_run_of_format_4_was_simulated_by_mujoco(run: Path, monkeypatch):
+def rewrite_as_format(
+    number: int, run: Path, field: str, value: Any, monkeypatch, *, in_policy: bool
+):
+    """Write a run in an older format, which lacks a field of this value."""
     config, checkpoint = run / "config.json", run / "checkpoint.safetensors"
     content, _ = read_sealed(config)
     tensors, header = load_tensors(checkpoint)
-    for part in (content, header["config"], header["policy"]):
-        assert part.pop("engine") == "mujoco"
+    holders = [content, header["config"]]
+    holders += [header["policy"]] * in_policy
+    for part in holders:
+        assert part.pop(field) == value
     with monkeypatch.context() as patch:
-        patch.setattr("egoskin.storage.formats.FORMAT", 4)
+        patch.setattr("egoskin.storage.formats.FORMAT", number)
         config.write_bytes(sealed_json(content))
         save_tensors(checkpoint, tensors, header)
-    assert read_sealed(config)[1] == 4
+    assert read_sealed(config)[1] == number
+
+
+def test_a_run_of_format_4_was_simulated_by_mujoco(run: Path, monkeypatch):
+    rewrite_as_format(4, run, "engine", "mujoco", monkeypatch, in_policy=True)
     resume(run)
     assert Run.open(run).config.engine == "mujoco"
     assert egoskin.load_policy(run).policy_spec.engine == "mujoco"
 
 
 def test_a_run_of_format_5_started_from_new_networks(run: Path, monkeypatch):
-    config, checkpoint = run / "config.json", run / "checkpoint.safetensors"
-    content, _ = read_sealed(config)
-    tensors, header = load_tensors(checkpoint)
-    for part in (content, header["config"]):
-        assert part.pop("init_from") is None
-    with monkeypatch.context() as patch:
-        patch.setattr("egoskin.storage.formats.FORMAT", 5)
-        config.write_bytes(sealed_json(content))
-        save_tensors(checkpoint, tensors, header)
-    assert read_sealed(config)[1] == 5
+    rewrite_as_format(5, run, "init_from", None, monkeypatch, in_policy=False)
     resume(run)
 
 
