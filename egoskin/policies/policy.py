@@ -276,12 +276,12 @@ def check_finite(agent: Agent, what: str) -> None:
 
 def save_policy(path: Path, agent: Agent, spec: PolicySpec) -> None:
     """Write the actor of an agent as a self-contained policy file."""
-    tensors = {
-        name: value
-        for name, value in agent_tensors(agent).items()
-        if not name.startswith(_CRITIC)
-    }
-    save_tensors(path, prefixed("agent", tensors), {"policy": spec.header()})
+    tensors = prefixed("agent", _without_critic(agent_tensors(agent)))
+    save_tensors(path, tensors, {"policy": spec.header()})
+
+
+def _without_critic(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {n: value for n, value in tensors.items() if not n.startswith(_CRITIC)}
 
 
 class Policy(TensorDictModuleBase):
@@ -428,12 +428,8 @@ def load_networks(path: str | Path) -> tuple[dict[str, Tensor], PolicySpec]:
         ValueError: As in `load_policy`.
     """
     agent, spec, has_critic = _load_agent(policy_file(path))
-    tensors = {
-        name: value.detach()
-        for name, value in agent_tensors(agent).items()
-        if has_critic or not name.startswith(_CRITIC)
-    }
-    return tensors, spec
+    tensors = {name: value.detach() for name, value in agent_tensors(agent).items()}
+    return tensors if has_critic else _without_critic(tensors), spec
 
 
 def policy_file(path: str | Path) -> Path:

@@ -1,0 +1,131 @@
+"""Networks of a policy or run, trained further in another run: ``--init-from``."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from egoskin.runs.config import parse_config
+from egoskin.runs.run import Run
+from egoskin.runs.trainer import Trainer, open_trainer, train
+from egoskin.storage.formats import read_sealed
+from egoskin.storage.tensor_file import load_tensors
+from making import blind_run
+
+
+def networks_of(file: Path) -> dict[str, torch.Tensor]:
+    """Return the tensors of the networks in a policy or checkpoint."""
+    tensors, _ = load_tensors(file)
+    return {name: value for name, value in tensors.items() if "agent/" in name}
+
+
+def test_a_run_goes_on_from_the_networks_of_another(trained: Trainer, tmp_path: Path):
+    first = trained.run.path
+    config = blind_run(tmp_path / "run", 64)
+    run = Run.create(replace(config, init_from=first, seed=5))
+    with open_trainer(run) as trainer:
+        assert trainer.frames == 0
+        # Nothing else is taken.
+        assert trainer.ppo.state() == {}
+        assert trainer.ppo.learning_rate == config.ppo.learning_rate
+        start = networks_of(run.checkpoint_path)
+        train(trainer)
+    before = networks_of(first / "checkpoint.safetensors")
+    assert any(name.startswith("agent/critic.") for name in before)
+    torch.testing.assert_close(start, before, rtol=0, atol=0)
+    now = networks_of(run.checkpoint_path)
+    assert all((now[n] != before[n]).any() for n in before if n.endswith("weight"))
+
+
+def test_a_policy_has_no_critic_to_go_on_from(trained: Trainer, tmp_path: Path):
+    policy = trained.run.policy_path(64)
+    runs = {
+        name: Run.create(replace(blind_run(tmp_path / name, 64), init_from=path))
+        for name, path in {"new": None, "on": policy}.items()
+    }
+    for run in runs.values():
+        with open_trainer(run):
+            pass
+    new, on = (networks_of(run.checkpoint_path) for run in runs.values())
+    critic = {name for name in on if name.startswith("agent/critic.")}
+    assert critic == on.keys() - networks_of(policy).keys()
+    for name, value in {**networks_of(policy), **{n: new[n] for n in critic}}.items():
+        assert torch.equal(on[name], value), name
+
+
+def test_a_resumed_run_needs_no_longer_what_it_started_from(
+    trained: Trainer, tmp_path: Path
+):
+    policy = tmp_path / "policy.safetensors"
+    policy.write_bytes(trained.run.policy_path(64).read_bytes())
+    config = blind_run(tmp_path / "run", 128)
+    run = Run.create(replace(config, init_from=policy))
+    with open_trainer(run) as trainer:
+        trainer.iterate()
+        trainer.save()
+    policy.unlink()
+    resumed = Run(run.path, parse_config(["--resume", str(run.path)]))
+    with open_trainer(resumed) as trainer:
+        assert trainer.frames == 64
+        train(trainer)
+        now = networks_of(run.checkpoint_path)
+    policy.write_bytes(trained.run.policy_path(64).read_bytes())
+    whole = Run.create(
+        replace(config, init_from=policy, run_dir=tmp_path / "undisturbed")
+    )
+    with open_trainer(whole) as trainer:
+        train(trainer)
+    torch.testing.assert_close(now, networks_of(whole.checkpoint_path), rtol=0, atol=0)
+
+
+def test_other_networks_than_those_of_the_run_are_refused(
+    trained: Trainer, tmp_path: Path
+):
+    policy = tmp_path / "policy.safetensors"
+    policy.write_bytes(trained.run.policy_path(64).read_bytes())
+    config = replace(blind_run(tmp_path / "run", 64), init_from=policy)
+    run = Run.create(config)
+    # Another policy with the same name, before the first checkpoint.
+    policy.write_bytes(trained.run.policy_path(0).read_bytes())
+    with (
+        pytest.raises(ValueError, match=r"policy\.safetensors is not what .*run was"),
+        open_trainer(run),
+    ):
+        pass
+    again = [
+        "--config",
+        str(run.path / "config.json"),
+        "--run-dir",
+        str(tmp_path / "2"),
+    ]
+    with pytest.raises(ValueError, match=r"policy\.safetensors has changed since"):
+        Run.create(parse_config(again))
+    other = [*again, "--init-from", str(trained.run.policy_path(0))]
+    Run.create(parse_config(other))
+    new = Run.create(
+        parse_config([*again[:3], str(tmp_path / "3"), "--init-from=None"])
+    )
+    assert "init_sha256" not in read_sealed(new.path / "config.json")[0]
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        (["--ppo.network.hidden", "16"], r"has layers of \[32, 32\], not of \[16\]"),
+        (["--robot", "g1"], "is a policy for h1_2, not for g1"),
+        (["--history", "2"], "reads 48 values of 'observation', but here there are 96"),
+        (["--privileged", "velocity"], "reads 50 values of 'privileged_observation'"),
+        (["--init-from", "nowhere"], "no policy nowhere"),
+    ],
+)
+def test_networks_that_do_not_fit_are_refused_before_anything_is_made(
+    options, text, tmp_path: Path
+):
+    folder = tmp_path / "run"
+    args = ["--init-from", "field_proximity", "--num-envs", "64", "--run-dir"]
+    with pytest.raises(ValueError, match=text):
+        Run.create(parse_config([*args, str(folder), *options]))
+    assert not folder.exists()
