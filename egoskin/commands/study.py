@@ -203,7 +203,7 @@ class Run:
     ray_address: str = "auto"
     """Address of the Ray cluster, ``host:port``; auto: the cluster of this machine."""
     parallel: Annotated[int | None, COUNT] = None
-    """Number of parallel runs; None: enough to use all cores."""
+    """Maximum number of parallel runs; None: enough to use all cores."""
     cores_per_run: Annotated[int | None, COUNT] = None
     """Workers and learner threads of each run; None: measured, half a minute for each
     choice, unless the whole study is short (results do not depend on it)."""
@@ -235,12 +235,15 @@ class Run:
             start, end = ("\r", "\x1b[K") if live else ("", "\n")
             print(f"{start}{text}", end=end, flush=True)
 
-        kind, cores = self._where()
-        per_run = self.cores_per_run or self._cores_per_run(folder, cores)
+        kind = self._where()
+        cores_per_run = self.cores_per_run or self._cores_per_run(folder)
+        parallel = self.parallel
+        if kind is LocalRunner and parallel is None:
+            parallel = max(available_cores() // cores_per_run, 1)
         runner = kind(
             folder,
-            parallel=self.parallel or max(cores // per_run, 1),
-            cores_per_run=per_run,
+            parallel=parallel,
+            cores_per_run=cores_per_run,
             tries=self.tries,
             nice=self.nice,
             show=show,
@@ -252,24 +255,26 @@ class Run:
             raise SystemExit(1)
         print(f"done; now: egoskin study report {self.dir}")
 
-    def _cores_per_run(self, folder: StudyFolder, cores: int) -> int:
+    def _cores_per_run(self, folder: StudyFolder) -> int:
         """Return the number of cores per run with the highest total throughput."""
         status = folder.status(folder.manifest())
         left = [each for each in status if each.state != "done"]
         frames = sum(each.run.end - each.frames for each in left)
         if self.on != "local" or self.parallel or frames < _WORTH_MEASURING:
             return 1
-        return fastest(measure_all(left[0].run, cores, _tell)).cores_per_run
+        measured = measure_all(left[0].run, available_cores(), _tell)
+        return fastest(measured).cores_per_run
 
-    def _where(self) -> tuple[type[Runner], int]:
-        """Return the runner for the study, and its number of cores."""
+    def _where(self) -> type[Runner]:
+        """Return the runner for the study."""
         if self.on == "local":
-            return LocalRunner, available_cores()
+            return LocalRunner
         check_packages("--on ray", "ray", "ray")
         # Imported here, because only this option needs Ray.
         from egoskin.study.ray_runner import RayRunner, connect
 
-        return RayRunner, connect(self.ray_address)
+        connect(self.ray_address)
+        return RayRunner
 
 
 @dataclass(frozen=True, kw_only=True)

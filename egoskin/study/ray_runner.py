@@ -40,8 +40,8 @@ _ANSWER_S = 10.0
 _LET_LIVE = {"RAY_kill_child_processes_on_worker_exit": "false"}
 
 
-def connect(address: str) -> int:
-    """Connect to an existing cluster; return its number of cores.
+def connect(address: str) -> None:
+    """Connect to an existing cluster.
 
     Args:
         address: Its address, ``host:port``, or "auto": the cluster of this machine.
@@ -72,11 +72,13 @@ def connect(address: str) -> int:
     finally:
         # Ray's handler would end this process with another exit status.
         signal.signal(signal.SIGTERM, handler)
-    return int(ray.cluster_resources().get("CPU", 1))
 
 
 class RayRunner(Runner):
     """Runner on the cluster that `connect` has connected to.
+
+    Unless ``parallel`` limits them, Ray gets a task for every run that is left and
+    starts as many as there are cores, also when the cluster grows or shrinks.
 
     Raises:
         ValueError: If no node has enough cores for a run.
@@ -105,14 +107,17 @@ class RayRunner(Runner):
         self._tasks[run.name] = task.remote(path, run.name, self._nice, self._cores)
 
     def _ended(self) -> dict[str, tuple[int, str]]:
+        if not self._tasks:
+            return {}
+        names = {task: name for name, task in self._tasks.items()}
         found = {}
-        for name, task in list(self._tasks.items()):
-            if ray.wait([task], timeout=0)[0]:
-                del self._tasks[name]
-                try:
-                    found[name] = ray.get(task)
-                except RayError as error:
-                    found[name] = FAILED, _lines(error)[-1]
+        for task in ray.wait(list(names), num_returns=len(names), timeout=0)[0]:
+            name = names[task]
+            del self._tasks[name]
+            try:
+                found[name] = ray.get(task)
+            except RayError as error:
+                found[name] = FAILED, _lines(error)[-1]
         return found
 
     def _stop(self) -> None:

@@ -81,7 +81,7 @@ class Runner(ABC):
 
     Args:
         folder: The study.
-        parallel: Number of parallel runs.
+        parallel: Maximum number of parallel runs; None: there is no maximum.
         tries: Maximum number of attempts for each run.
         nice: Niceness of the runs.
         cores_per_run: Workers and learner threads of each run.
@@ -92,7 +92,7 @@ class Runner(ABC):
         self,
         folder: StudyFolder,
         *,
-        parallel: int,
+        parallel: int | None = None,
         tries: int = 3,
         nice: int = 5,
         cores_per_run: int = 1,
@@ -162,7 +162,7 @@ class Runner(ABC):
 
     def _start(self, open_runs: list[PlannedRun]) -> None:
         for run in open_runs:
-            if len(self._running()) >= self._parallel:
+            if self._parallel and len(self._running()) >= self._parallel:
                 return
             clock = time.monotonic()
             if self._again.get(run.name, clock) > clock:

@@ -94,6 +94,16 @@ def test_a_node_that_is_lost_costs_no_run(cluster, study, start, undisturbed):
     assert table(study) == undisturbed
 
 
+def test_a_node_that_joins_later_is_used(cluster, study, start, undisturbed):
+    cluster.remove_node(cluster.list_all_nodes()[-1])
+    runner = start(study.path, *on(cluster))
+    wait_for(lambda: len(claimed_runs(study)) == 1)
+    cluster.add_node(num_cpus=1)
+    wait_for(lambda: len(claimed_runs(study)) == 2)
+    assert runner.end() == 0, runner.text()
+    assert table(study) == undisturbed
+
+
 def test_a_runner_that_is_killed_ends_its_tasks(cluster, study, start, undisturbed):
     runner = start(study.path, *on(cluster))
     wait_for(lambda: in_the_middle(study))
