@@ -12,9 +12,9 @@ from making import blind_run
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory) -> Iterator[Trainer]:
+def finished(tmp_path_factory) -> Iterator[Trainer]:
     """A trainer after one rollout of 64 frames."""
-    run = Run.create(blind_run(tmp_path_factory.mktemp("trained") / "run", 64))
+    run = Run.create(blind_run(tmp_path_factory.mktemp("finished") / "run", 64))
     with open_trainer(run) as trainer:
         train(trainer)
         yield trainer

@@ -22,8 +22,8 @@ def networks_of(file: Path) -> dict[str, torch.Tensor]:
     return {name: value for name, value in tensors.items() if "agent/" in name}
 
 
-def test_a_run_goes_on_from_the_networks_of_another(trained: Trainer, tmp_path: Path):
-    first = trained.run.path
+def test_a_run_goes_on_from_the_networks_of_another(finished: Trainer, tmp_path: Path):
+    first = finished.run.path
     config = blind_run(tmp_path / "run", 64)
     run = Run.create(replace(config, init_from=first, seed=5))
     with open_trainer(run) as trainer:
@@ -40,8 +40,8 @@ def test_a_run_goes_on_from_the_networks_of_another(trained: Trainer, tmp_path: 
     assert all((now[n] != before[n]).any() for n in before if n.endswith("weight"))
 
 
-def test_a_policy_has_no_critic_to_go_on_from(trained: Trainer, tmp_path: Path):
-    policy = trained.run.policy_path(64)
+def test_a_policy_has_no_critic_to_go_on_from(finished: Trainer, tmp_path: Path):
+    policy = finished.run.policy_path(64)
     runs = {
         name: Run.create(replace(blind_run(tmp_path / name, 64), init_from=path))
         for name, path in {"new": None, "on": policy}.items()
@@ -57,10 +57,10 @@ def test_a_policy_has_no_critic_to_go_on_from(trained: Trainer, tmp_path: Path):
 
 
 def test_a_resumed_run_needs_no_longer_what_it_started_from(
-    trained: Trainer, tmp_path: Path
+    finished: Trainer, tmp_path: Path
 ):
     policy = tmp_path / "policy.safetensors"
-    policy.write_bytes(trained.run.policy_path(64).read_bytes())
+    policy.write_bytes(finished.run.policy_path(64).read_bytes())
     config = blind_run(tmp_path / "run", 128)
     run = Run.create(replace(config, init_from=policy))
     with open_trainer(run) as trainer:
@@ -72,7 +72,7 @@ def test_a_resumed_run_needs_no_longer_what_it_started_from(
         assert trainer.frames == 64
         train(trainer)
         now = networks_of(run.checkpoint_path)
-    policy.write_bytes(trained.run.policy_path(64).read_bytes())
+    policy.write_bytes(finished.run.policy_path(64).read_bytes())
     whole = Run.create(
         replace(config, init_from=policy, run_dir=tmp_path / "undisturbed")
     )
@@ -82,14 +82,14 @@ def test_a_resumed_run_needs_no_longer_what_it_started_from(
 
 
 def test_other_networks_than_those_of_the_run_are_refused(
-    trained: Trainer, tmp_path: Path
+    finished: Trainer, tmp_path: Path
 ):
     policy = tmp_path / "policy.safetensors"
-    policy.write_bytes(trained.run.policy_path(64).read_bytes())
+    policy.write_bytes(finished.run.policy_path(64).read_bytes())
     config = replace(blind_run(tmp_path / "run", 64), init_from=policy)
     run = Run.create(config)
     # Another policy with the same name, before the first checkpoint.
-    policy.write_bytes(trained.run.policy_path(0).read_bytes())
+    policy.write_bytes(finished.run.policy_path(0).read_bytes())
     with (
         pytest.raises(ValueError, match=r"policy\.safetensors is not what .*run was"),
         open_trainer(run),
@@ -103,7 +103,7 @@ def test_other_networks_than_those_of_the_run_are_refused(
     ]
     with pytest.raises(ValueError, match=r"policy\.safetensors has changed since"):
         Run.create(parse_config(again))
-    other = [*again, "--init-from", str(trained.run.policy_path(0))]
+    other = [*again, "--init-from", str(finished.run.policy_path(0))]
     Run.create(parse_config(other))
     new = Run.create(
         parse_config([*again[:3], str(tmp_path / "3"), "--init-from=None"])

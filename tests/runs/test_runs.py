@@ -331,11 +331,11 @@ def full_disk() -> Iterator[None]:
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_a_full_disk_names_the_file(write, name: str, trained: Trainer):
+def test_a_full_disk_names_the_file(write, name: str, finished: Trainer):
     with pytest.raises(OSError, match="File too large") as error, full_disk():
-        write(trained)
+        write(finished)
     assert Path(str(error.value.filename)).name.startswith(name)
-    assert not list(trained.run.path.rglob(PARTIAL))
+    assert not list(finished.run.path.rglob(PARTIAL))
 
 
 def test_a_folder_renamed_while_it_trains_ends_with_one_clear_error(
@@ -380,18 +380,18 @@ def test_a_folder_renamed_while_it_trains_ends_with_one_clear_error(
     ],
 )
 def test_a_tensor_that_does_not_fit_is_named_before_anything_is_loaded(
-    name, value, message, trained: Trainer
+    name, value, message, finished: Trainer
 ):
-    tensors, header = trained.run.load_checkpoint()
-    before = trained.agent.head.log_std.detach().clone()
+    tensors, header = finished.run.load_checkpoint()
+    before = finished.agent.head.log_std.detach().clone()
     tensors["agent/head.log_std"] = before / 2
     if value is None:
         del tensors[name]
     else:
         tensors[name] = value
     with pytest.raises(ValueError, match=message):
-        trained.load(tensors, header)
-    assert torch.equal(trained.agent.head.log_std, before)
+        finished.load(tensors, header)
+    assert torch.equal(finished.agent.head.log_std, before)
 
 
 @pytest.mark.parametrize(
@@ -405,20 +405,20 @@ def test_a_tensor_that_does_not_fit_is_named_before_anything_is_loaded(
         ("learning_rate", [1]),
     ],
 )
-def test_a_header_that_no_training_writes_is_refused(name, value, trained: Trainer):
-    tensors, header = trained.run.load_checkpoint()
+def test_a_header_that_no_training_writes_is_refused(name, value, finished: Trainer):
+    tensors, header = finished.run.load_checkpoint()
     if value is None:
         del header[name]
     else:
         header[name] = value
     with pytest.raises(ValueError, match=name):
-        trained.load(tensors, header)
+        finished.load(tensors, header)
 
 
 # --- what is logged -----------------------------------------------------------------
 
 
-def test_an_episode_ends_by_one_cause(trained: Trainer):
+def test_an_episode_ends_by_one_cause(finished: Trainer):
     flags = {k: torch.zeros(4, dtype=torch.bool) for k in METRIC_KEYS}
     # Of four: hit and thrown over; hit; fallen; and one that goes on.
     flags["hit"][:2] = True
@@ -429,7 +429,7 @@ def test_an_episode_ends_by_one_cause(trained: Trainer):
         info[key] = torch.zeros(1, 4, 1, dtype=torch.int64)
     info["reward"] = torch.zeros(1, 4, 1)
     info["reward_terms"] = torch.zeros(1, 4, len(TERMS))
-    metrics = trained._episode_metrics(info)
+    metrics = finished._episode_metrics(info)
     assert metrics["episode/ended_by_ball"] == pytest.approx(2 / 3)
     assert metrics["episode/ended_by_fall"] == pytest.approx(1 / 3)
 
