@@ -26,6 +26,9 @@ SCRIPTS = [calling.SCRIPTS / "ppo.py", calling.SCRIPTS / "evaluate.py"]
 def handlers() -> Iterator[None]:
     """Restore pytest's signal handlers after each test."""
     before = {number: signal.getsignal(number) for number in ENDING}
+    # Ignored signals remain ignored; nohup ignores this one.
+    if before[signal.SIGHUP] is signal.SIG_IGN:
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
     say.cache_clear()
     yield
     for number, handler in before.items():
