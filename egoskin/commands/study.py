@@ -236,14 +236,10 @@ class Run:
             print(f"{start}{text}", end=end, flush=True)
 
         kind = self._where()
-        cores_per_run = self.cores_per_run or self._cores_per_run(folder)
-        parallel = self.parallel
-        if kind is LocalRunner and parallel is None:
-            parallel = max(available_cores() // cores_per_run, 1)
         runner = kind(
             folder,
-            parallel=parallel,
-            cores_per_run=cores_per_run,
+            parallel=self.parallel,
+            cores_per_run=self.cores_per_run or self._cores_per_run(folder),
             tries=self.tries,
             nice=self.nice,
             show=show,

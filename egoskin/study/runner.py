@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from egoskin.parallel import available_cores
 from egoskin.progress import duration
 from egoskin.study.job import CLAIMED, STOPPED, command
 from egoskin.study.manifest import Manifest, PlannedRun
@@ -81,7 +82,7 @@ class Runner(ABC):
 
     Args:
         folder: The study.
-        parallel: Maximum number of parallel runs; None: there is no maximum.
+        parallel: Maximum number of parallel runs; None: as many as there are cores for.
         tries: Maximum number of attempts for each run.
         nice: Niceness of the runs.
         cores_per_run: Workers and learner threads of each run.
@@ -189,6 +190,8 @@ class LocalRunner(Runner):
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
+        if self._parallel is None:
+            self._parallel = max(available_cores() // self._cores, 1)
         self._jobs: dict[str, subprocess.Popen[bytes]] = {}
 
     def _running(self) -> Collection[str]:
