@@ -16,19 +16,17 @@ import onnxruntime
 class Controller:
     """Runs an exported policy; call `step` once per control step.
 
-    The controller stops, and stays stopped, when the body state or the distances are
-    too old, when state or action are not finite, or when too many distances are missing
-    (a missing one counts as no detection). `stopped` then holds the reason, and `step`
-    returns the last target; the motor driver decides what to do (for example, damp).
-    `metadata` holds the file's description of robot, skin and policy.
+    It stops, and stays stopped, when body state or distances are too old, state or
+    action are not finite, or too many distances are missing (a missing one counts as no
+    detection). `stopped` then holds the reason, and `step` returns the last target.
+    `metadata` is the file's description of robot, skin and policy.
 
     Args:
         path: The exported policy.
         max_age: Stop when states or distances are older than this [s].
         max_missing: Stop when more than this share of the distances is missing.
         margin: How far targets may lie outside the joint ranges, in units of torque
-            limit / kp. This is the position error that commands full torque, which
-            policies request in this way.
+            limit / kp, the position error that commands full torque.
         max_change: Largest change of targets per control step, in the same unit.
 
     Raises:
@@ -94,9 +92,8 @@ class Controller:
             joint_pos: Joint positions in the file's order [rad], ``[J]``.
             joint_vel: Joint velocities [rad/s], ``[J]``.
             body_age: Age of these measurements [s].
-            distance: Distances measured by the sensors [m], inf for no detection, NaN
-                if missing: ``[S]``, or ``[S, K]`` for grids. Not needed by a blind
-                policy.
+            distance: Distances of the sensors [m], inf for no detection, NaN if
+                missing: ``[S]``, or ``[S, K]`` for grids; None for a blind policy.
             skin_age: Age of the distances [s].
         """
         w, x, y, z = base_quat  # of the rotation R; gravity_b = R^T (0, 0, -1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 import runpy
 import subprocess
@@ -230,6 +231,10 @@ print(sorted(name for name in sys.modules if name.startswith("egoskin")))
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
     assert done.stdout == "['egoskin', 'egoskin.deploy']\n"
+
+
+def test_it_is_short_enough_to_be_read_before_it_moves_a_robot():
+    assert len(Path(inspect.getfile(Controller)).read_text().splitlines()) <= 150
 
 
 # --- the example ------------------------------------------------------------------
