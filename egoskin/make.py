@@ -260,7 +260,7 @@ def make_env(
     )
     assert isinstance(one.base_env, DodgeballEnv)
     one.base_env.check_scene()
-    check_fits(one, num_envs)
+    check_env_memory(one, num_envs)
     rows = num_envs // workers
     return WorkerPool(
         [
@@ -282,7 +282,7 @@ def make_env(
     )
 
 
-def check_fits(
+def check_env_memory(
     one: EnvBase, num_envs: int, others: Mapping[str, int] | None = None
 ) -> None:
     """Raise ValueError if an environment does not fit into the machine's memory.

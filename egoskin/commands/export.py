@@ -16,7 +16,7 @@ import egoskin.policies.export
 from egoskin.commands.errors import check_packages
 from egoskin.policies.export import export_onnx, observation_parts
 from egoskin.policies.policy import load_policy
-from egoskin.runs.run import git_state
+from egoskin.runs.starts import git_state
 from egoskin.storage.files import check_output
 from egoskin.storage.tensor_file import write_file
 

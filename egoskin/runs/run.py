@@ -27,8 +27,6 @@ import io
 import itertools
 import json
 import os
-import platform
-import subprocess
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -39,16 +37,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from egoskin.agents.networks import Agent
-from egoskin.make import check_fits, make_worker_env
 from egoskin.policies.policy import (
     CHECKPOINT_NAME,
-    PolicySpec,
-    agent_tensors,
-    check_agent_tensors,
     load_networks,
-    sparse_sources,
 )
+from egoskin.runs.checks import check_fits, check_repeats
 from egoskin.runs.config import (
     CALL_FIELDS,
     INIT_HASH,
@@ -59,12 +52,12 @@ from egoskin.runs.config import (
     read_config,
 )
 from egoskin.runs.events import EventFile
+from egoskin.runs.starts import describe_start
 from egoskin.runs.wandb_log import WandbLog
 from egoskin.sensors import Skin
 from egoskin.storage.files import read_regular
 from egoskin.storage.formats import (
     content_hash,
-    package_version,
     sealed_json,
     unseal,
 )
@@ -83,11 +76,6 @@ from egoskin.storage.tensor_file import (
 )
 
 T = TypeVar("T")
-
-_PACKAGES = ("egoskin", "torch", "torchrl", "tensordict", "mujoco", "numpy")
-_PACKAGES += ("pytorch-kinematics", "gymnasium")
-_WARP_PACKAGES = ("mujoco-warp", "warp-lang")
-
 
 # Name of the metrics tensor in a checkpoint.
 _METRICS = "log/metrics"
@@ -130,8 +118,8 @@ class Run:
         if config.init_from is not None:
             initial = load_networks(config.init_from)
             hashes[INIT_HASH] = content_hash({}, initial[0])
-        _check_fits(config, skin, initial)
-        _check_repeats(config, hashes)
+        check_fits(config, skin, initial)
+        check_repeats(config, hashes)
         path = config.run_dir
         if path is None:
             kind = config.env.sensor.label()
@@ -251,21 +239,7 @@ class Run:
             self._starts = starts
         except ValueError as error:
             self._put_aside(self._versions_path, str(error))
-        names = _PACKAGES + _WARP_PACKAGES * (self.config.engine == "warp")
-        # The version of torch names its build; that of the installed package may not.
-        packages = {p: package_version(p) for p in names}
-        packages["torch"] = str(torch.__version__)
-        self._starts.append(
-            {
-                "time": datetime.datetime.now(datetime.timezone.utc).isoformat(),
-                "command": sys.argv,
-                "python": platform.python_version(),
-                "machine": f"{platform.system()} {platform.machine()}",
-                "cores": os.cpu_count(),
-                "packages": packages,
-                "git": git_state(Path(__file__)),
-            }
-        )
+        self._starts.append(describe_start(self.config.engine))
         write_file(self._versions_path, sealed_json({"starts": self._starts}))
 
     def _put_aside(self, path: Path, why: str) -> None:
@@ -455,85 +429,6 @@ def _as_stored(skin: Skin) -> Any:
     return json.loads(json.dumps(skin.to_dict(), default=str))
 
 
-def _check_repeats(config: TrainConfig, hashes: Mapping[str, str]) -> None:
-    """Raise ValueError if the run to repeat had other files with the same options."""
-    if config.config is None:
-        return
-    content, before = read_config(config.config)
-    if (
-        content["env"]["skin"] == to_plain(config.env.skin)
-        and before.get(SKIN_HASH, hashes[SKIN_HASH]) != hashes[SKIN_HASH]
-    ):
-        raise ValueError(
-            f"the skin differs from that of {config.config}: its file was changed, or "
-            "sensors are placed differently here; use that run's skin: --skin.path "
-            f"{config.config.parent / 'skin.json'}"
-        )
-    if content["init_from"] == to_plain(config)["init_from"] and before.get(
-        INIT_HASH
-    ) != hashes.get(INIT_HASH):
-        raise ValueError(
-            f"{config.init_from} has changed since the run of {config.config} started "
-            "from it"
-        )
-
-
-def _check_fits(
-    config: TrainConfig,
-    skin: Skin,
-    initial: tuple[dict[str, Tensor], PolicySpec] | None,
-) -> None:
-    """Raise ValueError if sensors do not fit the skin or memory is too small.
-
-    So if the networks to start from do not fit. This is checked here, before the
-    workers start.
-    """
-    sources = sparse_sources(config.env, skin)
-    one = make_worker_env(
-        config.env, skin, num_envs=1, seed=config.seed, sparse=bool(sources)
-    )
-    spec = PolicySpec.of(config.env, skin, config.ppo.network, one, sources)
-    with torch.device("meta"):
-        agent = spec.build_agent()
-    if initial is not None:
-        _check_init(agent, spec, *initial, str(config.init_from))
-    weights = sum(value.numel() for value in agent_tensors(agent).values())
-    read = sum(size for key, size in spec.sizes.items() if key not in sources)
-    others = {
-        # Weights, two moments, and gradients in total and of four shares, in float32.
-        "the networks (ppo.network.hidden)": 32 * weights,
-        "a rollout (num_envs, ppo.rollout_steps, history)": 4
-        * read
-        * config.frames_per_batch,
-    }
-    if config.engine == "mujoco":
-        check_fits(one, config.num_envs, others)
-
-
-def _check_init(
-    agent: Agent,
-    spec: PolicySpec,
-    tensors: Mapping[str, Tensor],
-    other: PolicySpec,
-    path: str,
-) -> None:
-    """Raise ValueError unless an agent can start from what `load_networks` returned."""
-    robot, theirs = (s.env.robot_config.name for s in (spec, other))
-    if robot != theirs:
-        raise ValueError(f"{path} is a policy for {theirs}, not for {robot}")
-    if other.network.hidden != spec.network.hidden:
-        raise ValueError(
-            f"{path} has layers of {list(other.network.hidden)}, not of "
-            f"{list(spec.network.hidden)} (ppo.network.hidden)"
-        )
-    for key, size in spec.sizes.items():
-        if (given := other.sizes.get(key, 0)) != size:
-            raise ValueError(
-                f"{path} reads {given} values of {key!r}, but here there are {size}"
-            )
-    check_agent_tensors(agent_tensors(agent), tensors, path)
-
-
 def _a(kind: type[T], value: Any, name: str, what: str) -> T:
     """Return a value of a file; raise ValueError if it has another type."""
     if not isinstance(value, kind):
@@ -570,28 +465,3 @@ def _whole_rows(path: Path, frames: int) -> str:
     except (OSError, ValueError):
         return ""
     return "".join([first, *kept]) if kept else ""
-
-
-def git_state(source: Path) -> dict[str, Any] | None:
-    """Return the commit of a source file, and whether its working tree has changes.
-
-    Returns None if the file is not in a repository.
-    """
-
-    def git(*args: str) -> str:
-        return subprocess.run(
-            ["git", "-C", str(source.parent), *args],
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout.strip()
-
-    try:
-        # An installed copy may be inside an unrelated repository.
-        git("ls-files", "--error-unmatch", str(source))
-        return {
-            "commit": git("rev-parse", "HEAD"),
-            "changed": bool(git("status", "--porcelain", "--untracked-files=no")),
-        }
-    except (OSError, subprocess.CalledProcessError):
-        return None

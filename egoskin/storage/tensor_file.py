@@ -115,7 +115,8 @@ def load_tensors(
             names it.
     """
     if not path.is_file():
-        raise ValueError(f"no such file: {path}")
+        folder = path.is_dir()
+        raise ValueError(f"{path} is a folder" if folder else f"no such file: {path}")
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}

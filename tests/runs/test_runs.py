@@ -28,7 +28,8 @@ from egoskin.make import EnvConfig
 from egoskin.runs.config import TrainConfig, parse_config
 from egoskin.runs.events import EventFile
 from egoskin.runs.films import FilmMaker
-from egoskin.runs.run import Run, git_state
+from egoskin.runs.run import Run
+from egoskin.runs.starts import git_state
 from egoskin.runs.trainer import METRIC_KEYS, Trainer, open_trainer, train
 from egoskin.sensors.config import SensorConfig
 from egoskin.storage.formats import read_sealed, sealed_json

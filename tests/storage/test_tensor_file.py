@@ -54,6 +54,13 @@ def test_a_failed_write_leaves_the_file_and_nothing_else(tmp_path: Path, monkeyp
     assert os.listdir(tmp_path) == ["file.safetensors"]
 
 
+def test_a_path_that_is_no_file_is_told_as_what_it_is(tmp_path: Path):
+    with pytest.raises(ValueError, match=r"is a folder$"):
+        load_tensors(tmp_path)
+    with pytest.raises(ValueError, match="no such file"):
+        load_tensors(tmp_path / "missing.safetensors")
+
+
 def test_a_pickle_is_refused_and_not_run(tmp_path: Path):
     path = tmp_path / "file.safetensors"
 

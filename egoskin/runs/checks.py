@@ -1,0 +1,106 @@
+"""Checks of a training before it has a folder, and before its workers start."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from egoskin.agents.networks import Agent
+from egoskin.make import check_env_memory, make_worker_env
+from egoskin.policies.policy import (
+    PolicySpec,
+    agent_tensors,
+    check_agent_tensors,
+    sparse_sources,
+)
+from egoskin.runs.config import INIT_HASH, SKIN_HASH, TrainConfig, read_config
+from egoskin.sensors import Skin
+from egoskin.storage.serialization import to_plain
+
+
+def check_repeats(config: TrainConfig, hashes: Mapping[str, str]) -> None:
+    """Raise ValueError if the run to repeat had other files with the same options.
+
+    Args:
+        config: The training; `config.config` is the run to repeat, if any.
+        hashes: Hashes of its skin and of the networks it starts from.
+    """
+    if config.config is None:
+        return
+    content, before = read_config(config.config)
+    if (
+        content["env"]["skin"] == to_plain(config.env.skin)
+        and before.get(SKIN_HASH, hashes[SKIN_HASH]) != hashes[SKIN_HASH]
+    ):
+        raise ValueError(
+            f"the skin differs from that of {config.config}: its file was changed, or "
+            "sensors are placed differently here; use that run's skin: --skin.path "
+            f"{config.config.parent / 'skin.json'}"
+        )
+    if content["init_from"] == to_plain(config)["init_from"] and before.get(
+        INIT_HASH
+    ) != hashes.get(INIT_HASH):
+        raise ValueError(
+            f"{config.init_from} has changed since the run of {config.config} started "
+            "from it"
+        )
+
+
+def check_fits(
+    config: TrainConfig,
+    skin: Skin,
+    initial: tuple[dict[str, Tensor], PolicySpec] | None,
+) -> None:
+    """Raise ValueError unless the parts of a training fit together and into memory.
+
+    Args:
+        config: The training.
+        skin: Its sensors.
+        initial: The networks to start from, as returned by `load_networks`.
+    """
+    sources = sparse_sources(config.env, skin)
+    one = make_worker_env(
+        config.env, skin, num_envs=1, seed=config.seed, sparse=bool(sources)
+    )
+    spec = PolicySpec.of(config.env, skin, config.ppo.network, one, sources)
+    with torch.device("meta"):
+        agent = spec.build_agent()
+    if initial is not None:
+        _check_init(agent, spec, *initial, str(config.init_from))
+    weights = sum(value.numel() for value in agent_tensors(agent).values())
+    read = sum(size for key, size in spec.sizes.items() if key not in sources)
+    others = {
+        # Weights, two moments, and gradients in total and of four shares, in float32.
+        "the networks (ppo.network.hidden)": 32 * weights,
+        "a rollout (num_envs, ppo.rollout_steps, history)": 4
+        * read
+        * config.frames_per_batch,
+    }
+    if config.engine == "mujoco":
+        check_env_memory(one, config.num_envs, others)
+
+
+def _check_init(
+    agent: Agent,
+    spec: PolicySpec,
+    tensors: Mapping[str, Tensor],
+    other: PolicySpec,
+    path: str,
+) -> None:
+    """Raise ValueError unless an agent can start from what `load_networks` returned."""
+    robot, theirs = (s.env.robot_config.name for s in (spec, other))
+    if robot != theirs:
+        raise ValueError(f"{path} is a policy for {theirs}, not for {robot}")
+    if other.network.hidden != spec.network.hidden:
+        raise ValueError(
+            f"{path} has layers of {list(other.network.hidden)}, not of "
+            f"{list(spec.network.hidden)} (ppo.network.hidden)"
+        )
+    for key, size in spec.sizes.items():
+        if (given := other.sizes.get(key, 0)) != size:
+            raise ValueError(
+                f"{path} reads {given} values of {key!r}, but here there are {size}"
+            )
+    check_agent_tensors(agent_tensors(agent), tensors, path)
