@@ -67,6 +67,8 @@ class FilmMaker:
     def _finish(self) -> None:
         if self._process is None:
             return
+        if self._process.poll() is None:
+            print(f"waiting for the film {self._film}", file=sys.stderr)
         _, errors = self._process.communicate()
         if self._process.returncode > 0:
             last = errors.strip().splitlines()[-1:]

@@ -187,7 +187,8 @@ def test_a_film_that_cannot_be_made_is_told_of(tmp_path, capfd):
     (tmp_path / "config.json").write_text("{}")
     with FilmMaker(tmp_path) as maker:
         maker.start(tmp_path / "config.json")
-    (line,) = capfd.readouterr().err.splitlines()
+    waiting, line = capfd.readouterr().err.splitlines()
+    assert waiting.startswith("waiting for the film ")
     assert line.startswith("note: film ")
     assert ".mp4 failed: " in line
     assert "config.json" in line
