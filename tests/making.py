@@ -11,6 +11,7 @@ from egoskin.make import EnvConfig, make_worker_env
 from egoskin.policies.policy import Policy, PolicySpec, sparse_sources
 from egoskin.runs.config import TrainConfig
 from egoskin.sensors.config import SensorConfig
+from egoskin.storage.tensor_file import load_tensors, save_tensors
 
 
 def make_agent(
@@ -41,6 +42,14 @@ def make_policy(
 ) -> Policy:
     """Return a policy for an environment, with random weights and statistics."""
     return Policy(*make_agent(config, network or NetworkConfig(), seed))
+
+
+def remove_critic(policy: Path, out: Path) -> None:
+    """Write a policy as older versions did, without its critic."""
+    tensors, header = load_tensors(policy)
+    actor = {n: v for n, v in tensors.items() if not n.startswith("agent/critic.")}
+    assert len(actor) < len(tensors)
+    save_tensors(out, actor, header)
 
 
 def blind_run(path: Path, total_frames: int) -> TrainConfig:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, get_args
 
@@ -191,6 +191,11 @@ def agent_tensors(agent: Agent) -> dict[str, Tensor]:
     return {**dict(agent.named_parameters()), **dict(agent.named_buffers())}
 
 
+def has_critic(tensors: Iterable[str]) -> bool:
+    """Return whether tensors of an agent, by name, include those of its critic."""
+    return any(name.startswith(_CRITIC) for name in tensors)
+
+
 def check_agent_tensors(
     own: Mapping[str, Tensor], tensors: Mapping[str, Tensor], what: str
 ) -> None:
@@ -202,7 +207,7 @@ def check_agent_tensors(
         what: Origin of the tensors, for the error text, which names the tensor.
     """
     missing = own.keys() - tensors.keys()
-    if not any(name.startswith(_CRITIC) for name in tensors):
+    if not has_critic(tensors):
         missing = {name for name in missing if not name.startswith(_CRITIC)}
     if missing:
         raise ValueError(f"{what}: tensor {min(missing)!r} of the networks is missing")
@@ -275,13 +280,13 @@ def check_finite(agent: Agent, what: str) -> None:
 
 
 def save_policy(path: Path, agent: Agent, spec: PolicySpec) -> None:
-    """Write the actor of an agent as a self-contained policy file."""
-    tensors = prefixed("agent", _without_critic(agent_tensors(agent)))
-    save_tensors(path, tensors, {"policy": spec.header()})
+    """Write an agent as a self-contained policy file.
 
-
-def _without_critic(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    return {n: value for n, value in tensors.items() if not n.startswith(_CRITIC)}
+    The critic is included, so that the policy can be trained further.
+    """
+    save_tensors(
+        path, prefixed("agent", agent_tensors(agent)), {"policy": spec.header()}
+    )
 
 
 class Policy(TensorDictModuleBase):
@@ -401,9 +406,9 @@ def load_policy(path: str | Path) -> Policy:
 
 
 def load_with_critic(path: str | Path) -> tuple[Policy, Critic | None]:
-    """Return a policy and the critic that was trained with it; None without one.
+    """Return a policy and the critic that was trained with it.
 
-    Checkpoints of runs contain a critic, policy files do not.
+    The critic is None in a policy file of an older version, which has none.
 
     Args:
         path: As in `load_policy`.
@@ -411,25 +416,30 @@ def load_with_critic(path: str | Path) -> tuple[Policy, Critic | None]:
     Raises:
         ValueError: If there is no policy; the text says why.
     """
-    agent, spec, has_critic = _load_agent(policy_file(path))
-    return Policy(agent, spec), Critic(agent) if has_critic else None
+    agent, spec, complete = _load_agent(policy_file(path))
+    return Policy(agent, spec), Critic(agent) if complete else None
 
 
 def load_networks(path: str | Path) -> tuple[dict[str, Tensor], PolicySpec]:
     """Return the networks and normalisers of a policy or run, to train them further.
 
     Args:
-        path: As in `load_policy`. Only the checkpoint of a run includes the critic.
+        path: As in `load_policy`.
 
     Returns:
-        Tensors for `load_agent_tensors`, and the specification of their agent.
+        Tensors for `load_agent_tensors`, and the specification of their agent. Policy
+        files of older versions have no critic.
 
     Raises:
         ValueError: As in `load_policy`.
     """
-    agent, spec, has_critic = _load_agent(policy_file(path))
-    tensors = {name: value.detach() for name, value in agent_tensors(agent).items()}
-    return tensors if has_critic else _without_critic(tensors), spec
+    agent, spec, complete = _load_agent(policy_file(path))
+    tensors = {
+        name: value.detach()
+        for name, value in agent_tensors(agent).items()
+        if complete or not name.startswith(_CRITIC)
+    }
+    return tensors, spec
 
 
 def policy_file(path: str | Path) -> Path:
@@ -463,4 +473,4 @@ def _load_agent(path: Path) -> tuple[Agent, PolicySpec, bool]:
     agent = spec.build_agent()
     load_agent_tensors(agent, own, str(path))
     check_finite(agent, str(path))
-    return agent, spec, any(name.startswith(_CRITIC) for name in own)
+    return agent, spec, has_critic(own)

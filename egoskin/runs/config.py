@@ -65,8 +65,8 @@ class TrainConfig:
     checkpoint_interval: Annotated[float, POSITIVE] = 60.0
     """Maximum age of the latest checkpoint [s]."""
     init_from: Path | None = None
-    """Policy, or run with its critic, whose networks are trained further, as on another
-    task or range. Only the networks and normalisers are taken. None: new networks."""
+    """Policy or run whose networks are trained further, as on another task or range.
+    Only the networks and normalisers are taken. None: new networks."""
     config: Path | None = None
     """config.json of a run to repeat: its values are the defaults, and the skin must be
     the same."""

@@ -8,6 +8,7 @@ never replaces a checkpoint.
 from __future__ import annotations
 
 import dataclasses
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -42,6 +43,7 @@ from egoskin.policies.policy import (
     check_agent_tensors,
     check_finite,
     check_like,
+    has_critic,
     load_agent_tensors,
     save_policy,
     sparse_sources,
@@ -113,6 +115,12 @@ class Trainer:
         """
         if (initial := self.run.initial_networks()) is not None:
             load_agent_tensors(self.agent, initial, str(self.config.init_from))
+            if not has_critic(initial):
+                print(
+                    f"note: {self.config.init_from} is of an older version and has no "
+                    "critic: with a new one, success may fall for millions of frames",
+                    file=sys.stderr,
+                )
         self.root = self.env.reset()
         self.keep_policy()
         self.save()

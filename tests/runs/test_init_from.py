@@ -13,7 +13,7 @@ from egoskin.runs.run import Run
 from egoskin.runs.trainer import Trainer, open_trainer, train
 from egoskin.storage.formats import read_sealed
 from egoskin.storage.tensor_file import load_tensors
-from making import blind_run
+from making import blind_run, remove_critic
 
 
 def networks_of(file: Path) -> dict[str, torch.Tensor]:
@@ -40,8 +40,17 @@ def test_a_run_goes_on_from_the_networks_of_another(finished: Trainer, tmp_path:
     assert all((now[n] != before[n]).any() for n in before if n.endswith("weight"))
 
 
-def test_a_policy_has_no_critic_to_go_on_from(finished: Trainer, tmp_path: Path):
-    policy = finished.run.policy_path(64)
+def test_a_policy_has_what_its_run_had(finished: Trainer):
+    run = finished.run
+    policy = networks_of(run.policy_path(64))
+    torch.testing.assert_close(policy, networks_of(run.checkpoint_path), rtol=0, atol=0)
+
+
+def test_an_old_policy_has_no_critic_to_go_on_from(
+    finished: Trainer, tmp_path: Path, capfd
+):
+    policy = tmp_path / "old.safetensors"
+    remove_critic(finished.run.policy_path(64), policy)
     runs = {
         name: Run.create(replace(blind_run(tmp_path / name, 64), init_from=path))
         for name, path in {"new": None, "on": policy}.items()
@@ -49,6 +58,9 @@ def test_a_policy_has_no_critic_to_go_on_from(finished: Trainer, tmp_path: Path)
     for run in runs.values():
         with open_trainer(run):
             pass
+    note, *others = capfd.readouterr().err.splitlines()
+    assert "old.safetensors is of an older version and has no critic" in note
+    assert not others
     new, on = (networks_of(run.checkpoint_path) for run in runs.values())
     critic = {name for name in on if name.startswith("agent/critic.")}
     assert critic == on.keys() - networks_of(policy).keys()

@@ -12,6 +12,7 @@ from egoskin.envs.dodgeball import DodgeballEnv
 from egoskin.make import make_worker_env
 from egoskin.policies.policy import load_policy
 from egoskin.viewer.web.session import Session, Throw
+from making import remove_critic
 
 
 @pytest.fixture(scope="module")
@@ -196,14 +197,18 @@ def test_only_sensors_that_the_policy_can_read_are_taken(session: Session):
     session.configure(own)
 
 
-def test_a_policy_file_has_no_critic_and_a_run_has_one(session: Session, trained):
+def test_policies_and_runs_have_a_critic_but_for_old_policies(trained, tmp_path):
+    policy = max((trained / "policies").iterdir())
+    for source in (trained, policy):
+        session = Session(str(source))
+        assert session.critic is not None
+        values = [frame.value for frame in play(session, 3)]
+        assert np.isfinite(values).all()
+        assert len(set(values)) == 3
+    remove_critic(policy, tmp_path / "old.safetensors")
+    session = Session(str(tmp_path / "old.safetensors"))
     assert session.critic is None
     assert math.isnan(session.reset().value)
-    other = Session(str(trained))
-    assert other.critic is not None
-    values = [frame.value for frame in play(other, 3)]
-    assert np.isfinite(values).all()
-    assert len(set(values)) == 3
 
 
 def test_the_value_is_the_critics_of_the_checkpoint(trained):

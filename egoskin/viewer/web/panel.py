@@ -323,7 +323,7 @@ class Panel:
         title = "**Value of the state**, from the critic"
         if lacking:
             names = ", ".join(lacking)
-            title += f": none for {names}. Policy files contain no critic, runs do."
+            title += f": none for {names}, saved by an older version"
         self._value_title.content = title
         if self._value.visible:
             self._value.data = (time, *value)
