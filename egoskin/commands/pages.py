@@ -37,8 +37,8 @@ Train a robot to dodge balls with a skin of proximity sensors.
 Evaluate a policy on a fixed set of held-out throws.
 
   POLICY                  run folder, checkpoint, policy file, or a policy of the
-                          package: field_proximity, localization, blind and
-                          g1_proximity (standard 2), field_binary (standard 1)
+                          package: field_proximity, localization, field_binary,
+                          blind, g1_proximity
   --episodes INT          throw sequences (1024)
   --throw-set INT         seed of the throw set (0)
   --standard {2,1,paper,run}
