@@ -37,10 +37,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from egoskin.policies.policy import (
-    CHECKPOINT_NAME,
-    load_networks,
-)
+from egoskin.policies.policy import CHECKPOINT_NAME, load_networks
 from egoskin.runs.checks import check_fits, check_repeats
 from egoskin.runs.config import (
     CALL_FIELDS,
@@ -56,11 +53,7 @@ from egoskin.runs.starts import describe_start
 from egoskin.runs.wandb_log import WandbLog
 from egoskin.sensors import Skin
 from egoskin.storage.files import read_regular
-from egoskin.storage.formats import (
-    content_hash,
-    sealed_json,
-    unseal,
-)
+from egoskin.storage.formats import content_hash, sealed_json, unseal
 from egoskin.storage.serialization import (
     changed_fields,
     read_json,
