@@ -36,7 +36,7 @@ test-warp: $(VENV)/dev
 	$(BIN)/python -m pip install --quiet --editable ".[gpu]"
 	$(BIN)/python -m pytest -m warp -s $(ARGS)
 
-# Half an hour of training: does it grow?
+# Trains for half an hour and checks that memory does not grow.
 test-memory: $(VENV)/dev
 	EGOSKIN_MEMORY_MINUTES=30 $(BIN)/python -m pytest -m slow -s -k memory $(ARGS)
 

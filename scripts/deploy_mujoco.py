@@ -193,6 +193,10 @@ def run(folder: Path, episodes: int | None, margin: float) -> None:
     success_s, expected = float(throws.pop("success_s")), float(throws.pop("success"))
     poses = throws.pop("base_pose"), throws.pop("joint_pos")
     number = len(poses[0]) if episodes is None else episodes
+    if not 1 <= number <= len(poses[0]):
+        raise SystemExit(
+            f"--episodes must be from 1 to {len(poses[0])}, as prepared, got {number}"
+        )
     successes = 0
     for row in range(number):
         robot.reset(*(pose[row] for pose in poses))

@@ -30,15 +30,6 @@ from egoskin.interrupts import (
 from egoskin.memory import is_out_of_memory
 from egoskin.parallel import WorkerError
 
-# New names of renamed options, by the old name.
-_RENAMED = {
-    "--sensor.localization.hold": "--sensor.keep-last",
-    "--sensor.ray.fov": "--sensor.ray.fov-deg, from corner to corner",
-    "--coverage": "--visibility",
-    "--numb": "--mask",
-    "--throw": "--standard",
-    "--bank-seed": "--throw-set",
-}
 NUMBERS = ConstructorRegistry()
 """Rules for reading options while it is entered: integers also as 1e6."""
 
@@ -88,7 +79,6 @@ def clear_errors() -> Iterator[None]:
     take(_raise, *ENDING)
     try:
         try:
-            _check_names(sys.argv[1:])
             with NUMBERS:
                 yield
         finally:
@@ -115,14 +105,6 @@ def clear_errors() -> Iterator[None]:
         if signal.getsignal(signal.SIGINT) is not end_now:
             for number, handler in before.items():
                 signal.signal(number, handler)
-
-
-def _check_names(args: list[str]) -> None:
-    """Raise ValueError for an option that has been renamed."""
-    for arg in args:
-        name = arg.split("=")[0].replace("_", "-")
-        if name in _RENAMED:
-            raise ValueError(f"{name} is now {_RENAMED[name]}")
 
 
 def check_packages(what: str, extra: str, *packages: str) -> None:

@@ -270,9 +270,9 @@ def main(args: list[str]) -> None:
     trained = policy.env_config.standard
     played = trained if config.standard == "run" else config.standard
     title = (
-        f"{config.policy}: {policy.policy_spec.frames:,} frames on standard {trained}; "
-        f"standard {played}, throw set {config.throw_set} of "
-        f"{counted(config.episodes, 'episode')}"
+        f"{config.policy}: trained for {policy.policy_spec.frames:,} frames "
+        f"on standard {trained}; evaluated on standard {played}, "
+        f"throw set {config.throw_set} of {counted(config.episodes, 'episode')}"
     )
     if config.masked:
         title += f", sensors masked: {', '.join(config.masked)}"

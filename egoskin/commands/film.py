@@ -64,7 +64,7 @@ class RenderConfig:
     sheet: Path | None = None
     """Contact sheet to write, .png; None: beside the film, under the same name."""
     throw_set: int = 0
-    """Seed of the throw set, as in evaluate.py."""
+    """Seed of the throw set, as in `egoskin evaluate`."""
     episode: Annotated[int, NOT_NEGATIVE] = 0
     """Index of the episode in the throw set."""
     longest_of: Annotated[int, COUNT] = 1

@@ -29,7 +29,8 @@ Train a robot to dodge balls with a skin of proximity sensors.
   egoskin train --sensor.signal binary --sensor.range 1 --seed 1
   egoskin train --resume runs/NAME --total-frames 100e6
   egoskin train --config runs/NAME/config.json --seed 2
-  egoskin train --init-from field_proximity --task.randomization.friction 0.4 1
+  egoskin train --init-from localization --sensor.signal localization \
+      --task.randomization.friction 0.4 1
   egoskin train --film-every 5e6 --log wandb
   egoskin train --engine warp --device cuda
 """,
@@ -60,7 +61,8 @@ See a policy in the browser, and throw balls at it; or a skin, or a robot.
   POLICY ...              run folder (followed while it trains), checkpoint, policy
                           file, or a policy of the package; two are shown side by side
   --skin PATH             a skin file on its robot, without a policy
-  --robot NAME            a robot without a policy: its name, or an MJCF or URDF
+  --robot NAME|PATH       a robot without a policy: h1_2, g1, a folder with robot.toml,
+                          my_robot.py:ROBOT, or an MJCF or URDF file
   --port INT              local port, on 127.0.0.1; 0: any free port (8080)
 
   egoskin view field_proximity
@@ -71,7 +73,8 @@ See a policy in the browser, and throw balls at it; or a skin, or a robot.
 Film an episode of a policy, with a contact sheet of its moments.
 
   POLICY                  run folder, checkpoint, policy file, or a policy of the
-                          package; none: the robot holds its default pose
+                          package; none: zero action, targets at the default pose
+  --hold                  hold the robot rigid in its default pose
   --out PATH              film to write, .mp4 or .gif (episode.mp4)
   --longest-of INT        film the longest of this many episodes (1)
   --episode INT           index of the episode in the throw set (0)
@@ -130,7 +133,8 @@ Show what a skin sees of the throws; no training is needed.
   egoskin visibility --ranges 0.5 1 --occlusion
 """,
     "upper-bound": """\
-Search for what the body could still do when a ball comes within reach.
+Search for actions that avoid a ball once it is near a sensor: what the robot is able
+to do, as a reference for a policy.
 
   POLICY                  run folder, checkpoint, policy file, or a policy of the
                           package: it plays until the search takes over
@@ -146,7 +150,7 @@ Search for what the body could still do when a ball comes within reach.
   egoskin upper-bound field_proximity --ball 2
 """,
     "replay": """\
-Replay an update that was not finite.
+Repeat a training update whose result was NaN or infinite.
 
   FILE                    what a training wrote: runs/NAME/not-finite-*.safetensors
 
@@ -196,8 +200,8 @@ and threads, and other kernels give the same bits.
 Measure speed and accuracy.
 
   egoskin bench loop      the training loop, layer by layer [steps/s]
-  egoskin bench physics   the cost of the robot's model, choice by choice
-  egoskin bench engine    engine warp against the number of worlds
+  egoskin bench physics   the physics, for variants of the robot's model
+  egoskin bench engine    MuJoCo Warp, for several numbers of worlds
   egoskin bench sensors   the sensor kernels
   egoskin bench accuracy  the physics against a finer rate
   egoskin bench gradients --run runs/NAME

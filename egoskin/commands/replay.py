@@ -1,4 +1,4 @@
-"""Replay an update that was not finite, and show where this began.
+"""Repeat a training update whose result was NaN or infinite; show where it began.
 
 egoskin replay runs/NAME/not-finite-000001048576.safetensors
 """

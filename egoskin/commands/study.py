@@ -206,7 +206,8 @@ class Run:
     """Maximum number of parallel runs; None: enough to use all cores."""
     cores_per_run: Annotated[int | None, COUNT] = None
     """Workers and learner threads of each run; None: measured, half a minute for each
-    choice, unless the whole study is short (results do not depend on it)."""
+    choice; or 1, if the study is short, with --parallel, and on Ray. It does not change
+    the results."""
     tries: Annotated[int, COUNT] = 3
     """Maximum number of attempts for each run."""
     again: bool = False

@@ -1,4 +1,4 @@
-"""Search for what the body could still do when a ball is in reach of the skin.
+"""Search for actions that avoid a ball once it is near a sensor.
 
 egoskin upper-bound field_proximity
 egoskin upper-bound runs/NAME --throws 64 --ball 2 --json upper-bound.json

@@ -222,5 +222,5 @@ def main(args: list[str]) -> None:
                 half = config.iterations // 2
                 equal &= agree(planned, Path(folder), title, half)
     if not equal:
-        raise SystemExit("NOT equal: training is not exact")
-    print("equal: training is exact")
+        raise SystemExit("NOT equal: training is not reproducible")
+    print("equal: training is reproducible")

@@ -35,7 +35,8 @@ class ViewConfig:
     skin: Path | None = None
     """A skin file, shown on its robot without a policy."""
     robot: str | None = None
-    """A robot without a policy: its name, or an MJCF or URDF."""
+    """A robot without a policy: its name, a folder with robot.toml,
+    my_robot.py:ROBOT, or an MJCF or URDF file."""
     port: Annotated[int, Interval(ge=0, le=65535)] = 8080
     """Port of 127.0.0.1; 0: any free port."""
 
@@ -86,7 +87,7 @@ def _skin_page(config: ViewConfig) -> SkinPage:
         name = skin.robot
         if name not in ROBOTS:
             raise ValueError(
-                f"{config.skin} is for the robot {name!r}: give its path with --robot "
-                "PATH of its MJCF or URDF"
+                f"{config.skin} is for the robot {name!r}, which is not in the "
+                "package: add --robot PATH (folder, my_robot.py:ROBOT, MJCF or URDF)"
             )
     return SkinPage(find_robot(name), skin, config.port)

@@ -118,7 +118,7 @@ class RobotConfig:
     feet: tuple[str, ...] = ()
     """Links that may touch the ground."""
     untargeted_links: tuple[str, ...] = ()
-    """Links that throws are not aimed at."""
+    """Links that throws at the whole body (standard 1) are not aimed at."""
 
     def __post_init__(self) -> None:
         """Raise ValueError unless exactly one model is given."""

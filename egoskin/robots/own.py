@@ -6,7 +6,7 @@ A folder holds an MJCF or URDF and ``robot.toml``::
     base = "pelvis"                        # the link that floats
     feet = ["*_foot"]                      # links that may touch the ground
     skin_links = ["torso", "*_arm"]        # links that carry sensors
-    untargeted_links = ["*_shin"]          # optional: no ball is aimed at them
+    untargeted_links = ["*_shin"]          # optional: not aimed at with --standard 1
     name = "my_robot"                      # optional: else the folder's name
 
     [default_pose]                         # [rad] by joint; else 0

@@ -127,7 +127,7 @@ def test_an_evaluation_has_the_figures_promised(evaluated):
     about |= {"engine": "mujoco", "trained_by_engine": "mujoco"}
     assert {key: result[key] for key in about} == about
     assert result["frames"] == 4 * BATCH
-    assert f"{4 * BATCH:,} frames on standard 2; standard 2, throw set 0" in text
+    assert f"trained for {4 * BATCH:,} frames on standard 2; evaluated on " in text
     assert "success (no contact for 3 s)" in text
     assert "no contact for 5 s" in text
     assert result["success_5s"]["mean"] <= result["success"]["mean"]
@@ -171,7 +171,7 @@ def test_an_evaluation_says_by_which_standard_it_judges(evaluated):
         assert result["trained_on"] == "2"
         judged = "2" if standard == "run" else standard
         assert result["standard"] == judged
-        assert f"on standard 2; standard {judged}, throw set 0" in text
+        assert f"on standard 2; evaluated on standard {judged}, throw set 0" in text
         results[standard] = result["survival_time"]
     # Standards 2 and paper give the same result, with the first ball at the start; in
     # its training that ball comes later, and version 1 aims elsewhere.

@@ -513,6 +513,8 @@ def test_the_best_episode_is_kept_longer_than_the_others(page: Page):
 def test_a_name_keeps_its_dots():
     assert _short("runs/v1.2") == "v1.2"
     assert _short("files/v1.2.safetensors") == "v1.2"
+    assert _short("runs/v1.2/checkpoint.safetensors") == "v1.2"
+    assert _short("runs/v1.2/policies/000000065536.safetensors") == "v1.2 65536"
 
 
 def test_a_newer_policy_of_a_run_is_taken_up(trained, tmp_path):

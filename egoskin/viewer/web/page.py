@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import viser
 
-from egoskin.policies.policy import policy_file, shipped_policies
+from egoskin.policies.policy import CHECKPOINT_NAME, policy_file, shipped_policies
 from egoskin.viewer.web.panel import EPISODES, MEMORY, Panel, Wishes
 from egoskin.viewer.web.scene import RobotScene, set_stage
 from egoskin.viewer.web.server import ServedPage
@@ -518,7 +518,7 @@ class Page(ServedPage):
 def offered_policies(sources: Sequence[str]) -> list[str]:
     """Return the selectable policies: those given, those shipped, those in ``runs``."""
     runs = sorted(
-        str(path.parent) for path in Path("runs").glob("*/checkpoint.safetensors")
+        str(path.parent) for path in Path("runs").glob(f"*/{CHECKPOINT_NAME}")
     )
     return list(dict.fromkeys([*sources, *shipped_policies(), *runs]))
 
@@ -529,5 +529,11 @@ def _version(source: str) -> int:
 
 
 def _short(source: str) -> str:
-    """Return the name of a policy without its folder."""
-    return Path(source).name.removesuffix(".safetensors") or source
+    """Return a policy's name without its folder, of a file in a run with the run's."""
+    path = Path(source)
+    name = path.name.removesuffix(".safetensors") or source
+    if path.name == CHECKPOINT_NAME:
+        return path.absolute().parent.name
+    if path.parent.name == "policies":
+        return f"{path.absolute().parents[1].name} {name.lstrip('0')}"
+    return name

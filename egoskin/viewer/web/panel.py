@@ -19,9 +19,9 @@ from egoskin.viewer.web.session import HEIGHTS, SPEEDS, Session
 SIDES = {"Front": 0.0, "Left": 90.0, "Behind": 180.0, "Right": -90.0}
 """Directions to throw from: bearing relative to the robot's heading [deg]."""
 _KINDS = {
-    "spheres": {"coverage": "field", "reduce": "none"},
-    "beams, closest of each sensor": {"coverage": "ray", "reduce": "min"},
-    "beams, all": {"coverage": "ray", "reduce": "none"},
+    "field": {"coverage": "field", "reduce": "none"},
+    "ray, closest beam": {"coverage": "ray", "reduce": "min"},
+    "ray, all beams": {"coverage": "ray", "reduce": "none"},
 }
 _SIGNALS = ("proximity", "closeness", "binary", "localization")
 _CORRUPTIONS = ("none", "time_of_flight", "capacitive", "acoustic")
@@ -270,10 +270,9 @@ class Panel:
         self._range.visible = bool(np.isnan(skin.range).any())
         size = session.pipeline.signal_size
         self._readable.content = (
-            f"The policy reads {size} numbers from its skin and was trained with "
-            f"{own.label()}. All options here give as many numbers, but the policy may "
-            "not act well on them. The number and positions of the sensors cannot "
-            "change."
+            f"The policy was trained with {own.label()}; its signal has {size} values. "
+            "Only options with as many values can be selected, and the policy may do "
+            "worse with them. The number and positions of the sensors are fixed."
         )
         self.show_masked(len(session.masked), len(session.skin))
 
