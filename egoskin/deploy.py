@@ -30,8 +30,7 @@ class Controller:
         max_change: Largest change of targets per control step, in the same unit.
 
     Raises:
-        ValueError: If the file is not an exported policy, or the policy reads signals
-            that a skin cannot provide (oracle, localization).
+        ValueError: If it is no exported policy, or reads positions of balls.
     """
 
     def __init__(
@@ -57,7 +56,7 @@ class Controller:
         self._scale = np.array(data["action_scale"])
         self._range = np.repeat(np.array(data["range"], dtype=float), data["readings"])
         unit = np.array(data["torque_limit"]) / np.array(data["kp"])
-        self._limits = data["joint_range"] + margin * np.outer([-1, 1], unit)
+        self._limits = np.double(data["joint_range"]) + margin * np.outer([-1, 1], unit)
         self._max_change = max_change * unit
         self._max_age, self._max_missing = max_age, max_missing
         self.reset()
@@ -87,7 +86,7 @@ class Controller:
         """Return position targets of the joints [rad], ``[J]``, for the file's PD law.
 
         Args:
-            base_quat: Orientation of the base (w, x, y, z); any heading, ``[4]``.
+            base_quat: Unit quaternion of the base (w, x, y, z); any heading, ``[4]``.
             base_ang_vel_b: Angular velocity of the base in its frame [rad/s], ``[3]``.
             joint_pos: Joint positions in the file's order [rad], ``[J]``.
             joint_vel: Joint velocities [rad/s], ``[J]``.
@@ -102,6 +101,8 @@ class Controller:
         blocks = [np.concatenate((base_ang_vel_b, deviation, joint_vel, gravity_b))]
         if not np.isfinite(blocks[0]).all():
             self.stop("the state of the body is not finite")
+        if not abs(np.linalg.norm(base_quat) - 1) <= 0.01:
+            self.stop("base_quat is not a unit quaternion")
         if not body_age <= self._max_age:
             self.stop(f"the state of the body is {body_age:.3g} s old")
         if self.metadata["previous_action"]:
@@ -110,9 +111,8 @@ class Controller:
             blocks.append(self._signal(distance))
             if not skin_age <= self._max_age:
                 self.stop(f"the distances of the skin are {skin_age:.3g} s old")
-        last = self._target
-        if last is None:
-            last = self._default + np.nan_to_num(deviation)
+        first = self._default + np.nan_to_num(deviation)
+        last = first if self._target is None else self._target
         self._target = last if self.stopped else self._next_target(blocks, last)
         return self._target.copy()
 

@@ -78,7 +78,10 @@ class _Rows:
         kp, _ = robot.joint_gains(task.physics.gains)
         # Beyond these targets, a joint within its range already gets full torque.
         reach = robot.torque_limit / kp
-        bounds = robot.joint_range + np.array([[-1], [1]]) * reach
+        sides = np.array([[-1], [1]])
+        # Trainers need finite bounds: half a turn for joints without a range.
+        limits = robot.joint_range
+        bounds = np.where(np.isfinite(limits), limits, sides * np.pi) + sides * reach
         bounds = (bounds - robot.default_joint_pos) / (task.action_scale * reach)
         self.action_space = Box(*bounds.astype(np.float32))
 

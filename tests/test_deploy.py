@@ -120,6 +120,7 @@ def state(controller) -> dict[str, Any]:
         ({"skin_age": 1.5}, "the distances of the skin are 1.5 s old"),
         ({"joint_vel": np.full(21, np.nan)}, "the state of the body is not finite"),
         ({"base_quat": np.full(4, np.inf)}, "the state of the body is not finite"),
+        ({"base_quat": np.zeros(4)}, "base_quat is not a unit quaternion"),
         ({"distance": None}, "100% of the skin is missing"),
         ({"distance": np.full(64, np.nan)}, "100% of the skin is missing"),
         ({"distance": np.repeat([np.nan, 1], [7, 57])}, "11% of the skin is missing"),

@@ -122,12 +122,12 @@ def _joints(robot: RobotConfig) -> Iterator[Finding]:
             "effort of its limit)",
         )
     low, high = robot.joint_range
-    if without := _names(robot, low >= high):
+    if without := _names(robot, np.isinf(low)):
         yield Finding(
             "note", f"no range: {without}; only their collision shapes limit them"
         )
     pose = robot.default_joint_pos
-    outside = _names(robot, (low < high) & ((pose < low) | (pose > high)))
+    outside = _names(robot, (pose < low) | (pose > high))
     if outside:
         yield Finding("wrong", f"the default pose is out of range: {outside}")
 

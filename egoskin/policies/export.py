@@ -98,7 +98,7 @@ def metadata(policy: Policy, commit: str | None) -> dict[str, Any]:
         "control_hz": physics.control_hz,
         "joints": list(robot.joints),
         "default_joint_pos": robot.default_joint_pos.tolist(),
-        "joint_range": robot.joint_range.tolist(),
+        "joint_range": to_plain(robot.joint_range.tolist()),
         "kp": kp.tolist(),
         "kd": kd.tolist(),
         "torque_limit": robot.torque_limit.tolist(),

@@ -14,6 +14,8 @@ import pytorch_kinematics as pk
 import torch
 from pytorch_kinematics import frame as pk_frame
 
+from egoskin.hints import did_you_mean
+
 JOINT_TYPES = {
     mujoco.mjtJoint.mjJNT_HINGE: "revolute",
     mujoco.mjtJoint.mjJNT_SLIDE: "prismatic",
@@ -51,12 +53,13 @@ def body_id(model: mujoco.MjModel, name: str) -> int:
     """Return the index of the body with a name, which may be a generated one.
 
     Raises:
-        KeyError: If no body has the name.
+        ValueError: If no body has the name.
     """
     names = [body_name(model, body) for body in range(model.nbody)]
     if name not in names:
         known = ", ".join(map(repr, sorted(names)))
-        raise KeyError(f"the model has no body {name!r}; it has {known}")
+        hint = did_you_mean(name, names)
+        raise ValueError(f"the model has no body {name!r}{hint}; it has {known}")
     return names.index(name)
 
 
@@ -137,7 +140,7 @@ def build_chain(
         not at the body's origin, has additional frames, ``body:joint``.
 
     Raises:
-        KeyError: If the model has no body of the base's name.
+        ValueError: If the model has no body of the base's name.
         ValueError: If a joint below the base is neither hinge nor slide, or too many
             bodies are nested in each other.
     """

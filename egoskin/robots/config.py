@@ -253,8 +253,13 @@ class RobotConfig:
 
     @cached_property
     def joint_range(self) -> np.ndarray:
-        """Lower and upper limit of each joint [rad], for slides [m], ``[2, J]``."""
-        return self.model.jnt_range[self._joint_ids].T.copy()
+        """Lower and upper limit of each joint [rad], for slides [m], ``[2, J]``.
+
+        Infinite for a joint without a range.
+        """
+        limited = self.model.jnt_limited[self._joint_ids, None].astype(bool)
+        limits = self.model.jnt_range[self._joint_ids]
+        return np.where(limited, limits, [-np.inf, np.inf]).T
 
     def joint_gains(self, gain_set: str | None) -> tuple[np.ndarray, np.ndarray]:
         """Return (kp [N m/rad], kd [N m s/rad]) of a gain set, ``[J]`` each.
@@ -300,6 +305,8 @@ class RobotConfig:
         """The link that reaches lowest in the default pose."""
         data = self._in_pose(self.default_joint_pos)
         geoms = self._collision_geoms(self.links)
+        if not geoms:
+            return min(self.links, key=lambda link: data.body(link).xpos[2])
         geom = min(geoms, key=lambda g: _extent(self.model, data, g)[0])
         return body_name(self.model, int(self.model.geom_bodyid[geom]))
 
@@ -317,9 +324,12 @@ class RobotConfig:
         return data
 
     def _extent(self, data: mujoco.MjData) -> tuple[float, float]:
-        """Return the height of the lowest and highest point of its shapes [m]."""
+        """Return the height of the lowest and highest point of its shapes [m].
+
+        Without collision shapes: of the origins of its links.
+        """
         ends = [_extent(self.model, data, g) for g in self._collision_geoms(self.links)]
-        lows, highs = zip(*ends, strict=True)
+        lows, highs = zip(*(ends or data.xpos[self._bodies][:, [2, 2]]), strict=True)
         return min(lows), max(highs)
 
     @cached_property

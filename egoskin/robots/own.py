@@ -25,7 +25,7 @@ import fnmatch
 import re
 import runpy
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -35,7 +35,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from egoskin.bounds import is_number
 from egoskin.hints import did_you_mean
-from egoskin.robots.chains import body_id
+from egoskin.robots.chains import body_id, body_name
 from egoskin.robots.config import (
     ROBOTS,
     Gain,
@@ -252,15 +252,16 @@ def read_folder(folder: Path) -> RobotConfig:
         raise toml.error(str(error), "model") from None
     try:
         links = robot.links
-    except KeyError as error:
-        raise toml.error(str(error.args[0]), "base") from None
+    except ValueError as error:
+        raise toml.error(str(error), "base") from None
     lists = {key: _links(toml, key, links) for key in _LISTS}
-    for key, table in (("default_pose", robot.default_pose), *_flat(robot.gains)):
+    tables = [(("default_pose",), robot.default_pose)]
+    tables += [(("gains", name), table) for name, table in robot.gains.items()]
+    for keys, table in tables:
         for pattern in table:
             if not fnmatch.filter(robot.joints, pattern):
-                raise toml.error(
-                    _no_match(pattern, robot.joints, "joint"), *key.split("/"), pattern
-                )
+                text = _no_match(pattern, robot.joints, "joint")
+                raise toml.error(text, *keys, pattern)
     for name, gain_set in robot.gains.items():
         for joint in robot.joints:
             matching = [p for p in gain_set if fnmatch.fnmatchcase(joint, p)]
@@ -276,13 +277,6 @@ def read_folder(folder: Path) -> RobotConfig:
     except ValueError as error:
         raise toml.error(str(error), "default_pose") from None
     return replace(robot, **lists)
-
-
-def _flat(
-    gains: Mapping[str, Mapping[str, Gain]],
-) -> list[tuple[str, Mapping[str, Gain]]]:
-    """Return the gain sets with the paths of their keys."""
-    return [(f"gains/{name}", table) for name, table in gains.items()]
 
 
 def _pose(toml: _Toml) -> dict[str, float]:
@@ -360,6 +354,7 @@ def portable(robot: RobotConfig) -> RobotConfig:
         return robot
     spec, model = robot.spec(), robot.model
     keep = set(robot.links)
+    _check_outermost(robot, model)
     _fix_inertia(spec, model)
     in_pairs = {pair.geomname1 for pair in spec.pairs}
     in_pairs |= {pair.geomname2 for pair in spec.pairs}
@@ -382,7 +377,14 @@ def portable(robot: RobotConfig) -> RobotConfig:
                 "data may have spheres, capsules, boxes and cylinders: replace it, or "
                 'make it visual only (contype="0" conaffinity="0")'
             )
-    _set_bits(spec)
+    geoms, bodies = ({each.name for each in x} for x in (spec.geoms, spec.bodies))
+    for pair in list(spec.pairs):
+        if not {pair.geomname1, pair.geomname2} <= geoms:
+            spec.delete(pair)
+    for exclude in list(spec.excludes):
+        if not {exclude.bodyname1, exclude.bodyname2} <= bodies:
+            spec.delete(exclude)
+    _set_bits(spec, in_pairs)
     for elements in (
         *(spec.actuators, spec.sensors, spec.keys, spec.cameras, spec.lights),
         *(spec.meshes, spec.textures, spec.hfields, spec.skins),
@@ -414,6 +416,17 @@ _PRIMITIVES = (
 )
 
 
+def _check_outermost(robot: RobotConfig, model: mujoco.MjModel) -> None:
+    """Raise ValueError if the base is fixed to another body."""
+    parent = model.body_parentid[body_id(model, robot.base)]
+    if parent:
+        raise ValueError(
+            f"{robot.name}: the base {robot.base!r} is fixed to "
+            f"{body_name(model, parent)!r}, but must be attached to the world itself: "
+            "take the outermost body as base, or remove what is above it"
+        )
+
+
 def _fix_inertia(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
     """Set the inertia of each link, which may come from shapes that are left out."""
     for body in spec.bodies:
@@ -437,9 +450,11 @@ def _round_off(geom: mujoco.MjsGeom) -> None:
         geom.size = [radius, radius, half]
 
 
-def _set_bits(spec: mujoco.MjSpec) -> None:
+def _set_bits(spec: mujoco.MjSpec, in_pairs: Collection[str]) -> None:
     """Make balls and floor collide with all collision shapes, if they do not yet."""
-    touching = [g for g in spec.geoms if g.contype or g.conaffinity]
+    touching = [
+        g for g in spec.geoms if g.contype or g.conaffinity or g.name in in_pairs
+    ]
     if all(
         g.conaffinity & _WORLD_BITS == _WORLD_BITS and not g.contype & _WORLD_BITS
         for g in touching

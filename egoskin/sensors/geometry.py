@@ -231,8 +231,8 @@ class ProximitySensor(RowTransform):
 
     @property
     def ranges(self) -> Tensor:
-        """Range of each sensor [m], ``[S]`` float64."""
-        return self._range[:, 0].clone()
+        """Range of each sensor [m], ``[S]`` float64; masks do not change it."""
+        return self._skin_range[:, 0].clone()
 
     def scene(
         self, base_pose: Tensor, joint_pos: Tensor, object_pose: Tensor, active: Tensor

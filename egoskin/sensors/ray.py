@@ -273,7 +273,12 @@ class RaySensor(ProximitySensor):
         Returns:
             Index in the flattened readings ``[B, S, K]`` of each beam that hits
             anything, ascending ``[n]`` int64, and its reading [m], ``[n]``.
+
+        Raises:
+            ValueError: If the sensor has ``reduce`` or ``per_object``.
         """
+        if self.reduce != "none" or self.per_object:
+            raise ValueError("hits are of full grids: without reduce and per_object")
         if self._kernels is not None and self._kernels.can(*inputs[:3]):
             return self._kernels.hits(inputs)
         rows = self._rows_in_reach(*inputs)

@@ -275,7 +275,7 @@ class Painter:
         self._model = _build_model(robot, objects, size)
         self._data = mujoco.MjData(self._model)
         self._camera_config = camera or CameraConfig()
-        self._size = robot.standing_height / _REFERENCE_HEIGHT
+        self._size = (robot.standing_height or _REFERENCE_HEIGHT) / _REFERENCE_HEIGHT
         self._camera = mujoco.MjvCamera()
         self._last_time: float | None = None
         model = self._model

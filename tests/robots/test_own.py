@@ -352,3 +352,54 @@ def test_the_portable_g1_keeps_what_it_collides_with():
         own = getattr(G1.model, name)
         np.testing.assert_array_equal(getattr(one.model, name), own)
     assert mujoco.mj_getTotalmass(one.model) == pytest.approx(33.34, abs=0.01)
+
+
+def test_a_base_below_another_body_is_refused(tmp_path):
+    above = '<link name="footprint"/><joint name="up" type="fixed">'
+    above += '<parent link="footprint"/><child link="hull"/></joint></robot>'
+    (tmp_path / "stump.urdf").write_text(URDF.replace("</robot>", above))
+    (tmp_path / "robot.toml").write_text(
+        'model = "stump.urdf"\nbase = "hull"\nfeet = ["foot"]\nskin_links = ["hull"]\n'
+        "[gains.a]\nankle = { kp = 40, kd = 2 }\n"
+    )
+    with pytest.raises(ValueError, match=r"base 'hull' is fixed to 'footprint'"):
+        portable(read_folder(tmp_path))
+
+
+def test_geoms_that_only_pairs_let_collide_meet_balls_and_floor(tmp_path):
+    # Nothing but a pair lets the feet and the floor collide.
+    feet = MODEL.replace('size="0.15 0.06 0.02"', 'contype="0" conaffinity="0" {}')
+    for side in ("left", "right"):
+        feet = feet.replace("{}", f'name="{side}_sole" size="0.15 0.06 0.02"', 1)
+    text = feet.replace(
+        "<worldbody>",
+        '<contact><pair geom1="floor" geom2="left_sole"/>'
+        '<pair geom1="left_sole" geom2="right_sole"/></contact>'
+        '<worldbody><geom name="floor" type="plane" size="1 1 1"/>',
+    )
+    robot = portable(read_folder(write_robot(tmp_path, model=text)))
+    model = robot.model
+    assert model.npair == 1
+    for side in ("left", "right"):
+        assert model.geom(f"{side}_sole").conaffinity.item()
+    assert len(robot.primitives) == len(
+        portable(read_folder(write_robot(tmp_path / "as it was"))).primitives
+    )
+
+
+def test_a_joint_without_a_range_has_an_infinite_one(walker):
+    assert np.isinf(walker.joint_range).all(0).tolist() == [
+        not limited for limited in walker.model.jnt_limited[1:]
+    ]
+    json.dumps(to_plain(walker.joint_range.tolist()), allow_nan=False)
+
+
+def test_a_robot_without_collision_shapes_has_a_height():
+    xml = "<mujoco><worldbody><body name='a'><freejoint/><inertial mass='1' pos='0 0 0'"
+    xml += " diaginertia='1 1 1'/><body name='b' pos='0 0 -.5'><joint/><inertial"
+    xml += (
+        " mass='1' pos='0 0 0' diaginertia='1 1 1'/></body></body></worldbody></mujoco>"
+    )
+    robot = RobotConfig(name="bare", model_xml=xml, base="a", skin_links=())
+    assert robot.default_base_height == robot.standing_height == 0.5
+    assert robot.lowest_link == "b"

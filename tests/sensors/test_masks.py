@@ -164,6 +164,20 @@ def test_a_copied_sensor_keeps_its_mask(random_state):
     assert_same_bits(measure(copy.deepcopy(sensor), state), measure(sensor, state))
 
 
+def test_a_mask_does_not_change_the_ranges():
+    sensor = FieldSensor(SKIN, H1_2.chain, BALLS, 5.0)
+    sensor.mask([0])
+    assert sensor.ranges.tolist() == [5.0] * 24
+
+
+@pytest.mark.parametrize("form", [{"reduce": "min"}, {"per_object": True}])
+def test_only_full_grids_have_hits(form, random_state):
+    sensor = RaySensor(SKIN, H1_2.chain, BALLS, 3.0, Ray(grid=(4, 4)), **form)
+    state = random_state(2)
+    with pytest.raises(ValueError, match="without reduce and per_object"):
+        sensor.hits(*(state[str(key)] for key in sensor.in_keys))
+
+
 # --- environments ---------------------------------------------------------------
 
 

@@ -303,7 +303,7 @@ class Latency(FrameModel):
     """
 
     seconds: _NotNegative
-    """Delay [s], rounded to control steps: less than half a step is no delay."""
+    """Delay [s], rounded to control steps: half a step or less is no delay."""
 
     def start(self, reading: Tensor, moment: Moment) -> State:
         """Return the queue of delayed readings, oldest first, ``[B, steps, S, K]``."""

@@ -1,7 +1,7 @@
 // Sensor kernels for balls and a transparent robot. They fuse the computations of
 // geometry.py, field.py and ray.py over blocks of rows, so that intermediate results
-// stay in the cache. kernels.py builds and calls them; the PyTorch code is the
-// reference.
+// stay in the cache. compilation.py builds and binding.py calls them; the PyTorch
+// code is the reference.
 //
 // Contract: every number is bit-identical to that of the PyTorch code (except for the
 // sign of zero). Sums are therefore in the order of the Python code, and nothing may be
@@ -160,7 +160,7 @@ template <class T> void transpose(V<T> (&x)[W]) {
   }
 }
 
-// sincos of compilation.py.
+// sincos of egoskin/rounding.py.
 template <class T> void sincos(V<T> x, V<T> &sine, V<T> &cosine) {
   constexpr int terms = sizeof(T) == 8 ? 9 : 5;
   V<T> n = round_of<T>(x * T(2 / 3.141592653589793));

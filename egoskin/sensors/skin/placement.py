@@ -162,8 +162,8 @@ def _num_darts(area: float, spacing: float, num_sensors: int | None) -> int:
     """
     darts = math.ceil(_DARTS_PER_SQUARE * area / spacing**2)
     if num_sensors is not None:
-        # If 100 per sensor are fewer, the sensors are little more than half of those
-        # that fit.
+        # Where 100 per sensor are fewer, less than 0.4 sensors per square are wanted,
+        # and 0.7 fit.
         return min(darts, 100 * num_sensors)
     if darts > _MAX_DARTS:
         finest = math.sqrt(_DARTS_PER_SQUARE * area / _MAX_DARTS)
@@ -265,7 +265,7 @@ def place_sensors(
     if not covered:
         raise ValueError("place_sensors needs at least one link to cover")
     weights = _link_weights(covered, density or {})
-    if meshes is None:
+    if not meshes:
         surface = primitive_surface(robot, covered)
     else:
         surface = mesh_surface(robot, covered, meshes)

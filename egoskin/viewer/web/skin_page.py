@@ -122,7 +122,7 @@ class SkinPage(ServedPage):
 
     def _add_slider(self, i: int, low: float, high: float) -> None:
         start = self.joint_pos[i]
-        if not low < high:
+        if math.isinf(low):
             low, high = -_ANY_TURN, _ANY_TURN
         low, high = min(low, start), max(high, start)
         slider = self.server.gui.add_slider(
