@@ -21,7 +21,7 @@ import time
 import traceback
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from multiprocessing import (
     active_children,
     current_process,
@@ -46,10 +46,11 @@ from torchrl.envs import EnvBase, ParallelEnv, Transform, TransformedEnv
 from egoskin.interrupts import ENDING
 from egoskin.memory import is_out_of_memory
 
+_CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")
 # Interval at which the parent polls a worker that copies its results [s].
 _POLL = 2e-4
 # Interval between checks that the workers are alive [s].
-_LOOK = 0.2
+_CHECK_INTERVAL = 0.2
 # A worker that does not answer for this long counts as hanging [s]. The limit is high
 # because a worker that computes, compiles or waits for a core looks the same. Time is
 # counted in checks, so suspension of all processes (SIGSTOP, sleep) does not count.
@@ -83,7 +84,12 @@ def available_cores() -> int:
     """Return the number of cores that this process may use."""
     # macOS has no affinity.
     affinity = getattr(os, "sched_getaffinity", None)
-    return len(affinity(0)) if affinity else os.cpu_count() or 1
+    cores = len(affinity(0)) if affinity else os.cpu_count() or 1
+    # The share of a container; absent, or "max 100000", without a limit.
+    with suppress(OSError, ValueError):
+        quota, period = map(int, _CPU_QUOTA.read_text().split())
+        cores = min(cores, max(quota // period, 1))
+    return cores
 
 
 def default_num_workers(num_envs: int, cores: int | None = None) -> int:
@@ -351,7 +357,7 @@ class WorkerPool(ParallelEnv):
             self._wait(
                 range(len(channels)),
                 lambda worker: channels[worker].poll(),
-                lambda waiting: wait([channels[i] for i in waiting], _LOOK),
+                lambda waiting: wait([channels[i] for i in waiting], _CHECK_INTERVAL),
             )
             return [channel.recv()[1] for channel in channels]
 
@@ -388,10 +394,10 @@ class WorkerPool(ParallelEnv):
 
     def _watch_start(self, started: Event) -> None:
         """Kill workers that hang during the start, while the parent blocks."""
-        looks = 0
-        while not started.wait(_LOOK):
-            looks += 1
-            if looks * _LOOK > HANG_LIMIT:
+        checks = 0
+        while not started.wait(_CHECK_INTERVAL):
+            checks += 1
+            if checks * _CHECK_INTERVAL > HANG_LIMIT:
                 for worker, process in enumerate(list(self._workers)):
                     if not _ready(self._report(worker)).exists():
                         self._hung.add(worker)
@@ -409,7 +415,7 @@ class WorkerPool(ParallelEnv):
         def sleep(_: object) -> None:
             nonlocal computing
             if computing > 0:
-                if wait([self._bell.fileno()], _LOOK):
+                if wait([self._bell.fileno()], _CHECK_INTERVAL):
                     computing -= len(self._bell.read(computing))
             else:
                 # All copy their results to shared memory and set their flags.
@@ -433,16 +439,16 @@ class WorkerPool(ParallelEnv):
             sleep: Sleeps until one of the given workers may have answered, at most
                 for the interval of the checks.
         """
-        waiting, looks = list(workers), 0
-        looked = time.monotonic()
+        waiting, checks = list(workers), 0
+        checked_at = time.monotonic()
         while waiting := [worker for worker in waiting if not answered(worker)]:
             now = time.monotonic()
-            if now - looked > _LOOK:
-                looked, looks = now, looks + 1
+            if now - checked_at > _CHECK_INTERVAL:
+                checked_at, checks = now, checks + 1
                 for worker in waiting:
                     if not self._workers[worker].is_alive() and not answered(worker):
                         self._fail(worker, self._death(worker))
-                if looks * _LOOK > HANG_LIMIT:
+                if checks * _CHECK_INTERVAL > HANG_LIMIT:
                     self._fail(waiting[0], f"hung: no answer in {HANG_LIMIT:g} s")
             sleep(waiting)
 

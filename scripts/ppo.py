@@ -21,8 +21,8 @@ from egoskin.commands.train import (
     Stop,
     announce,
     open_run,
-    saying_how_to_go_on,
-    what_came_out,
+    summary_of,
+    with_resume_advice,
 )
 from egoskin.progress import ProgressLine
 from egoskin.runs.config import parse_config
@@ -34,16 +34,16 @@ def main(args: list[str]) -> None:
     config = parse_config(args)
     run = open_run(config)
     rollouts = math.ceil(config.total_frames / config.frames_per_batch)
-    with saying_how_to_go_on(run), open_trainer(run) as trainer:
+    with with_resume_advice(run), open_trainer(run) as trainer:
         announce(trainer)
         stop = Stop()
         line = ProgressLine(trainer.frames, rollouts * config.frames_per_batch)
         train(trainer, lambda: stop.requested or line.is_unread, line.update)
         line.finish()
     if trainer.frames < config.total_frames:
-        print(run.how_to_go_on())
+        print(run.resume_advice())
     else:
-        print(what_came_out(trainer, line.metrics))
+        print(summary_of(trainer, line.metrics))
 
 
 if __name__ == "__main__":

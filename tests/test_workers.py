@@ -30,6 +30,7 @@ from egoskin.make import (
 from egoskin.parallel import (
     WorkerError,
     WorkerPool,
+    available_cores,
     default_num_workers,
 )
 from egoskin.robots.config import H1_2
@@ -487,6 +488,18 @@ def test_the_default_number_of_workers_is_the_largest_divisor_not_above_the_core
     assert default_num_workers(4096, cores=12) == 8
     assert default_num_workers(9, cores=2) == 1
     assert default_num_workers(1, cores=64) == 1
+
+
+@pytest.mark.parametrize(
+    ("quota", "cores"), [("100000 100000", 1), ("50000 100000", 1), ("max 100000", 2)]
+)
+def test_a_container_gets_no_more_cores_than_its_quota(
+    quota, cores, tmp_path, monkeypatch
+):
+    (tmp_path / "cpu.max").write_text(quota)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 1}, raising=False)
+    monkeypatch.setattr(workers, "_CPU_QUOTA", tmp_path / "cpu.max")
+    assert available_cores() == cores
 
 
 def test_workers_that_do_not_divide_the_agents_are_refused(skin):

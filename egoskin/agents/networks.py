@@ -22,8 +22,8 @@ from egoskin.agents.normalizers import RunningNorm, SignalNorm
 from egoskin.bounds import POSITIVE, Interval, check_bounds
 from egoskin.sparse import SparseRows, SparseSource
 
-# Keys of the skin's signals.
-_SIGNAL_KEYS = ("signal",)
+# Key of the skin's signals.
+_SIGNAL = "signal"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,9 +45,9 @@ class NetworkConfig:
         """Raise ValueError for invalid sizes or bounds."""
         check_bounds(self)
         low, high = self.std_bounds
-        if not 0 < low <= self.init_std <= high:
+        if not low <= self.init_std <= high:
             raise ValueError(
-                f"need 0 < std_bounds[0] <= init_std <= std_bounds[1], got init_std "
+                f"need std_bounds[0] <= init_std <= std_bounds[1], got init_std "
                 f"{self.init_std} and std_bounds ({low}, {high})"
             )
         if not self.hidden:
@@ -194,17 +194,11 @@ class Agent(nn.Module):
         super().__init__()
         self.sources = dict(sources or {})
         self.actor_keys, self.critic_keys = list(actor_keys), list(critic_keys)
-        normalized = [
-            key
-            for key in critic_keys
-            if config.normalize == "all" or key not in _SIGNAL_KEYS
-        ]
         self.norms = nn.ModuleDict(
             {
-                key: SignalNorm(sizes[key])
-                if key in _SIGNAL_KEYS
-                else RunningNorm(sizes[key])
-                for key in normalized
+                key: (SignalNorm if key == _SIGNAL else RunningNorm)(sizes[key])
+                for key in critic_keys
+                if config.normalize == "all" or key != _SIGNAL
             }
         )
 
@@ -241,14 +235,9 @@ class Agent(nn.Module):
     @property
     def read_keys(self) -> list[str]:
         """Keys of the environment's output that `sense` reads."""
+        reads = {key: source.in_keys for key, source in self.sources.items()}
         return list(
-            dict.fromkeys(
-                read
-                for key in self.critic_keys
-                for read in (
-                    self.sources[key].in_keys if key in self.sources else [key]
-                )
-            )
+            dict.fromkeys(r for key in self.critic_keys for r in reads.get(key, [key]))
         )
 
     def sense(self, tensordict: TensorDictBase) -> TensorDict:

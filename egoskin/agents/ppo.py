@@ -176,14 +176,15 @@ class PPO:
         )
         self.loss.set_keys(sample_log_prob="action_log_prob")
         self._weights = [*_weights(agent.actor), *_weights(agent.critic)]
-        self._actor, self._critic = _joint(agent.actor), _joint(agent.critic)
+        self._actor, self._critic = _as_vector(agent.actor), _as_vector(agent.critic)
         self.optimizer = torch.optim.Adam(
             [self._actor, self._critic], lr=config.learning_rate, eps=1e-5, fused=True
         )
         on_cpu = agent.head.log_std.device.type == "cpu"
         self.shares = _SHARES if on_cpu else 1
+        self.num_threads = min(num_threads, self.shares)
         self._pool = ThreadPoolExecutor(
-            min(num_threads, self.shares), "learner", torch.set_num_threads, (1,)
+            self.num_threads, "learner", torch.set_num_threads, (1,)
         )
 
     @property
@@ -259,9 +260,9 @@ class PPO:
                     sums[name] = sums.get(name, 0.0) + value
                 count += 1
         metrics = {name: float(value) / count for name, value in sums.items()}
+        some = torch.randperm(len(batch), device=batch.device)[:_KL_FRAMES]
+        metrics["kl"] = self._divergence(batch, some)
         if config.desired_kl is not None:
-            some = torch.randperm(len(batch), device=batch.device)[:_KL_FRAMES]
-            metrics["kl"] = self._divergence(batch, some)
             self._adapt_learning_rate(metrics["kl"], config.desired_kl)
         for key, norm in self.agent.norms.items():
             assert isinstance(norm, RunningNorm)
@@ -387,7 +388,7 @@ def _weights(network: nn.Module) -> list[nn.Parameter]:
     return [p for p in network.parameters() if p.requires_grad]
 
 
-def _joint(network: nn.Module) -> nn.Parameter:
+def _as_vector(network: nn.Module) -> nn.Parameter:
     """Return the trainable parameters of a network as one vector.
 
     The layers and their gradients become views of it. The optimiser then takes one step

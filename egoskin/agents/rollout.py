@@ -49,8 +49,8 @@ def collect(
     shape = (num_steps, root.numel(), len(agent.head.log_std))
     noise = correlated_noise(shape, noise_correlation, device)
     frames, ended, infos = [], [], []
-    for now in noise:
-        frame = _act(agent, _readable(agent, root), now)
+    for step_noise in noise:
+        frame = _act(agent, _readable(agent, root), step_noise)
         root["action"] = frame["action"].reshape(*root.batch_size, -1).to(root.device)
         step, root = env.step_and_maybe_reset(root)
         after = step["next"].reshape(-1)

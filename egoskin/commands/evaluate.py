@@ -114,7 +114,7 @@ def share(value: float | None) -> str:
 
 def table(result: Evaluation, title: str, task: DodgeballConfig) -> str:
     """Return the results on a task as text."""
-    age, end = task.success_s, task.episode_length_s
+    age, end = task.success_age_s, task.episode_length_s
     later = min(LATER, end)
 
     def interval(value: Estimate, scale: float, unit: str) -> str:
@@ -303,7 +303,7 @@ def main(args: list[str]) -> None:
     if config.perturbed:
         rows = perturb(*subject, **quarter, on_point=counting("perturbed"))
         line.finish()
-        print(perturbed_table(rows, task.success_s))
+        print(perturbed_table(rows, task.success_age_s))
         content["perturbed"] = [dataclasses.asdict(row) for row in rows]
     if config.map is not None:
         lines = operating_map(*subject, **quarter, on_point=counting("map"))

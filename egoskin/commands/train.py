@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from shlex import quote
 from types import FrameType
 
 from egoskin.agents.ppo import NonFiniteError
@@ -70,32 +71,32 @@ def announce(trainer: Trainer) -> None:
     if config.engine == "warp":
         where = f"MuJoCo Warp, {config.device}"
     elif to_do > _SOON_DONE:
-        seconds = estimate_seconds(config, trainer.run.load_skin(), to_do)
+        seconds = estimate_seconds(config, trainer.spec.skin, to_do)
         time = f"; about {duration(seconds)} on this machine"
     print(
         f"{to_do:,} frames{f' after {done:,}' if done else ''}: "
         f"{counted(config.num_envs, 'agent')} on {where}, "
         f"learner on {config.device} with "
-        f"{counted(config.num_learner_threads, 'thread')}{time}\n"
-        f"curves while it trains: tensorboard --logdir {trainer.run.path}",
+        f"{counted(trainer.ppo.num_threads, 'thread')}{time}\n"
+        f"curves while it trains: tensorboard --logdir {quote(str(trainer.run.path))}",
         flush=True,
     )
 
 
-def what_came_out(trainer: Trainer, metrics: Mapping[str, float]) -> str:
+def summary_of(trainer: Trainer, metrics: Mapping[str, float]) -> str:
     """Return a summary of a finished training, and commands to inspect it.
 
     Args:
         trainer: Trainer of the finished run.
         metrics: Metrics of its last rollout; empty if no rollout was left to do.
     """
-    path, task = trainer.run.path, trainer.config.env.task
+    path, task = quote(str(trainer.run.path)), trainer.config.env.task
     summary = f"done: {trainer.frames:,} frames"
     if metrics:
         summary += f" in {duration(metrics['time/wall_s'])}; with exploration "
         # NaN if no episode could last long enough.
         if not math.isnan(success := metrics["episode/success"]):
-            summary += f"{success:.1%} untouched for {task.success_s:g} s, "
+            summary += f"{success:.1%} untouched for {task.success_age_s:g} s, "
         summary += f"survival {metrics['episode/survival_s']:.2f} s"
     return (
         f"{summary}\n"
@@ -106,12 +107,19 @@ def what_came_out(trainer: Trainer, metrics: Mapping[str, float]) -> str:
 
 
 @contextmanager
-def saying_how_to_go_on(run: Run) -> Iterator[None]:
+def with_resume_advice(run: Run) -> Iterator[None]:
     """Turn a failure of training into an error text that says how to resume."""
     try:
         yield
-    except (WorkerError, NonFiniteError, OSError) as error:
-        raise SystemExit(f"error: {error}\n{run.how_to_go_on()}") from error
+    except NonFiniteError as error:
+        raise SystemExit(
+            f"error: {error}\n"
+            "a resume would repeat this update; to train on from the last checkpoint, "
+            "change an option, for example --ppo.learning-rate, and keep the others: "
+            f"egoskin train --init-from {quote(str(run.path))}"
+        ) from error
+    except (WorkerError, OSError) as error:
+        raise SystemExit(f"error: {error}\n{run.resume_advice()}") from error
 
 
 def main(args: list[str]) -> None:
@@ -119,13 +127,13 @@ def main(args: list[str]) -> None:
     config = parse_config(args)
     run = open_run(config)
     rollouts = math.ceil(config.total_frames / config.frames_per_batch)
-    with saying_how_to_go_on(run), open_trainer(run) as trainer:
+    with with_resume_advice(run), open_trainer(run) as trainer:
         announce(trainer)
         stop = Stop()
         line = ProgressLine(trainer.frames, rollouts * config.frames_per_batch)
         train(trainer, lambda: stop.requested or line.is_unread, line.update)
         line.finish()
     if trainer.frames < config.total_frames:
-        print(run.how_to_go_on())
+        print(run.resume_advice())
     else:
-        print(what_came_out(trainer, line.metrics))
+        print(summary_of(trainer, line.metrics))

@@ -72,7 +72,12 @@ class DodgeballConfig:
         return round(self.episode_length_s * self.physics.control_hz)
 
     @property
-    def delay_steps(self) -> int:
+    def success_age_s(self) -> float:
+        """Time from the first throw after which an episode counts as success [s]."""
+        return min(self.success_s, self.episode_length_s)
+
+    @property
+    def max_first_throw_step(self) -> int:
         """Largest number of control steps before the first throw."""
         return round(self.throws.first_delay[1] * self.physics.control_hz)
 

@@ -52,6 +52,8 @@ class RandomizationConfig:
                     f"{field.name} must be (low, high) with low <= high, got "
                     f"{low, high}"
                 )
+        if self.push_interval != RandomizationConfig.push_interval and not self.pushes:
+            raise ValueError("push_interval has no effect without push_speed")
 
     @property
     def varies_robot(self) -> bool:

@@ -77,23 +77,25 @@ def _event(
 
 
 _WORKER: tuple[Reader, ...] = ("sensors", "observations")
-_OWN: tuple[Reader, ...] = ("observations",)
+_OBSERVED: tuple[Reader, ...] = ("observations",)
 _PARENT: tuple[Reader, ...] = ("trainer", "evaluation")
 STATE = (
     StateKey("base_pose", (7,), "position [m], quaternion (w, x, y, z)", _WORKER),
-    StateKey("base_lin_vel_w", (3,), "velocity of the base's origin [m/s]", _OWN),
-    StateKey("base_ang_vel_b", (3,), "angular velocity [rad/s]", _OWN),
+    StateKey("base_lin_vel_w", (3,), "velocity of the base's origin [m/s]", _OBSERVED),
+    StateKey("base_ang_vel_b", (3,), "angular velocity [rad/s]", _OBSERVED),
     StateKey("joint_pos", ("J",), "joint positions [rad]", _WORKER),
     StateKey("joint_vel", ("J",), "joint velocities [rad/s]", _WORKER),
     StateKey(
         "object_pose", ("O", 7), "position [m], quaternion, in the world", _WORKER
     ),
-    StateKey("object_lin_vel_w", ("O", 3), "velocity of the objects [m/s]", _OWN),
+    StateKey("object_lin_vel_w", ("O", 3), "velocity of the objects [m/s]", _OBSERVED),
     StateKey("object_active", ("O",), "whether the object is in play", _WORKER, _FLAG),
     _event("tactile", "L", "whether each link touched ball or floor", "sensors"),
-    StateKey("displacement_w", (2,), "planar displacement from the start [m]", _OWN),
     StateKey(
-        "previous_action", ("J",), "action of the previous step (0 at first)", _OWN
+        "displacement_w", (2,), "displacement from the start [m], planar", _OBSERVED
+    ),
+    StateKey(
+        "previous_action", ("J",), "action of the previous step (0 at first)", _OBSERVED
     ),
     _event("reward_terms", "R", "weighted terms, as TERMS", "trainer", kind=_NUMBER),
     _event("hit", 1, "a ball touched the robot", *_PARENT),

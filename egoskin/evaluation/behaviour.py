@@ -182,7 +182,7 @@ class Watcher:
     def __init__(self, config: EnvConfig, throw_set: int, episodes: int) -> None:
         task, robot = config.task, config.robot_config
         self._hz, self._balls = task.physics.control_hz, task.throws.num_balls
-        self._limit = round(task.success_s * self._hz)
+        self._limit = round(task.success_age_s * self._hz)
         self._by_link = task.throws.aim != "box"
         self._thrower = Thrower(task.throws, robot, task.physics.timestep)
         shortest = max(1, round(task.throws.interval[0] * self._hz))

@@ -210,7 +210,7 @@ def play_throws(
     try:
         root: TensorDictBase = env.reset()
         first_throw = root["first_throw_step"].reshape(-1).cpu().clone()
-        last = config.task.delay_steps + config.task.episode_steps
+        last = config.task.max_first_throw_step + config.task.episode_steps
         for step in range(1, last + 1):
             flat = root.reshape(-1)
             if policy is None:
@@ -277,10 +277,10 @@ def summarize(played: Episodes, rigid: Episodes, task: DodgeballConfig) -> Evalu
     Args:
         played: Episodes of the policy.
         rigid: Episodes of the rigid robot on the same throw set.
-        task: The task; its control rate and ``success_s`` are used.
+        task: The task; its control rate and ``success_age_s`` are used.
     """
     control_hz = task.physics.control_hz
-    n, limit = len(played.steps), round(task.success_s * control_hz)
+    n, limit = len(played.steps), round(task.success_age_s * control_hz)
     early = played.steps <= limit
 
     def success(episodes: Episodes, limit: int) -> Estimate:

@@ -228,7 +228,7 @@ def _until_in_reach(
     simulation = _task(env).simulation_state()
     waiting = torch.ones(throws, dtype=torch.bool)
     started = ~waiting
-    for _ in range(config.task.delay_steps + config.task.episode_steps):
+    for _ in range(config.task.max_first_throw_step + config.task.episode_steps):
         now = _task(env).simulation_state()
         last = now["throw"] == ball
         if (now["next_throw_step"][last] < _NEVER).any():

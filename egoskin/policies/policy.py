@@ -29,7 +29,7 @@ from egoskin.storage.tensor_file import load_tensors, part, prefixed, save_tenso
 
 CHECKPOINT_NAME = "checkpoint.safetensors"
 """Name of the latest checkpoint in a run folder."""
-# Prefix of the tensor names that a policy file leaves out.
+# Prefix of the critic's tensors, which policy files of older versions lack.
 _CRITIC = "critic."
 # Signals that are not normalised are in metres, or fractions of the range.
 _LARGEST_SIGNAL = 1e6

@@ -51,7 +51,7 @@ class TrainConfig:
     device: str = "cpu"
     """Device of the learner, and of engine warp ("cpu", "cuda", "cuda:1")."""
     learner_threads: Annotated[int | None, COUNT] = None
-    """Threads of the learner; None: one per core."""
+    """Threads of the learner on a CPU, at most 4; None: one per core, up to that."""
     run_dir: Path | None = None
     """Folder of the run; None: a new one under runs/, named after time and sensor."""
     snapshot_frames: Annotated[int, COUNT] = 5_000_000

@@ -7,6 +7,7 @@ import time
 import torch
 
 from egoskin.make import check_num_workers, make_worker_env
+from egoskin.parallel import available_cores
 from egoskin.runs.config import TrainConfig
 from egoskin.sensors import Skin
 
@@ -48,4 +49,5 @@ def estimate_seconds(config: TrainConfig, skin: Skin, frames: int) -> float:
     finally:
         torch.set_num_threads(threads)
     workers = check_num_workers(config.num_envs, config.num_workers)
+    workers = min(workers, available_cores())
     return frames * sum(times[1:]) / (agents * _STEPS * len(times[1:]) * workers)

@@ -41,6 +41,8 @@ class FilmMaker:
         """Finish the last film if training ended normally; otherwise stop it."""
         if kind is not None and self._process is not None:
             self._process.terminate()
+            self._process.communicate()
+            self._process = None
         self._finish()
 
     def start(self, policy: Path) -> None:
@@ -70,7 +72,7 @@ class FilmMaker:
         if self._process.poll() is None:
             print(f"waiting for the film {self._film}", file=sys.stderr)
         _, errors = self._process.communicate()
-        if self._process.returncode > 0:
-            last = errors.strip().splitlines()[-1:]
+        if status := self._process.returncode:
+            last = errors.strip().splitlines()[-1:] or [f"exit status {status}"]
             print(f"note: film {self._film} failed: {' '.join(last)}", file=sys.stderr)
         self._process = None

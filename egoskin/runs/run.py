@@ -31,6 +31,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from shlex import quote
 from typing import Any, TypeVar
 
 import numpy as np
@@ -92,6 +93,8 @@ class Run:
         self._wandb: WandbLog | None = None
         # By `SKIN_HASH` and `INIT_HASH`.
         self._hashes: dict[str, str] = {}
+        # Tensors to start from, once they are read.
+        self._initial: dict[str, Tensor] | None = None
         # The logs so far: a line for each rollout, an entry for each start.
         self._metrics = ""
         self._starts: list[dict[str, Any]] = []
@@ -122,7 +125,7 @@ class Run:
             go_on = (path / "config.json").is_file()
             raise ValueError(
                 f"{path} already exists; choose another --run-dir"
-                + f", or continue it with --resume {path}" * go_on
+                + f", or continue it with --resume {quote(str(path))}" * go_on
             )
         (path / "policies").mkdir(parents=True)
         run = cls(path, config)
@@ -131,6 +134,7 @@ class Run:
         except OSError as error:
             raise named(error, run.skin_path) from error
         run._hashes = hashes
+        run._initial = None if initial is None else initial[0]
         # Written last, because a folder with a configuration can be resumed.
         run.write_config()
         return run
@@ -175,8 +179,8 @@ class Run:
             ValueError: If they cannot be read or have changed.
         """
         path = self.config.init_from
-        if path is None:
-            return None
+        if path is None or self._initial is not None:
+            return self._initial
         tensors, _ = load_networks(path)
         _, written = read_config(self.path / "config.json")
         if content_hash({}, tensors) != written[INIT_HASH]:
@@ -220,7 +224,8 @@ class Run:
             return unseal({"starts": content}, what)[0]["starts"]
         if not isinstance(content, dict) or "sha256" not in content:
             raise ValueError(f"{what} is damaged or was edited")
-        return _a(list, unseal(content, what)[0].get("starts"), "starts", what)
+        starts = unseal(content, what)[0].get("starts")
+        return _checked_type(list, starts, "starts", what)
 
     def record_start(self) -> None:
         """Add versions, machine, git state and command of this start to the log."""
@@ -301,14 +306,14 @@ class Run:
         """Return whether there is nothing to resume, even if the run was started."""
         return not (self.checkpoint_path.exists() or self._metrics_path.exists())
 
-    def how_to_go_on(self) -> str:
+    def resume_advice(self) -> str:
         """Return advice on how to continue after a stop or a failure."""
         if not (self.path / "config.json").is_file():
             return (
                 f"{self.path} no longer exists: start a new run or, if it was renamed, "
                 "--resume it by its new name"
             )
-        return f"continue with: egoskin train --resume {self.path}"
+        return f"continue with: egoskin train --resume {quote(str(self.path))}"
 
     def save_checkpoint(
         self, tensors: Mapping[str, Tensor], header: Mapping[str, Any]
@@ -333,9 +338,9 @@ class Run:
         what = str(self.checkpoint_path)
         # Checkpoints of format 1 do not contain these.
         if "config" in header:
-            config = _a(dict, header.pop("config"), "config", what)
+            config = _checked_type(dict, header.pop("config"), "config", what)
             self._check_trained_with(config)
-        self._starts = _a(list, header.pop("starts", []), "starts", what)
+        self._starts = _checked_type(list, header.pop("starts", []), "starts", what)
         if _METRICS in tensors:
             self._metrics = _text(tensors.pop(_METRICS), what)
         else:
@@ -422,7 +427,7 @@ def _as_stored(skin: Skin) -> Any:
     return json.loads(json.dumps(skin.to_dict(), default=str))
 
 
-def _a(kind: type[T], value: Any, name: str, what: str) -> T:
+def _checked_type(kind: type[T], value: Any, name: str, what: str) -> T:
     """Return a value of a file; raise ValueError if it has another type."""
     if not isinstance(value, kind):
         raise ValueError(

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Any
 
 import torch
@@ -145,7 +146,7 @@ class Trainer:
         try:
             learned = self.ppo.update(rollout, self.frames)
         except NonFiniteError as error:
-            path = self.dump(error)
+            path = quote(str(self.dump(error)))
             error.args = (f"{error}\nreplay it with: egoskin replay {path}",)
             raise
         print_note(self.env)
@@ -182,7 +183,7 @@ class Trainer:
         return {
             "episode/survival_s": self.survival.mean() / hz,
             "episode/success": self.survival.probability(
-                round(min(task.success_s, task.episode_length_s) * hz)
+                round(task.success_age_s * hz)
             ),
             "episode/ended_by_ball": share_of_ends(hit),
             "episode/ended_by_fall": share_of_ends(fallen),

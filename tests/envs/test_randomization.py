@@ -186,6 +186,7 @@ def test_it_is_a_matter_of_training_a_standard_judges_the_model():
         ({"gains": (1.2, 0.8)}, r"gains must be \(low, high\) with low <= high"),
         ({"link_mass": (0.0, 1.0)}, "at least 0.01"),
         ({"delay_steps": (0, 101)}, "at most 100"),
+        ({"push_interval": (0.5, 1.0)}, "no effect without push_speed"),
     ],
 )
 def test_what_is_no_range_is_refused(ranges, told):

@@ -101,6 +101,9 @@ def test_success_is_read_at_the_age_of_the_task():
     )
     assert summarize(played, played, DodgeballConfig()).success.mean == 0
     early = summarize(played, played, DodgeballConfig(success_s=1.0))
+    # An episode that ends before success_s is judged at its end.
+    short = DodgeballConfig(success_s=3.0, episode_length_s=1.0)
+    assert summarize(played, played, short).success == early.success
     assert early.success.mean == early.ended_by_ball == 0.5
 
 

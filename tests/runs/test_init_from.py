@@ -104,9 +104,14 @@ def test_other_networks_than_those_of_the_run_are_refused(
     policy.write_bytes(finished.run.policy_path(0).read_bytes())
     with (
         pytest.raises(ValueError, match=r"policy\.safetensors is not what .*run was"),
-        open_trainer(run),
+        open_trainer(Run.open(run.path)),
     ):
         pass
+    # The run that has read the first one starts from it.
+    with open_trainer(run):
+        started = networks_of(run.checkpoint_path)
+    for name, value in networks_of(finished.run.policy_path(64)).items():
+        assert torch.equal(started[name], value), name
     again = [
         "--config",
         str(run.path / "config.json"),

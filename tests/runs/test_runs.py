@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,6 +21,7 @@ from tensordict import TensorDict
 import egoskin
 from calling import limit_file_size
 from egoskin.agents.ppo import NonFiniteError
+from egoskin.commands.train import with_resume_advice
 from egoskin.envs.dodgeball import DodgeballConfig
 from egoskin.envs.rewards import TERMS
 from egoskin.envs.standards import training_task
@@ -194,6 +195,34 @@ def test_a_film_that_cannot_be_made_is_told_of(tmp_path, capfd):
     assert "config.json" in line
 
 
+def test_a_killed_film_is_told_of_and_one_that_training_ends_is_not(tmp_path, capfd):
+    with FilmMaker(tmp_path) as maker:
+        maker.start(tmp_path / "policy.safetensors")
+        assert maker._process is not None
+        maker._process.kill()
+    assert "policy.mp4 failed: exit status -9" in capfd.readouterr().err
+    with suppress(OSError), FilmMaker(tmp_path) as maker:
+        maker.start(tmp_path / "policy.safetensors")
+        raise OSError("full")
+    assert capfd.readouterr().err == ""
+
+
+def test_advice_after_a_failure_is_a_command_that_helps(config: TrainConfig, tmp_path):
+    run = Run.create(replace(config, run_dir=tmp_path / "a run"))
+    with (
+        pytest.raises(SystemExit, match=f"--resume '{run.path}'"),
+        with_resume_advice(run),
+    ):
+        raise OSError("disk full")
+    # A resume would fail again at the same update.
+    with (
+        pytest.raises(SystemExit, match=f"--init-from '{run.path}'") as ended,
+        with_resume_advice(run),
+    ):
+        raise NonFiniteError("loss_actor nan", TensorDict())
+    assert "--resume" not in str(ended.value)
+
+
 def test_metrics_go_to_weights_and_biases(config: TrainConfig, monkeypatch):
     """Checks the calls to wandb; a resume continues the same wandb run."""
     given = {}
@@ -352,7 +381,7 @@ def test_a_folder_renamed_while_it_trains_ends_with_one_clear_error(
         with pytest.raises(OSError, match=r"No such file .*run/metrics\.csv"):
             train(trainer)
     assert not run.path.exists()
-    assert "--resume it by its new name" in run.how_to_go_on()
+    assert "--resume it by its new name" in run.resume_advice()
     again = Run(moved, parse_config(["--resume", str(moved)]))
     with open_trainer(again) as trainer:
         assert trainer.frames == 64

@@ -51,10 +51,10 @@ def build_scene(scene: Scene) -> mujoco.MjModel:
     # Slide joints instead of a free joint: contact ends the episode, so objects need
     # not rotate, which saves three degrees of freedom each. The common parent lets one
     # contact sensor refer to all objects.
-    shelf = spec.worldbody.add_body(name="objects")
+    parent = spec.worldbody.add_body(name="objects")
     axes = ([1, 0, 0], [0, 1, 0], [0, 0, 1])
     for i, shape in enumerate(scene.objects):
-        body = shelf.add_body(
+        body = parent.add_body(
             name=f"object_{i}", gravcomp=float(scene.weightless_objects)
         )
         for axis, letter in zip(axes, "xyz", strict=True):
