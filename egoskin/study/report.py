@@ -106,7 +106,8 @@ def _pictures(
         ),
         "sample-efficiency": (
             sample_efficiency(manifest, results),
-            "Environment steps until a run reaches 50 and 90 % of its final success.",
+            "Environment steps until a run reaches 50 and 90 % of its final success; "
+            "all its steps if that is below 5 %.",
         ),
     }
     return {k: (f, text) for k, (f, text) in drawn.items() if f is not None}
@@ -153,7 +154,7 @@ def _blocks(
     yield "## The cells"
     yield (
         "Interquartile mean and range over seeds; in brackets the mean with its 95 % "
-        "t interval, which needs two seeds or more."
+        "t interval, which needs two seeds or more; n: if only some seeds have a value."
     )
     yield _cell_rows(manifest, values)
     for name in ("equivalence", "learning-curves", "sample-efficiency"):
@@ -285,7 +286,8 @@ def _cell_rows(manifest: Manifest, values: Mapping[str, Table]) -> str:
         row = [cell.name, str(len(success))]
         for metric in _SHOWN:
             own = list(values[metric.name].get(cell.name, {}).values())
-            row.append(_spread(own))
+            fewer = f", n = {len(own)}" * (0 < len(own) < len(success))
+            row.append(_spread(own) + fewer)
         effect = mean_effect(list(success.values()))
         low, high = effect.interval()
         if effect.error > 0:

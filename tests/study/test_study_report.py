@@ -15,10 +15,11 @@ import pytest
 from egoskin.commands.study import what_is_seen
 from egoskin.runs.run import Run
 from egoskin.study.figures import equivalence, places
+from egoskin.study.findings import judge_findings
 from egoskin.study.manifest import Manifest, resolve
 from egoskin.study.metrics import METRICS, frames_to, runs_csv, tables
 from egoskin.study.report import page, table, write_report
-from egoskin.study.shipped import FINDINGS
+from egoskin.study.shipped import FINDINGS, SMOKE
 from egoskin.study.store import StudyFolder
 from studies import expected, store, store_all
 
@@ -224,8 +225,9 @@ def test_frames_to_a_share_are_read_off_the_curve(
     # is the mean of the last twentieth, 0.9924.
     own = -0.2 * np.log(1 - 0.5 * 0.9924)
     assert frames_to(result, 0.5) == pytest.approx(own * end, rel=2e-3)
+    # A run that has not learnt has used its whole budget.
     blind = folder.result(manifest.run("blind-seed0"))
-    assert frames_to(blind, 0.5) is None
+    assert frames_to(blind, 0.5) == blind.run.end
     # Between stored lines it is linear: 0, 0.2, 0.4 and then 0.8.
     stored = dataclasses.replace(
         result.stored,
@@ -234,6 +236,46 @@ def test_frames_to_a_share_are_read_off_the_curve(
     )
     result = dataclasses.replace(result, stored=stored)
     assert frames_to(result, 0.75) == pytest.approx(25)
+
+
+def test_seeds_that_never_learn_do_not_make_a_cell_look_fast(
+    manifest: Manifest, tmp_path: Path
+):
+    folder = StudyFolder(tmp_path)
+    more = resolve(dataclasses.replace(FINDINGS, seeds=(0, 1, 2, 3, 4)))
+    results = []
+    for seed in range(5):
+        run = more.run(f"field-proximity-2m-seed{seed}")
+        store(folder, more, run, 60.0 if seed < 3 else 1.0)
+        results.append(folder.result(run))
+    # Three learn within about a fifth of the budget, two do not learn.
+    for seed in range(3):
+        frames = results[seed].run.end * np.array([0, 0.20 + 0.01 * seed, 0.5, 1])
+        stored = dataclasses.replace(
+            results[seed].stored, frames=frames, success=np.array([0, 0.5, 0.5, 0.5])
+        )
+        results[seed] = dataclasses.replace(results[seed], stored=stored)
+    for kept, verdict in ((3, "confirmed"), (5, "undecided")):
+        values = tables(results[:kept])
+        (judged,) = (j for j in judge_findings(values) if j.finding.label == "6b")
+        assert judged.verdict == verdict
+    shares = values["share_to_90"]["field-proximity-2m"]
+    # 90 % of the way to 20, 21, 22 %.
+    assert list(shares.values()) == pytest.approx([18, 18.9, 19.8, 100, 100])
+
+
+def test_a_value_that_only_some_seeds_have_says_how_many(tmp_path: Path):
+    folder, manifest = StudyFolder(tmp_path), resolve(SMOKE)
+    folder.plan(manifest)
+    # The second seed avoids no first ball, and thus has no later ones.
+    for seed, success in enumerate((50.0, 0.0)):
+        run = manifest.run(f"field-proximity-2m-seed{seed}")
+        store(folder, manifest, run, success)
+    write_report(folder, tmp_path / "report")
+    text = (tmp_path / "report" / "report.md").read_text()
+    (row,) = (x for x in text.splitlines() if x.startswith("| field-proximity-2m |"))
+    assert row.count("n = ") == 1
+    assert "| 40.0, n = 1 |" in row
 
 
 def test_the_tables_hold_what_there_is(folder: StudyFolder, manifest: Manifest):
