@@ -12,7 +12,7 @@ import pytest
 from egoskin.runs.config import TrainConfig
 from egoskin.storage.formats import content_hash, read_sealed, sealed_json
 from egoskin.storage.serialization import to_plain
-from egoskin.study.findings import FINDINGS
+from egoskin.study.findings import CELLS, FINDINGS
 from egoskin.study.manifest import (
     EvaluationPlan,
     Manifest,
@@ -66,9 +66,10 @@ def test_the_findings_are_decided_by_29_cells_of_the_default_recipe(resolved):
     findings = resolved["findings"]
     assert (len(findings.cells), findings.not_default()) == (29, {})
     names = {cell.name for cell in findings.cells}
-    asked = {name for f in FINDINGS for c in f.claims for name in c.weights}
     # All but the blind robot, which is only the visual baseline of the figures.
-    assert asked == names - {"blind"}
+    assert names - {"blind"} == CELLS
+    for other in ("paper", "paper-1000"):
+        assert {cell.name for cell in resolved[other].cells} >= CELLS
     assert {f.metric for f in FINDINGS} <= {m.name for m in METRICS}
 
 

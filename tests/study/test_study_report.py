@@ -143,8 +143,13 @@ def test_cells_of_other_kinds_are_reported_too(tmp_path: Path):
     assert list(places(manifest)) == ["field-proximity-2m"]
     write_report(folder, tmp_path / "report")
     text = (tmp_path / "report" / "report.md").read_text()
-    assert "field-proximity-2m-history-3" in text
     assert "learning-curves.png" in text
+    # It is judged on its own question, not on the paper's.
+    assert "the paper's findings" not in text
+    rows = text.split("## Differences to the first cell")[1].split("##")[0]
+    row = r"\| field-proximity-2m-history-3 \| [+-].* to .*\) \| [\d.]+ \| 2 of \d+ \|"
+    assert re.search(row, rows)
+    assert rows.count("\n| field-proximity-2m") == 2
 
 
 def test_the_cost_of_a_decision_is_in_core_hours(manifest: Manifest, tmp_path: Path):
@@ -164,6 +169,33 @@ def test_the_cost_of_a_decision_is_in_core_hours(manifest: Manifest, tmp_path: P
         hours.append(float(row.split("|")[-2]))
     # Each run took an hour of wall time.
     assert hours[1] == 4 * hours[0] > 0
+
+
+def test_runs_on_an_unknown_number_of_cores_have_no_core_hours(
+    manifest: Manifest, tmp_path: Path
+):
+    def cost(folder: StudyFolder) -> str:
+        write_report(folder, folder.path / "report")
+        text = (folder.path / "report" / "report.md").read_text()
+        (row,) = (line for line in text.splitlines() if line.startswith("| 6a |"))
+        return row.split("|")[-2].strip()
+
+    folder = StudyFolder(tmp_path)
+    folder.plan(manifest)
+    one, other = (
+        manifest.run(f"ray-binary-1m{name}-seed0") for name in ("", "-reduce-min")
+    )
+    for run, success in ((one, 50.0), (other, 70.0)):
+        store(folder, manifest, run, success)
+        config = dataclasses.replace(run.config, num_workers=None)
+        Run(folder.result_path(run.name), config).write_config()
+    # The spread of seeds, for the number that is needed.
+    more = manifest.run("ray-binary-1m-seed1")
+    store(folder, manifest, more, 55.0)
+    known = cost(folder)
+    config = dataclasses.replace(more.config, num_workers=None)
+    Run(folder.result_path(more.name), config).write_config()
+    assert (float(known) > 0, cost(folder)) == (True, "")
 
 
 def test_the_visibility_of_balls_that_all_miss_is_reported(
