@@ -144,8 +144,9 @@ class PlannedRun:
     @property
     def end(self) -> int:
         """Environment steps at its end, rounded up to whole rollouts."""
-        size = self.config.frames_per_batch
-        return math.ceil(self.config.total_frames / size) * size
+        config = self.cell.config
+        size = config.frames_per_batch
+        return math.ceil(config.total_frames / size) * size
 
     def differences(self, other: TrainConfig) -> list[str]:
         """Return the names of the fields in which a configuration is not this run's.
@@ -378,7 +379,9 @@ def cell_name(base: TrainConfig, config: TrainConfig) -> str:
     parts = [config.env.sensor.label()]
     for name, value in _differences(base, config).items():
         if name not in _LABEL:
-            words = [name.rpartition(".")[2], _brief(value)]
+            # A minus sign, as "[-1.0, 1.0]" has, is not one of the hyphens.
+            words = [name.rpartition(".")[2]]
+            words += [re.sub(r"(?<!\w)-(?=\.?\d)", "minus", _brief(value))]
             parts += [re.sub(r"[^\w.]+", "-", word).strip("-") for word in words]
     return "-".join(parts)
 
@@ -417,6 +420,13 @@ def _set(content: Any, name: str, value: Any, *, known: bool) -> None:
         content = content[key]
     if known:
         _check_key(content, last, ".".join(path))
+        if isinstance(content[last], dict) and not name.startswith(_ROBOT):
+            # Its other fields would get their defaults, whatever was set before.
+            group = name.removeprefix("env.")
+            raise ValueError(
+                f"{group} is a group of fields; set them one by one, as "
+                f"{group}.{next(iter(content[last]))}"
+            )
     content[last] = value
 
 

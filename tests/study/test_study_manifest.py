@@ -90,6 +90,8 @@ def test_a_cell_is_named_by_what_differs():
             {"sensor.coverage": "ray", "sensor.reduce": "min"},
             {"ppo.network.hidden": [64, 64], "skin.num_sensors": 8},
             {"task.throws.first_delay": [0.0, 0.5]},
+            {"task.throws.azimuth_deg": [-90.0, 90.0]},
+            {"task.throws.azimuth_deg": [90.0, 90.0]},
         )
     )
     assert [cell.name for cell in manifest.cells] == [
@@ -98,6 +100,8 @@ def test_a_cell_is_named_by_what_differs():
         "ray-proximity-2m-reduce-min",
         "field-proximity-2m-num_sensors-8-hidden-64-64",
         "field-proximity-2m-first_delay-0.0-0.5",
+        "field-proximity-2m-azimuth_deg-minus90.0-90.0",
+        "field-proximity-2m-azimuth_deg-90.0-90.0",
     ]
     assert manifest.cells[-1].config.env.standard == "custom"
     run = manifest.runs[0].config
@@ -113,6 +117,7 @@ def test_a_cell_is_named_by_what_differs():
             "no field 'sensr', did you mean 'sensor'|no field 'sensr'",
         ),
         ({"sensor.range": "far"}, "range"),
+        ({"sensor": {"range": 1.0}}, "sensor is a group.*one by one, as sensor.cover"),
         ({"sensor.range": -1.0}, "sensor.range=-1.0.*must be at least 0.001"),
         ({"sensor.reduce": "min"}, "is for ray sensors"),
         ({"seed": 1}, "seed cannot be set here"),
