@@ -98,7 +98,7 @@ def _pictures(
         "success-by-range": (
             success_by_range(manifest, success),
             "Success against range: interquartile mean and range over seeds; each dot "
-            "is a seed.",
+            "is a seed. Infinite ranges are left out.",
         ),
         "findings": (
             forest(judged) if judged else None,
