@@ -327,13 +327,19 @@ class StudyFolder:
             path.unlink(missing_ok=True)
 
     def last_words(self, name: str) -> str:
-        """Return the last error of a run's latest process, or else its last line."""
+        """Return the last error of a run's latest process, or else its last line.
+
+        Of an error of several lines, as with a worker's traceback, the first and last.
+        """
         with suppress(FileNotFoundError), open(self.log_path(name), "rb") as file:
             file.seek(max(0, file.seek(0, os.SEEK_END) - _TAIL))
             text = file.read().decode(errors="replace").rpartition(START)[2]
             said = [line.strip() for line in text.split("\n")[1:] if line.strip()]
-            errors = [line for line in said if line.startswith("error: ")]
-            return (errors or said or [""])[-1].removeprefix("error: ")
+            starts = [i for i, line in enumerate(said) if line.startswith("error: ")]
+            if starts:
+                first, *rest = said[starts[-1] :]
+                return ": ".join([first.removeprefix("error: "), *rest[-1:]])
+            return said[-1] if said else ""
         return ""
 
     # --- progress -------------------------------------------------------------

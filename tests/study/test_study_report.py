@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import io
 import json
+import math
 import re
 from pathlib import Path
 
@@ -14,7 +15,7 @@ import pytest
 
 from egoskin.commands.study import what_is_seen
 from egoskin.runs.run import Run
-from egoskin.study.figures import equivalence, places
+from egoskin.study.figures import equivalence, places, success_by_range
 from egoskin.study.findings import judge_findings
 from egoskin.study.manifest import Manifest, resolve
 from egoskin.study.metrics import METRICS, frames_to, runs_csv, tables
@@ -230,12 +231,25 @@ def test_signals_whose_seeds_have_no_spread_are_neither_equal_nor_different(
     assert [point.get_color() for point in points] == ["#888888"]
 
 
+def test_an_infinite_range_is_left_out_of_the_figure_over_ranges(manifest: Manifest):
+    names = ("field-proximity-1m", "field-proximity-infm")
+    cells = ({"sensor.range": 1.0}, {"sensor.range": math.inf})
+    mine = resolve(dataclasses.replace(FINDINGS, name="mine", cells=cells))
+    figure = success_by_range(mine, {name: {0: 60.0} for name in names})
+    assert figure is not None
+    (axes,) = figure.axes
+    assert [tick.get_text() for tick in axes.get_xticklabels()] == ["1"]
+    assert np.isfinite(axes.get_xlim()).all()
+    assert success_by_range(mine, {names[1]: {0: 60.0}}) is None
+
+
 def test_visibility_is_that_of_the_cells_with_the_bases_skin(capsys):
     cells = (
         {"sensor.range": 0.5},
         {"sensor.range": 0.5, "skin.num_sensors": 8},
         {"sensor.range": 0.3, "sensor.occlusion": True},
         {"sensor.coverage": "none"},
+        {"sensor.range": math.inf},
     )
     study = dataclasses.replace(
         FINDINGS, name="mine", cells=cells, base={"skin.num_sensors": 4}
@@ -244,6 +258,7 @@ def test_visibility_is_that_of_the_cells_with_the_bases_skin(capsys):
     assert [(c["coverage"], c["range"]) for c in seen["cells"]] == [("field", 0.5)]
     said = capsys.readouterr().out
     assert "not analysed" in said
+    assert "field-proximity-infm" in said
     assert "field-proximity-0.5m-num_sensors-8, field-proximity-0.3m-occlusion" in said
     assert what_is_seen(resolve(dataclasses.replace(study, cells=cells[1:]))) == {}
 
