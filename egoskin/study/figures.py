@@ -159,7 +159,8 @@ def _legend_above(figure: Figure, panels: Iterable[Axes]) -> None:
         list(handles.values()),
         list(handles),
         loc="outside upper center",
-        ncols=min(len(handles), 5),
+        # An entry is up to 1.5 inches wide.
+        ncols=min(len(handles), 5, int(figure.get_figwidth() / 1.5)),
         frameon=False,
         fontsize=9,
     )

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from egoskin.commands.study import what_is_seen
 from egoskin.runs.run import Run
@@ -241,6 +242,20 @@ def test_an_infinite_range_is_left_out_of_the_figure_over_ranges(manifest: Manif
     assert [tick.get_text() for tick in axes.get_xticklabels()] == ["1"]
     assert np.isfinite(axes.get_xlim()).all()
     assert success_by_range(mine, {names[1]: {0: 60.0}}) is None
+
+
+def test_a_legend_fits_into_a_figure_of_one_panel():
+    coverages = ({"sensor.coverage": "none"}, {"sensor.coverage": "oracle"})
+    signals = ("localization", "proximity", "binary")
+    cells = (*({"sensor.signal": signal} for signal in signals), *coverages)
+    mine = resolve(dataclasses.replace(FINDINGS, name="mine", cells=cells))
+    figure = success_by_range(mine, {cell.name: {0: 50.0} for cell in mine.cells})
+    assert figure is not None
+    FigureCanvasAgg(figure).draw()
+    (legend,) = figure.legends
+    box = legend.get_window_extent()
+    assert len(legend.get_texts()) == 5
+    assert figure.bbox.x0 <= box.x0 < box.x1 <= figure.bbox.x1
 
 
 def test_visibility_is_that_of_the_cells_with_the_bases_skin(capsys):
