@@ -14,6 +14,7 @@ egoskin.study.manifest.Study.
 from __future__ import annotations
 
 import json
+import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +29,7 @@ from egoskin.parallel import available_cores
 from egoskin.progress import counted, duration
 from egoskin.storage.serialization import to_plain
 from egoskin.storage.tensor_file import write_file
+from egoskin.study.claims import owner
 from egoskin.study.cost import Speed, cost, measure_all
 from egoskin.study.manifest import Manifest, load_study, resolve, settings
 from egoskin.study.runner import LocalRunner, Progress, Runner, slurm_script
@@ -76,8 +78,11 @@ def fastest(speeds: list[Speed]) -> Speed:
     return max(speeds, key=lambda speed: speed.per_s)
 
 
-def _tell(text: str) -> None:
-    print(text, flush=True)
+def show(text: str, stays: bool) -> None:
+    """Print a line; on a terminal the next one replaces it, unless it stays."""
+    live = sys.stdout.isatty()
+    start, end = ("\r", "\x1b[K" + "\n" * stays) if live else ("", "\n")
+    print(f"{start}{text}", end=end, flush=True)
 
 
 def check_parent(folder: Path) -> None:
@@ -115,7 +120,7 @@ class Plan:
         per_s, source, cores = self.steps_per_s, "as given", available_cores()
         if per_s is None:
             run = manifest.runs[0]
-            best = fastest(measure_all(run, cores, _tell))
+            best = fastest(measure_all(manifest, run, cores))
             per_s = best.per_s / cores
             source = f"measured on {run.cell.name}; full ray grids take longer"
         total = cost(manifest, per_s)
@@ -158,16 +163,18 @@ def what_is_seen(manifest: Manifest) -> dict[str, Any]:
     others = [
         c
         for c in skinned
-        if any(name.startswith(_OF_THE_BASE) for name in manifest.overrides(c))
+        if math.isinf(c.config.env.sensor.range)
+        or any(name.startswith(_OF_THE_BASE) for name in manifest.overrides(c))
     ]
     sensors = [c.config.env.sensor for c in skinned if c not in others]
     if others:
         print(
-            "visibility is not analysed for cells with another robot, skin, shape of "
-            f"sensors or throw than the base: {', '.join(c.name for c in others)}"
+            "visibility is not analysed for cells with an infinite range, or another "
+            "robot, skin, shape of sensors or throw than the base: "
+            f"{', '.join(c.name for c in others)}"
         )
     if not sensors:
-        print("no cell has the skin of the base: there is no visibility to analyse")
+        print("no cell is left: there is no visibility to analyse")
         return {}
     base = manifest.base.env
     analysis = analyse(
@@ -230,36 +237,30 @@ class Run:
         manifest = folder.manifest()
         if self.again:
             folder.forget_failures()
-        live = sys.stdout.isatty()
-
-        def show(text: str) -> None:
-            start, end = ("\r", "\x1b[K") if live else ("", "\n")
-            print(f"{start}{text}", end=end, flush=True)
-
         kind = self._where()
         runner = kind(
             folder,
             parallel=self.parallel,
-            cores_per_run=self.cores_per_run or self._cores_per_run(folder),
+            cores_per_run=self.cores_per_run or self._cores_per_run(folder, manifest),
             tries=self.tries,
             nice=self.nice,
             show=show,
         )
         status = runner.run()
-        print("\r\x1b[K" * live, end="")
-        print_status(manifest, status)
+        print("\r\x1b[K" * sys.stdout.isatty(), end="")
+        print_status(folder, manifest, status)
         if any(each.state != "done" for each in status):
             raise SystemExit(1)
         print(f"done; now: egoskin study report {self.dir}")
 
-    def _cores_per_run(self, folder: StudyFolder) -> int:
+    def _cores_per_run(self, folder: StudyFolder, manifest: Manifest) -> int:
         """Return the number of cores per run with the highest total throughput."""
-        status = folder.status(folder.manifest())
+        status = folder.status(manifest)
         left = [each for each in status if each.state != "done"]
         frames = sum(each.run.end - each.frames for each in left)
         if self.on != "local" or self.parallel or frames < _WORTH_MEASURING:
             return 1
-        measured = measure_all(left[0].run, available_cores(), _tell)
+        measured = measure_all(manifest, left[0].run, available_cores())
         return fastest(measured).cores_per_run
 
     def _where(self) -> type[Runner]:
@@ -285,11 +286,13 @@ class Status:
         """Print a table by cell and seed."""
         folder = StudyFolder(self.dir)
         manifest = folder.manifest()
-        print_status(manifest, folder.status(manifest))
+        print_status(folder, manifest, folder.status(manifest))
 
 
-def print_status(manifest: Manifest, status: list[RunStatus]) -> None:
-    """Print the progress of each run, by cell and seed, and the failures."""
+def print_status(
+    folder: StudyFolder, manifest: Manifest, status: list[RunStatus]
+) -> None:
+    """Print the progress of each run, by cell and seed, where it runs, its failures."""
     entries = {(each.run.cell.name, each.run.seed): entry(each) for each in status}
     width = max(len(cell.name) for cell in manifest.cells)
     wide = max(map(len, entries.values())) + 2
@@ -299,6 +302,8 @@ def print_status(manifest: Manifest, status: list[RunStatus]) -> None:
         row = "".join(f"{entries[cell.name, seed]:<{wide}}" for seed in manifest.seeds)
         print(f"{cell.name:{width}}  {row.rstrip()}")
     for each in status:
+        if each.state == "running" and (where := owner(folder.claims, each.run.name)):
+            print(f"{each.run.name}: running on {where}")
         if each.failure is not None:
             print(
                 f"{each.run.name}: failed {counted(each.failure.tries, 'time')}, "
@@ -371,8 +376,10 @@ class Slurm:
         (self.dir / "logs").mkdir(exist_ok=True)
         elements = self.elements or -(-len(manifest.runs) // self.cores)
         path = self.dir.absolute()
-        shared: dict[str, Any] = {"cores": self.cores, "elements": elements}
-        print(slurm_script(manifest, path, hours=self.hours, **shared), end="")
+        text = slurm_script(
+            manifest, path, cores=self.cores, elements=elements, hours=self.hours
+        )
+        print(text, end="")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
+import torch
 import tyro
 from torch import Tensor
 
@@ -69,25 +70,26 @@ class UpperBoundConfig:
 
 def groups(result: UpperBound) -> list[dict[str, float | int]]:
     """Return counts of throws, of avoided balls and of standing robots, by height."""
-    rows = []
-    for low, high in zip(BOUNDS, BOUNDS[1:], strict=False):
-        member = (result.height >= low) & (result.height < high)
+    return [
+        {
+            "from_m": low,
+            "to_m": high,
+            **_counts(result, (result.height >= low) & (result.height < high)),
+        }
+        for low, high in zip(BOUNDS, BOUNDS[1:], strict=False)
+    ]
 
-        def count(which: Tensor, member: Tensor = member) -> int:
-            return int((which & member).sum())
 
-        rows.append(
-            {
-                "from_m": low,
-                "to_m": high,
-                "throws": int(member.sum()),
-                "policy_avoids": count(result.policy.avoided),
-                "policy_stands": count(result.policy.stood),
-                "search_avoids": count(result.best.avoided),
-                "search_stands": count(result.best.stood),
-            }
-        )
-    return rows
+def _counts(result: UpperBound, member: Tensor) -> dict[str, int]:
+    """Return the counts of some throws, ``[throws]``."""
+    which = {
+        "throws": member,
+        "policy_avoids": result.policy.avoided,
+        "policy_stands": result.policy.stood,
+        "search_avoids": result.best.avoided,
+        "search_stands": result.best.stood,
+    }
+    return {name: int((each & member).sum()) for name, each in which.items()}
 
 
 def table(result: UpperBound, title: str) -> str:
@@ -98,9 +100,9 @@ def table(result: UpperBound, title: str) -> str:
         f"  {'height aimed at':<16} {'throws':>6}  {'avoids':>8} {'and stands':>10}"
         f"  {'avoids':>8} {'and stands':>10}",
     ]
-    rows = groups(result)
-    total = {key: sum(row[key] for row in rows) for key in rows[0]}
-    for row in [*rows, total]:
+    total = _counts(result, torch.ones_like(result.policy.avoided))
+    # More than the sum of the groups, if throws are aimed higher than the last.
+    for row in [*groups(result), total]:
         name = "all" if row is total else f"{row['from_m']:g} to {row['to_m']:g} m"
         lines.append(
             f"  {name:<16} {row['throws']:>6}  {row['policy_avoids']:>8} "

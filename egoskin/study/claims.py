@@ -63,6 +63,20 @@ def is_locked(path: Path) -> bool:
         return False
 
 
+def owner(folder: Path, name: str) -> str:
+    """Return the host and process of a claim's owner as text, "" if unknown.
+
+    Args:
+        folder: Folder of the claims.
+        name: Name of the claim.
+    """
+    for path in reversed(_owners(folder, name)):
+        with suppress(FileNotFoundError, ValueError, KeyError):
+            content = json.loads(path.read_text())
+            return f"{content['name']}, process {content['pid']}"
+    return ""
+
+
 @contextmanager
 def claimed(
     folder: Path,

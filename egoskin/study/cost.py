@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import statistics
 import tempfile
-from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import get_context
@@ -82,39 +82,31 @@ class Speed:
         )
 
 
-def measure_all(
-    run: PlannedRun, cores: int, tell: Callable[[str], None] = lambda text: None
-) -> list[Speed]:
+def measure_all(manifest: Manifest, run: PlannedRun, cores: int) -> list[Speed]:
     """Return the speeds with 1, 2, 4, ... cores per run, with all cores in use.
 
     Each measurement takes about half a minute and trains in temporary folders.
 
     Args:
-        run: The run.
+        manifest: The study; all its runs can use these numbers of cores.
+        run: The run to measure.
         cores: Number of cores to use.
-        tell: Called with a line of text before each measurement.
     """
+    agents = math.gcd(*(cell.config.num_envs for cell in manifest.cells))
     choices = [2**k for k in range(cores.bit_length()) if cores % 2**k == 0]
-    fit = [n for n in choices if run.config.num_envs % n == 0]
-    return [measure(run, n, cores // n, tell) for n in fit]
+    return [measure(run, n, cores // n) for n in choices if agents % n == 0]
 
 
-def measure(
-    run: PlannedRun,
-    cores_per_run: int = 1,
-    parallel: int = 1,
-    tell: Callable[[str], None] = lambda text: None,
-) -> Speed:
-    """Return the speed of some runs in parallel.
+def measure(run: PlannedRun, cores_per_run: int = 1, parallel: int = 1) -> Speed:
+    """Print what is measured; return the speed of some runs in parallel.
 
     Args:
         run: The run, the same in each process.
         cores_per_run: Workers and learner threads of each run.
         parallel: Number of parallel runs, each in its own process.
-        tell: Called with a line of text before the measurement.
     """
-    each = f"{counted(cores_per_run, 'core')} each"
-    tell(f"measuring {counted(parallel, 'run')} of {run.cell.name} on {each} ...")
+    runs, each = counted(parallel, "run"), counted(cores_per_run, "core")
+    print(f"measuring {runs} of {run.cell.name} on {each} each ...", flush=True)
     config = dataclasses.replace(
         run.config, num_workers=cores_per_run, learner_threads=cores_per_run
     )

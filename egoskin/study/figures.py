@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -103,7 +104,12 @@ def success_by_range(manifest: Manifest, table: Table) -> Figure | None:
     One line per signal and one panel per geometry: interquartile mean and range over
     seeds, and each seed as a small dot.
     """
-    grid = {k: v for k, v in places(manifest).items() if table.get(k)}
+    # The axis is logarithmic and finite.
+    grid = {
+        k: v
+        for k, v in places(manifest).items()
+        if table.get(k) and math.isfinite(v.range)
+    }
     names = [
         n for n in _GEOMETRIES.values() if n in {p.geometry for p in grid.values()}
     ]
@@ -153,7 +159,8 @@ def _legend_above(figure: Figure, panels: Iterable[Axes]) -> None:
         list(handles.values()),
         list(handles),
         loc="outside upper center",
-        ncols=min(len(handles), 5),
+        # An entry is up to 1.5 inches wide.
+        ncols=min(len(handles), 5, int(figure.get_figwidth() / 1.5)),
         frameon=False,
         fontsize=9,
     )
@@ -345,12 +352,9 @@ def equivalence(manifest: Manifest, table: Table) -> Figure | None:
     figure.legend(loc="outside upper center", ncols=3, frameon=False, fontsize=9)
     axes.set_yticks(range(len(pairs)), [name for name, _ in pairs], fontsize=8)
     axes.set_ylim(len(pairs) - 0.4, -0.6)
-    reach = max(abs(e.mean) for _, e in pairs)
     reach = max(
-        [
-            reach,
-            *(min(max(map(abs, e.interval())), 100) for _, e in pairs if e.error > 0),
-        ]
+        [abs(e.mean) for _, e in pairs]
+        + [min(max(map(abs, e.interval())), 100) for _, e in pairs if e.error > 0]
     )
     axes.set_xlim(-1.1 * reach - MARGIN, 1.1 * reach + MARGIN)
     axes.set_xlabel("difference in success at 3 s [percentage points]")

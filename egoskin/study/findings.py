@@ -25,9 +25,9 @@ from egoskin.study.statistics import (
     Effect,
     Region,
     Table,
+    assumed_sd,
     contrast,
     holm,
-    seed_sd,
     seeds_needed,
 )
 
@@ -234,6 +234,9 @@ FINDINGS = (
 )
 """The findings, in the paper's order. Values are percentages."""
 
+CELLS = frozenset(name for f in FINDINGS for c in f.claims for name in c.weights)
+"""Names of the cells that the findings are about."""
+
 
 def judge_findings(tables: Mapping[str, Table]) -> list[Judged]:
     """Return the verdict on each finding.
@@ -286,7 +289,7 @@ def _test(finding: Finding, table: Table) -> list[Tested]:
 def _needed(claims: Sequence[Tested], table: Table) -> int | None:
     """Return the number of seeds that decides a finding in its present direction."""
     # Bonferroni, as if all findings were to be decided at once.
-    alpha, one = ALPHA / len(FINDINGS), seed_sd(table)
+    alpha = ALPHA / len(FINDINGS)
     confirm: list[float] = []
     refute: list[int | None] = []
     for tested in claims:
@@ -294,11 +297,7 @@ def _needed(claims: Sequence[Tested], table: Table) -> int | None:
         if effect is None:
             confirm.append(math.nan)
             continue
-        sd = effect.sd
-        if not sd > 0:
-            # Assumed: the spread of the other cells, and unpaired seeds.
-            weights = tested.claim.weights.values()
-            sd = one * math.sqrt(sum(w**2 for w in weights)) or math.nan
+        sd = assumed_sd(effect, tested.claim.weights.values(), table)
         distances = [abs(effect.mean - bound) / sd for bound in region.bounds]
         confirm += distances
         if effect.mean not in region:

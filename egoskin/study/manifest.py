@@ -24,9 +24,16 @@ from egoskin.bounds import COUNT, check_bounds
 from egoskin.envs.standards import Standard, training_task
 from egoskin.hints import did_you_mean
 from egoskin.make import EnvConfig
+from egoskin.policies.policy import load_networks
 from egoskin.rng import check_seed
 from egoskin.robots.own import kept_robot
-from egoskin.runs.config import MACHINE_FIELDS, RESUME_FIELDS, TrainConfig
+from egoskin.runs.config import (
+    INIT_HASH,
+    MACHINE_FIELDS,
+    RESUME_FIELDS,
+    SKIN_HASH,
+    TrainConfig,
+)
 from egoskin.sensors import Skin
 from egoskin.storage.formats import (
     content_hash,
@@ -50,6 +57,8 @@ _NOT_OF_A_STUDY = RESUME_FIELDS | {"seed", "device", "engine"}
 _OF_ALL_CELLS = {"snapshot_frames", "checkpoint_interval"}
 # Compared as a whole: a robot is either a name or data.
 _ROBOT = "env.robot"
+# Files. Runs have other working directories, and the content is compared by its hash.
+_FILES = ("env.skin.path", "init_from")
 # Fields that the sensor's label already contains.
 _LABEL = ("env.sensor.coverage", "env.sensor.signal", "env.sensor.range")
 
@@ -118,6 +127,14 @@ class Cell:
     """Its configuration, with seed 0."""
     skin_sha256: str
     """Hash of its skin."""
+    init_sha256: str | None = None
+    """Hash of the networks that its runs start from; None: new networks."""
+
+    @property
+    def hashes(self) -> dict[str, str]:
+        """Hashes of the files that its results depend on, by their keys in a run."""
+        found = {SKIN_HASH: self.skin_sha256, INIT_HASH: self.init_sha256}
+        return {key: value for key, value in found.items() if value is not None}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,16 +161,30 @@ class PlannedRun:
     @property
     def end(self) -> int:
         """Environment steps at its end, rounded up to whole rollouts."""
-        size = self.config.frames_per_batch
-        return math.ceil(self.config.total_frames / size) * size
+        config = self.cell.config
+        size = config.frames_per_batch
+        return math.ceil(config.total_frames / size) * size
 
-    def differences(self, other: TrainConfig) -> list[str]:
+    def differences(
+        self, other: TrainConfig, hashes: Mapping[str, str] | None = None
+    ) -> list[str]:
         """Return the names of the fields in which a configuration is not this run's.
 
         The length is not compared: a shorter run can be continued.
+
+        Args:
+            other: The configuration.
+            hashes: Hashes of its files, by ``SKIN_HASH`` and ``INIT_HASH``; None: not
+                compared. Their paths may differ.
         """
-        names = changed_fields(to_plain(self.config), to_plain(other))
-        return [n.removeprefix("env.") for n in names if n not in RESUME_FIELDS]
+        old, new = to_plain(self.config), to_plain(other)
+        moved = {n for n in _FILES if None not in (_get(old, n), _get(new, n))}
+        kept = RESUME_FIELDS | moved
+        names = [n for n in changed_fields(old, new) if n not in kept]
+        # Older runs and manifests lack some hashes.
+        own, given = self.cell.hashes.items(), hashes or {}
+        names += [key for key, value in own if given.get(key, value) != value]
+        return [n.removeprefix("env.") for n in names]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -219,7 +250,7 @@ class Manifest:
         for cell in other.cells:
             before = own.setdefault(cell.name, cell)
             if before != cell:
-                names = [*_differences(before.config, cell.config)] or ["skin"]
+                names = [*_differences(before.config, cell.config)] or ["files"]
                 raise ValueError(
                     f"the manifest's cell {cell.name} cannot be changed; it differs in "
                     + ", ".join(names)
@@ -241,7 +272,7 @@ class Manifest:
                 {
                     "name": cell.name,
                     "overrides": self.overrides(cell),
-                    "skin_sha256": cell.skin_sha256,
+                    **cell.hashes,
                 }
                 for cell in self.cells
             ],
@@ -279,7 +310,8 @@ class Manifest:
                     Cell(
                         name=cell["name"],
                         config=config(cell["overrides"]),
-                        skin_sha256=cell["skin_sha256"],
+                        skin_sha256=cell[SKIN_HASH],
+                        init_sha256=cell.get(INIT_HASH),
                     )
                     for cell in content["cells"]
                 ),
@@ -322,9 +354,17 @@ def resolve(study: Study) -> Manifest:
             skin, digest = skins[key]
             # Raises for sensors that do not fit each other.
             config.env.pipeline(skin)
+            init = None
+            if config.init_from is not None:
+                init = content_hash({}, load_networks(config.init_from)[0])
         except (ValueError, OSError) as error:
             raise ValueError(f"{what}: {error}") from error
-        cell = Cell(name=cell_name(base, config), config=config, skin_sha256=digest)
+        cell = Cell(
+            name=cell_name(base, config),
+            config=config,
+            skin_sha256=digest,
+            init_sha256=init,
+        )
         if cell.name in cells:
             raise ValueError(f"{what}: cell {cell.name} is defined twice")
         cells[cell.name] = cell
@@ -360,6 +400,9 @@ def override(
         try:
             if full == _ROBOT and isinstance(value, str):
                 value = kept_robot(value)
+            # The name of a policy of the package is no path.
+            if full in _FILES and isinstance(value, str) and Path(value).exists():
+                value = Path(value).absolute()
             _set(plain, full, to_plain(value), known=True)
         except KeyError as error:
             raise ValueError(f"{what}: {error.args[0]}") from None
@@ -377,8 +420,12 @@ def cell_name(base: TrainConfig, config: TrainConfig) -> str:
     """Return a cell's name: its sensor's label, then other differences to the base."""
     parts = [config.env.sensor.label()]
     for name, value in _differences(base, config).items():
+        if name in _FILES and value is not None:
+            value = Path(value).name
         if name not in _LABEL:
-            words = [name.rpartition(".")[2], _brief(value)]
+            # A minus sign, as "[-1.0, 1.0]" has, is not one of the hyphens.
+            words = [name.rpartition(".")[2]]
+            words += [re.sub(r"(?<!\w)-(?=\.?\d)", "minus", _brief(value))]
             parts += [re.sub(r"[^\w.]+", "-", word).strip("-") for word in words]
     return "-".join(parts)
 
@@ -417,6 +464,13 @@ def _set(content: Any, name: str, value: Any, *, known: bool) -> None:
         content = content[key]
     if known:
         _check_key(content, last, ".".join(path))
+        if isinstance(content[last], dict) and not name.startswith(_ROBOT):
+            # Its other fields would get their defaults, whatever was set before.
+            group = name.removeprefix("env.")
+            raise ValueError(
+                f"{group} is a group of fields; set them one by one, as "
+                f"{group}.{next(iter(content[last]))}"
+            )
     content[last] = value
 
 

@@ -16,7 +16,7 @@ from egoskin.study.statistics import Table
 from egoskin.study.store import Result
 
 # Final success is the mean of the learning curve over this last share of the frames;
-# below this final success, sample efficiency is not computed.
+# below this final success, a run has not learnt.
 _END_SHARE, _LEAST_END = 0.05, 0.05
 
 
@@ -37,15 +37,16 @@ class Metric:
 def frames_to(result: Result, share: float) -> float | None:
     """Return the frames until success in training reaches a share of its final value.
 
-    None if the run did not learn: if its final success is below 5 %.
+    A run that has not learnt (final success below 5 %) has used its whole budget: left
+    out, it would make its cell look fast. None if there are no stored frames.
     """
     frames, success = result.stored.frames, result.stored.success
     if not len(frames):
         return None
     late = frames > (1 - _END_SHARE) * frames[-1]
     end = float(success[late].mean())
-    if not end >= _LEAST_END:
-        return None
+    if end < _LEAST_END:
+        return float(result.run.end)
     first = int(np.argmax(success >= share * end))
     if first == 0:
         return float(frames[0])
@@ -139,7 +140,8 @@ METRICS = (
     ),
 )
 """Metrics of a run. Success, survival, balls and falls are from the throw set; frames
-are from the success in training, with exploration."""
+are from the success in training, with exploration, and are the whole budget for a run
+that has not learnt (final success below 5 %)."""
 
 
 def metric(name: str) -> Metric:

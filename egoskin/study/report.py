@@ -9,8 +9,10 @@ from __future__ import annotations
 import base64
 import html
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from statistics import fmean
 
 from markdown import markdown
 from matplotlib.figure import Figure
@@ -18,6 +20,7 @@ from matplotlib.figure import Figure
 from egoskin.evaluation.visibility import warning_texts
 from egoskin.storage.serialization import read_json
 from egoskin.storage.tensor_file import write_file
+from egoskin.study.differences import Difference, differences
 from egoskin.study.figures import (
     equivalence,
     forest,
@@ -26,10 +29,12 @@ from egoskin.study.figures import (
     save,
     success_by_range,
 )
-from egoskin.study.findings import Judged, Tested, judge_findings
+from egoskin.study.findings import CELLS, Judged, Tested, judge_findings
 from egoskin.study.manifest import Manifest, settings
 from egoskin.study.metrics import METRICS, runs_csv, tables
 from egoskin.study.statistics import (
+    ALPHA,
+    Effect,
     Table,
     mean_effect,
     separation,
@@ -56,8 +61,14 @@ def write_report(folder: StudyFolder, out: Path) -> None:
     results = folder.results(manifest)
     out.mkdir(parents=True, exist_ok=True)
     values = tables(results)
-    judged = judge_findings(values)
-    concerned = [j for j in judged if any(c.effect for c in j.claims)]
+    names = [cell.name for cell in manifest.cells]
+    concerned: list[Judged] = []
+    found: list[Difference] = []
+    if set(names) >= CELLS:
+        judged = judge_findings(values)
+        concerned = [j for j in judged if any(c.effect for c in j.claims)]
+    else:
+        found = differences(names, values["success_3s"])
     pictures = _pictures(manifest, results, values["success_3s"], concerned)
     for name, (figure, _) in pictures.items():
         save(figure, out, name)
@@ -65,7 +76,7 @@ def write_report(folder: StudyFolder, out: Path) -> None:
         name: f"![{caption}]({name}.png)\n\n*{caption}*"
         for name, (_, caption) in pictures.items()
     }
-    blocks = _blocks(folder, manifest, results, values, concerned, shown)
+    blocks = _blocks(folder, manifest, results, values, concerned, found, shown)
     text = "\n\n".join(blocks) + "\n"
     contents = {
         "runs.csv": runs_csv(manifest, results),
@@ -87,7 +98,7 @@ def _pictures(
         "success-by-range": (
             success_by_range(manifest, success),
             "Success against range: interquartile mean and range over seeds; each dot "
-            "is a seed.",
+            "is a seed. Infinite ranges are left out.",
         ),
         "findings": (
             forest(judged) if judged else None,
@@ -97,7 +108,8 @@ def _pictures(
         "equivalence": (
             equivalence(manifest, success),
             "Which signals are equivalent. Shaded: the margin of equivalence; 90 % "
-            "(thick) and 95 % (thin) intervals; hollow: one seed.",
+            "(thick) and 95 % (thin) intervals; hollow: one seed. Each pair is tested "
+            "alone, without correction for their number.",
         ),
         "learning-curves": (
             learning_curves(manifest, results),
@@ -106,7 +118,8 @@ def _pictures(
         ),
         "sample-efficiency": (
             sample_efficiency(manifest, results),
-            "Environment steps until a run reaches 50 and 90 % of its final success.",
+            "Environment steps until a run reaches 50 and 90 % of its final success; "
+            "all its steps if that is below 5 %.",
         ),
     }
     return {k: (f, text) for k, (f, text) in drawn.items() if f is not None}
@@ -118,6 +131,7 @@ def _blocks(
     results: Sequence[Result],
     values: Mapping[str, Table],
     judged: Sequence[Judged],
+    found: Sequence[Difference],
     shown: Mapping[str, str],
 ) -> Iterator[str]:
     """Yield the parts of the report, in Markdown."""
@@ -150,10 +164,20 @@ def _blocks(
         )
         yield _finding_rows(judged, results)
         yield shown["findings"]
+    if found:
+        yield "## Differences to the first cell"
+        yield (
+            f"Success at 3 s of each cell minus that of {manifest.cells[0].name}, "
+            "compared seed by seed if they share two or more seeds. Two-sided "
+            "p-values, corrected for the number of cells (Holm). *Seeds* is the number "
+            "it is based on and, if p is above 0.05, the total that would decide it "
+            "with a power of 80 % if effect and spread stay as observed."
+        )
+        yield _difference_rows(found)
     yield "## The cells"
     yield (
         "Interquartile mean and range over seeds; in brackets the mean with its 95 % "
-        "t interval, which needs two seeds or more."
+        "t interval, which needs two seeds or more; n: if only some seeds have a value."
     )
     yield _cell_rows(manifest, values)
     for name in ("equivalence", "learning-curves", "sample-efficiency"):
@@ -168,7 +192,8 @@ def _blocks(
     known = sorted((r for r in ratios if r[0] >= 0), key=lambda r: -r[0])
     if known:
         yield table(
-            ("metric", "cells / seeds"), [(m.label, f"{r:.2f}") for r, m in known]
+            ("metric", "sd between cells / sd between seeds"),
+            [(m.label, f"{r:.2f}") for r, m in known],
         )
     else:
         yield "Unknown: no cell has two seeds that differ."
@@ -224,30 +249,27 @@ def _deciding(judged: Judged) -> Tested:
 
 
 def _finding_rows(judged: Sequence[Judged], results: Sequence[Result]) -> str:
-    # Core-hours of a run: its workers are as many as its cores.
+    # Core-hours of a run: its workers are as many as its cores. None means all cores
+    # of its machine, whose number the stored configuration does not hold.
     hours = [
-        r.stored.record.wall_s / 3600 * (r.stored.config.num_workers or 1)
+        r.stored.record.wall_s / 3600 * r.stored.config.num_workers
         for r in results
+        if r.stored.config.num_workers is not None
     ]
-    each = sum(hours) / len(hours)
-    have: dict[str, int] = {}
-    for result in results:
-        have[result.run.cell.name] = have.get(result.run.cell.name, 0) + 1
+    have = Counter(result.run.cell.name for result in results)
     rows = []
     for j in judged:
         claim = _deciding(j)
         effect = claim.effect
         assert effect is not None
-        low, high = effect.interval()
-        interval = f" ({low:+.1f} to {high:+.1f})" if effect.error > 0 else ""
         known = sum(c.effect is not None for c in j.claims)
         more = cost = ""
         if j.verdict == "undecided":
             cells = {name for c in j.claims for name in c.claim.weights}
-            more = ", needs more" if j.seeds_needed is None else f" of {j.seeds_needed}"
-            if j.seeds_needed is not None:
-                runs = sum(max(j.seeds_needed - have.get(c, 0), 0) for c in cells)
-                cost = f"{runs * each:,.0f}"
+            more = _more(j.seeds_needed)
+            if j.seeds_needed is not None and hours:
+                runs = sum(max(j.seeds_needed - have[c], 0) for c in cells)
+                cost = f"{runs * fmean(hours):,.0f}"
         text = j.finding.text
         if j.finding.stand_in:
             text += f". Stand-in: {j.finding.stand_in}"
@@ -256,8 +278,8 @@ def _finding_rows(judged: Sequence[Judged], results: Sequence[Result]) -> str:
                 j.finding.label,
                 text,
                 f"**{j.verdict}**",
-                f"{j.p_value:.3f}",
-                f"{claim.claim.name}: {effect.mean:+.1f}{interval}",
+                _p_value(j.p_value),
+                f"{claim.claim.name}: {_effect(effect)}",
                 f"{effect.seeds}{more}",
                 f"{known} of {len(j.claims)}",
                 cost,
@@ -276,6 +298,32 @@ def _finding_rows(judged: Sequence[Judged], results: Sequence[Result]) -> str:
     return table(head, rows)
 
 
+def _difference_rows(found: Sequence[Difference]) -> str:
+    rows = []
+    for each in found:
+        open_ = each.p_value > ALPHA
+        more = _more(each.seeds_needed) if open_ else ""
+        seeds = f"{each.effect.seeds}{more}"
+        rows.append((each.cell, _effect(each.effect), _p_value(each.p_value), seeds))
+    return table(("cell", "difference [points] (95 %)", "p", "seeds"), rows)
+
+
+def _effect(effect: Effect) -> str:
+    """Return an effect with its 95 % interval, if that is known."""
+    low, high = effect.interval()
+    known = effect.error > 0
+    return f"{effect.mean:+.1f}" + f" ({low:+.1f} to {high:+.1f})" * known
+
+
+def _more(needed: int | None) -> str:
+    """Return how many seeds would decide, after the number that there are."""
+    return ", needs more" if needed is None else f" of {needed}"
+
+
+def _p_value(p: float) -> str:
+    return "< 0.001" if p < 0.001 else f"{p:.3f}"
+
+
 def _cell_rows(manifest: Manifest, values: Mapping[str, Table]) -> str:
     rows = []
     for cell in manifest.cells:
@@ -285,7 +333,8 @@ def _cell_rows(manifest: Manifest, values: Mapping[str, Table]) -> str:
         row = [cell.name, str(len(success))]
         for metric in _SHOWN:
             own = list(values[metric.name].get(cell.name, {}).values())
-            row.append(_spread(own))
+            fewer = f", n = {len(own)}" * (0 < len(own) < len(success))
+            row.append(_spread(own) + fewer)
         effect = mean_effect(list(success.values()))
         low, high = effect.interval()
         if effect.error > 0:

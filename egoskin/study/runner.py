@@ -26,8 +26,9 @@ from egoskin.study.job import CLAIMED, STOPPED, command
 from egoskin.study.manifest import Manifest, PlannedRun
 from egoskin.study.store import START, RunStatus, StudyFolder, now
 
-# Intervals at which processes are polled, and a claimed run is tried again [s].
-_POLL, _AGAIN = 0.2, 5.0
+# Intervals at which processes are polled, and at which the folder, which may be on a
+# shared file system, is searched for runs to do if no process has ended [s].
+_POLL, _LOOK = 0.2, 5.0
 # Intervals between progress lines: on a terminal, in a file [s].
 _SHOW_LIVE, _SHOW_FILE = 2.0, 60.0
 PATIENCE_S = 120.0
@@ -86,7 +87,11 @@ class Runner(ABC):
         tries: Maximum number of attempts for each run.
         nice: Niceness of the runs.
         cores_per_run: Workers and learner threads of each run.
-        show: Called with the progress line, and with each failure.
+        show: Called with a line of text, and whether it is to stay: the progress line
+            is replaced by the next line, a failure is not.
+
+    Raises:
+        ValueError: If the agents of a run cannot be divided among its cores.
     """
 
     def __init__(
@@ -97,9 +102,15 @@ class Runner(ABC):
         tries: int = 3,
         nice: int = 5,
         cores_per_run: int = 1,
-        show: Callable[[str], None] = lambda text: None,
+        show: Callable[[str, bool], None] = lambda text, stays: None,
     ) -> None:
         self._folder, self._manifest = folder, folder.manifest()
+        for cell in self._manifest.cells:
+            if cell.config.num_envs % cores_per_run:
+                raise ValueError(
+                    f"--cores-per-run {cores_per_run} must divide num_envs of every "
+                    f"cell; that of {cell.name} is {cell.config.num_envs}"
+                )
         self._parallel, self._tries, self._nice = parallel, tries, nice
         self._cores, self._show = cores_per_run, show
         self._finished: set[str] = set()
@@ -131,17 +142,18 @@ class Runner(ABC):
         for name in ("runs", "results", "claims", "logs", "failed"):
             (self._folder.path / name).mkdir(exist_ok=True)
         interval = _SHOW_LIVE if sys.stdout.isatty() else _SHOW_FILE
-        shown = float("-inf")
+        looked = shown = float("-inf")
         try:
             while True:
-                self._reap()
-                open_runs = self._open_runs()
-                if not (open_runs or self._running()):
-                    return self._folder.status(self._manifest)
-                self._start(open_runs)
+                if self._reap() or time.monotonic() - looked > _LOOK:
+                    open_runs = self._open_runs()
+                    if not (open_runs or self._running()):
+                        return self._folder.status(self._manifest)
+                    self._start(open_runs)
+                    looked = time.monotonic()
                 if time.monotonic() - shown > interval:
                     status = self._folder.status(self._manifest)
-                    self._show(str(Progress.of(status, self._tries)))
+                    self._show(str(Progress.of(status, self._tries)), False)
                     shown = time.monotonic()
                 time.sleep(_POLL)
         finally:
@@ -169,20 +181,23 @@ class Runner(ABC):
             if self._again.get(run.name, clock) > clock:
                 continue
             if self._folder.is_running(run.name):
-                self._again[run.name] = clock + _AGAIN
+                self._again[run.name] = clock + _LOOK
                 continue
             self._begin(run)
 
-    def _reap(self) -> None:
-        """Handle the runs that have ended."""
-        for name, (status, error) in self._ended().items():
+    def _reap(self) -> bool:
+        """Handle the runs that have ended; return whether there are any."""
+        ended = self._ended()
+        for name, (status, error) in ended.items():
             if status == CLAIMED:
-                self._again[name] = time.monotonic() + _AGAIN
+                self._again[name] = time.monotonic() + _LOOK
             elif status not in (0, STOPPED):
                 failure = self._folder.note_failure(name, error)
                 self._show(
-                    f"{name} failed, try {failure.tries} of {self._tries}: {error}"
+                    f"{name} failed, try {failure.tries} of {self._tries}: {error}",
+                    True,
                 )
+        return bool(ended)
 
 
 class LocalRunner(Runner):

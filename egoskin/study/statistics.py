@@ -9,7 +9,7 @@ Contract: nothing is decided if the spread is zero, or unknown as there is one s
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -179,6 +179,22 @@ def contrast(weights: Mapping[str, float], table: Table) -> Effect | None:
         seeds=fewest,
         sd=math.sqrt(sum(v for v, _ in terms)),
     )
+
+
+def assumed_sd(effect: Effect, weights: Collection[float], table: Table) -> float:
+    """Return the standard deviation of a contrast of one seed per cell.
+
+    If it is unknown or zero, the pooled spread of all cells and unpaired seeds are
+    assumed; NaN if that is unknown too.
+
+    Args:
+        effect: The contrast.
+        weights: Weights of its cells.
+        table: Values of the metric.
+    """
+    if effect.sd > 0:
+        return effect.sd
+    return seed_sd(table) * math.sqrt(sum(w**2 for w in weights)) or math.nan
 
 
 def holm(p_values: Sequence[float]) -> list[float]:

@@ -31,6 +31,7 @@ from typing import Any, Literal
 from egoskin.evaluation.throw_set import play_throws, standard_task, summarize
 from egoskin.parallel import default_num_workers
 from egoskin.policies.policy import Policy, load_policy
+from egoskin.runs.config import INIT_HASH, read_config
 from egoskin.runs.run import Run
 from egoskin.sensors import MASK_ALL
 from egoskin.storage.formats import content_hash, read_sealed, sealed_json
@@ -187,7 +188,7 @@ class StudyFolder:
             # Renamed when complete: no incomplete folder has the run's name.
             new = path.with_name(f".{planned.name}.new")
             shutil.rmtree(new, ignore_errors=True)
-            Run.create(dataclasses.replace(config, run_dir=new))
+            _check_files(planned, Run.create(dataclasses.replace(config, run_dir=new)))
             os.rename(new, path)
         stored = Run.open(path).config
         if differs := planned.differences(stored):
@@ -205,12 +206,7 @@ class StudyFolder:
             dataclasses.replace(config, num_workers=cores, learner_threads=cores),
         )
         run.load_skin()
-        if content_hash(read_json(run.skin_path)) != planned.cell.skin_sha256:
-            raise ValueError(
-                f"{run.skin_path} is not the skin of the study's cell "
-                f"{planned.cell.name}: the skin file or the placement of sensors in "
-                "this version of egoskin has changed"
-            )
+        _check_files(planned, run)
         return run
 
     def is_trained(self, planned: PlannedRun) -> bool:
@@ -331,13 +327,19 @@ class StudyFolder:
             path.unlink(missing_ok=True)
 
     def last_words(self, name: str) -> str:
-        """Return the last error of a run's latest process, or else its last line."""
+        """Return the last error of a run's latest process, or else its last line.
+
+        Of an error of several lines, as with a worker's traceback, the first and last.
+        """
         with suppress(FileNotFoundError), open(self.log_path(name), "rb") as file:
             file.seek(max(0, file.seek(0, os.SEEK_END) - _TAIL))
             text = file.read().decode(errors="replace").rpartition(START)[2]
             said = [line.strip() for line in text.split("\n")[1:] if line.strip()]
-            errors = [line for line in said if line.startswith("error: ")]
-            return (errors or said or [""])[-1].removeprefix("error: ")
+            starts = [i for i, line in enumerate(said) if line.startswith("error: ")]
+            if starts:
+                first, *rest = said[starts[-1] :]
+                return ": ".join([first.removeprefix("error: "), *rest[-1:]])
+            return said[-1] if said else ""
         return ""
 
     # --- progress -------------------------------------------------------------
@@ -378,7 +380,8 @@ class StudyFolder:
                 differences to the closest.
         """
         config = Run.open(source).config
-        differs = {run: run.differences(config) for run in manifest.runs}
+        _, hashes = read_config(source / "config.json")
+        differs = {run: run.differences(config, hashes) for run in manifest.runs}
         run = min(manifest.runs, key=lambda run: len(differs[run]))
         if differs[run]:
             raise ValueError(
@@ -392,10 +395,27 @@ class StudyFolder:
         path.symlink_to(source.resolve(), target_is_directory=True)
         try:
             self.open_run(run)
-        except ValueError:
+        except (ValueError, OSError):
             path.unlink()
             raise
         return run
+
+
+def _check_files(planned: PlannedRun, run: Run) -> None:
+    """Raise ValueError unless a run has the skin and initial networks of its cell."""
+    cell = planned.cell
+    if content_hash(read_json(run.skin_path)) != cell.skin_sha256:
+        raise ValueError(
+            f"{run.skin_path} is not the skin of the study's cell {cell.name}: the "
+            "skin file or the placement of sensors in this version of egoskin has "
+            "changed"
+        )
+    _, hashes = read_config(run.path / "config.json")
+    if cell.init_sha256 not in (None, hashes.get(INIT_HASH)):
+        raise ValueError(
+            f"{planned.config.init_from} has changed: it is not what the study's cell "
+            f"{cell.name} starts from"
+        )
 
 
 def judge(

@@ -19,6 +19,7 @@ import egoskin
 import egoskin.commands.evaluate as command
 from calling import BATCH, SMALL, call, fail, succeed
 from egoskin.commands.evaluate import EvaluateConfig
+from egoskin.commands.upper_bound import table
 from egoskin.commands.verify import run_hash
 from egoskin.envs.dodgeball import DodgeballConfig
 from egoskin.evaluation import operating_map
@@ -30,6 +31,7 @@ from egoskin.evaluation.throw_set import (
     evaluate,
     standard_task,
 )
+from egoskin.evaluation.upper_bound import Outcome, UpperBound
 from egoskin.runs.run import Run
 from egoskin.sensors import MASK_ALL
 from egoskin.storage.tensor_file import load_tensors
@@ -314,6 +316,19 @@ def test_an_upper_bound_counts_what_policy_and_search_avoid(tmp_path: Path):
     assert 0 < avoided <= sum(row["search_avoids"] for row in rows)
     bad = fail("upper-bound", "field_proximity", "--reach", "0")
     assert "reach must be positive" in bad
+
+
+def test_all_throws_include_those_aimed_above_the_last_group():
+    # Of three throws, the policy avoids the first and the last, aimed at 2.5 m.
+    avoided = torch.tensor([True, False, True])
+    found = UpperBound(
+        height=torch.tensor([0.5, 1.0, 2.5]),
+        policy=Outcome(avoided=avoided, stood=avoided),
+        best=Outcome(avoided=avoided | True, stood=avoided),
+    )
+    lines = table(found, "title").splitlines()
+    assert lines[-2].split() == ["1.3", "to", "2", "m", *"00000"]
+    assert lines[-1].split() == ["all", *"32232"]
 
 
 def test_a_policy_file_runs_on_a_tensordict_without_any_environment(trained: Path):

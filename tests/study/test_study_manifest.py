@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from egoskin.runs.config import TrainConfig
+from egoskin.make import EnvConfig
+from egoskin.runs.config import INIT_HASH, SKIN_HASH, TrainConfig
 from egoskin.storage.formats import content_hash, read_sealed, sealed_json
 from egoskin.storage.serialization import to_plain
-from egoskin.study.findings import FINDINGS
+from egoskin.study.findings import CELLS, FINDINGS
 from egoskin.study.manifest import (
     EvaluationPlan,
     Manifest,
@@ -24,7 +26,7 @@ from egoskin.study.metrics import METRICS
 from egoskin.study.shipped import PAPER, SMOKE, STUDIES
 from egoskin.study.store import StudyFolder
 from owning import TOML, write_robot
-from studies import as_format_1
+from studies import POLICY, as_format_1
 
 STUDY = Study(
     name="small",
@@ -66,9 +68,10 @@ def test_the_findings_are_decided_by_29_cells_of_the_default_recipe(resolved):
     findings = resolved["findings"]
     assert (len(findings.cells), findings.not_default()) == (29, {})
     names = {cell.name for cell in findings.cells}
-    asked = {name for f in FINDINGS for c in f.claims for name in c.weights}
     # All but the blind robot, which is only the visual baseline of the figures.
-    assert asked == names - {"blind"}
+    assert names - {"blind"} == CELLS
+    for other in ("paper", "paper-1000"):
+        assert {cell.name for cell in resolved[other].cells} >= CELLS
     assert {f.metric for f in FINDINGS} <= {m.name for m in METRICS}
 
 
@@ -89,6 +92,8 @@ def test_a_cell_is_named_by_what_differs():
             {"sensor.coverage": "ray", "sensor.reduce": "min"},
             {"ppo.network.hidden": [64, 64], "skin.num_sensors": 8},
             {"task.throws.first_delay": [0.0, 0.5]},
+            {"task.throws.azimuth_deg": [-90.0, 90.0]},
+            {"task.throws.azimuth_deg": [90.0, 90.0]},
         )
     )
     assert [cell.name for cell in manifest.cells] == [
@@ -97,6 +102,8 @@ def test_a_cell_is_named_by_what_differs():
         "ray-proximity-2m-reduce-min",
         "field-proximity-2m-num_sensors-8-hidden-64-64",
         "field-proximity-2m-first_delay-0.0-0.5",
+        "field-proximity-2m-azimuth_deg-minus90.0-90.0",
+        "field-proximity-2m-azimuth_deg-90.0-90.0",
     ]
     assert manifest.cells[-1].config.env.standard == "custom"
     run = manifest.runs[0].config
@@ -112,6 +119,7 @@ def test_a_cell_is_named_by_what_differs():
             "no field 'sensr', did you mean 'sensor'|no field 'sensr'",
         ),
         ({"sensor.range": "far"}, "range"),
+        ({"sensor": {"range": 1.0}}, "sensor is a group.*one by one, as sensor.cover"),
         ({"sensor.range": -1.0}, "sensor.range=-1.0.*must be at least 0.001"),
         ({"sensor.reduce": "min"}, "is for ray sensors"),
         ({"seed": 1}, "seed cannot be set here"),
@@ -237,6 +245,48 @@ def test_an_option_that_is_no_more_and_had_an_effect_is_refused(tmp_path: Path):
     )
     with pytest.raises(ValueError, match=r"manifest\.json was made with core_frames="):
         folder.manifest()
+
+
+def test_files_are_named_by_absolute_paths_and_pinned_by_their_content(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    config = EnvConfig()
+    skin = config.skin.build(config.robot_config)
+    (tmp_path / "skins").mkdir()
+    skin.save(tmp_path / "skins/my.json")
+    shutil.copy(POLICY, tmp_path / "old.safetensors")
+    monkeypatch.chdir(tmp_path)
+    cells = (
+        {"skin.path": "skins/my.json"},
+        {"sensor.coverage": "none", "init_from": "old.safetensors"},
+        {"sensor.coverage": "none", "init_from": "blind"},
+    )
+    manifest = changed(cells=cells)
+    manifest.save(tmp_path / "m.json")
+    monkeypatch.chdir("/")
+    assert Manifest.load(tmp_path / "m.json") == manifest
+    names = ("my.json", "old.safetensors", "blind")
+    assert [c.name.rpartition("-")[2] for c in manifest.cells] == [*names]
+    one, other, own = (cell.config for cell in manifest.cells)
+    assert one.env.skin.path == tmp_path / "skins/my.json"
+    assert other.init_from == tmp_path / "old.safetensors"
+    assert own.init_from == Path("blind")
+    # The same networks, by whatever name.
+    assert manifest.cells[1].init_sha256 == manifest.cells[2].init_sha256 is not None
+    with pytest.raises(ValueError, match=r"small, cell 1: no policy none\.safet"):
+        changed(cells=({"init_from": "none.safetensors"},))
+
+
+def test_a_run_is_compared_by_the_content_of_its_files_not_their_place():
+    cell = {"sensor.coverage": "none", "init_from": "blind"}
+    run = changed(cells=(cell,)).runs[0]
+    moved = dataclasses.replace(run.config, init_from=Path("/elsewhere"))
+    hashes = run.cell.hashes
+    assert run.differences(moved, hashes) == []
+    assert run.differences(moved, {**hashes, INIT_HASH: "0"}) == [INIT_HASH]
+    assert run.differences(moved, {**hashes, SKIN_HASH: "0"}) == [SKIN_HASH]
+    new = dataclasses.replace(run.config, init_from=None)
+    assert run.differences(new) == ["init_from"]
 
 
 def test_robots_of_ones_own_are_kept_as_data(tmp_path: Path):

@@ -6,19 +6,22 @@ import csv
 import dataclasses
 import io
 import json
+import math
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from egoskin.commands.study import what_is_seen
 from egoskin.runs.run import Run
-from egoskin.study.figures import equivalence, places
+from egoskin.study.figures import equivalence, places, success_by_range
+from egoskin.study.findings import judge_findings
 from egoskin.study.manifest import Manifest, resolve
 from egoskin.study.metrics import METRICS, frames_to, runs_csv, tables
 from egoskin.study.report import page, table, write_report
-from egoskin.study.shipped import FINDINGS
+from egoskin.study.shipped import FINDINGS, SMOKE
 from egoskin.study.store import StudyFolder
 from studies import expected, store, store_all
 
@@ -142,8 +145,13 @@ def test_cells_of_other_kinds_are_reported_too(tmp_path: Path):
     assert list(places(manifest)) == ["field-proximity-2m"]
     write_report(folder, tmp_path / "report")
     text = (tmp_path / "report" / "report.md").read_text()
-    assert "field-proximity-2m-history-3" in text
     assert "learning-curves.png" in text
+    # It is judged on its own question, not on the paper's.
+    assert "the paper's findings" not in text
+    rows = text.split("## Differences to the first cell")[1].split("##")[0]
+    row = r"\| field-proximity-2m-history-3 \| [+-].* to .*\) \| [\d.]+ \| 2 of \d+ \|"
+    assert re.search(row, rows)
+    assert rows.count("\n| field-proximity-2m") == 2
 
 
 def test_the_cost_of_a_decision_is_in_core_hours(manifest: Manifest, tmp_path: Path):
@@ -163,6 +171,33 @@ def test_the_cost_of_a_decision_is_in_core_hours(manifest: Manifest, tmp_path: P
         hours.append(float(row.split("|")[-2]))
     # Each run took an hour of wall time.
     assert hours[1] == 4 * hours[0] > 0
+
+
+def test_runs_on_an_unknown_number_of_cores_have_no_core_hours(
+    manifest: Manifest, tmp_path: Path
+):
+    def cost(folder: StudyFolder) -> str:
+        write_report(folder, folder.path / "report")
+        text = (folder.path / "report" / "report.md").read_text()
+        (row,) = (line for line in text.splitlines() if line.startswith("| 6a |"))
+        return row.split("|")[-2].strip()
+
+    folder = StudyFolder(tmp_path)
+    folder.plan(manifest)
+    one, other = (
+        manifest.run(f"ray-binary-1m{name}-seed0") for name in ("", "-reduce-min")
+    )
+    for run, success in ((one, 50.0), (other, 70.0)):
+        store(folder, manifest, run, success)
+        config = dataclasses.replace(run.config, num_workers=None)
+        Run(folder.result_path(run.name), config).write_config()
+    # The spread of seeds, for the number that is needed.
+    more = manifest.run("ray-binary-1m-seed1")
+    store(folder, manifest, more, 55.0)
+    known = cost(folder)
+    config = dataclasses.replace(more.config, num_workers=None)
+    Run(folder.result_path(more.name), config).write_config()
+    assert (float(known) > 0, cost(folder)) == (True, "")
 
 
 def test_the_visibility_of_balls_that_all_miss_is_reported(
@@ -197,12 +232,39 @@ def test_signals_whose_seeds_have_no_spread_are_neither_equal_nor_different(
     assert [point.get_color() for point in points] == ["#888888"]
 
 
+def test_an_infinite_range_is_left_out_of_the_figure_over_ranges(manifest: Manifest):
+    names = ("field-proximity-1m", "field-proximity-infm")
+    cells = ({"sensor.range": 1.0}, {"sensor.range": math.inf})
+    mine = resolve(dataclasses.replace(FINDINGS, name="mine", cells=cells))
+    figure = success_by_range(mine, {name: {0: 60.0} for name in names})
+    assert figure is not None
+    (axes,) = figure.axes
+    assert [tick.get_text() for tick in axes.get_xticklabels()] == ["1"]
+    assert np.isfinite(axes.get_xlim()).all()
+    assert success_by_range(mine, {names[1]: {0: 60.0}}) is None
+
+
+def test_a_legend_fits_into_a_figure_of_one_panel():
+    coverages = ({"sensor.coverage": "none"}, {"sensor.coverage": "oracle"})
+    signals = ("localization", "proximity", "binary")
+    cells = (*({"sensor.signal": signal} for signal in signals), *coverages)
+    mine = resolve(dataclasses.replace(FINDINGS, name="mine", cells=cells))
+    figure = success_by_range(mine, {cell.name: {0: 50.0} for cell in mine.cells})
+    assert figure is not None
+    FigureCanvasAgg(figure).draw()
+    (legend,) = figure.legends
+    box = legend.get_window_extent()
+    assert len(legend.get_texts()) == 5
+    assert figure.bbox.x0 <= box.x0 < box.x1 <= figure.bbox.x1
+
+
 def test_visibility_is_that_of_the_cells_with_the_bases_skin(capsys):
     cells = (
         {"sensor.range": 0.5},
         {"sensor.range": 0.5, "skin.num_sensors": 8},
         {"sensor.range": 0.3, "sensor.occlusion": True},
         {"sensor.coverage": "none"},
+        {"sensor.range": math.inf},
     )
     study = dataclasses.replace(
         FINDINGS, name="mine", cells=cells, base={"skin.num_sensors": 4}
@@ -211,6 +273,7 @@ def test_visibility_is_that_of_the_cells_with_the_bases_skin(capsys):
     assert [(c["coverage"], c["range"]) for c in seen["cells"]] == [("field", 0.5)]
     said = capsys.readouterr().out
     assert "not analysed" in said
+    assert "field-proximity-infm" in said
     assert "field-proximity-0.5m-num_sensors-8, field-proximity-0.3m-occlusion" in said
     assert what_is_seen(resolve(dataclasses.replace(study, cells=cells[1:]))) == {}
 
@@ -224,8 +287,9 @@ def test_frames_to_a_share_are_read_off_the_curve(
     # is the mean of the last twentieth, 0.9924.
     own = -0.2 * np.log(1 - 0.5 * 0.9924)
     assert frames_to(result, 0.5) == pytest.approx(own * end, rel=2e-3)
+    # A run that has not learnt has used its whole budget.
     blind = folder.result(manifest.run("blind-seed0"))
-    assert frames_to(blind, 0.5) is None
+    assert frames_to(blind, 0.5) == blind.run.end
     # Between stored lines it is linear: 0, 0.2, 0.4 and then 0.8.
     stored = dataclasses.replace(
         result.stored,
@@ -234,6 +298,46 @@ def test_frames_to_a_share_are_read_off_the_curve(
     )
     result = dataclasses.replace(result, stored=stored)
     assert frames_to(result, 0.75) == pytest.approx(25)
+
+
+def test_seeds_that_never_learn_do_not_make_a_cell_look_fast(
+    manifest: Manifest, tmp_path: Path
+):
+    folder = StudyFolder(tmp_path)
+    more = resolve(dataclasses.replace(FINDINGS, seeds=(0, 1, 2, 3, 4)))
+    results = []
+    for seed in range(5):
+        run = more.run(f"field-proximity-2m-seed{seed}")
+        store(folder, more, run, 60.0 if seed < 3 else 1.0)
+        results.append(folder.result(run))
+    # Three learn within about a fifth of the budget, two do not learn.
+    for seed in range(3):
+        frames = results[seed].run.end * np.array([0, 0.20 + 0.01 * seed, 0.5, 1])
+        stored = dataclasses.replace(
+            results[seed].stored, frames=frames, success=np.array([0, 0.5, 0.5, 0.5])
+        )
+        results[seed] = dataclasses.replace(results[seed], stored=stored)
+    for kept, verdict in ((3, "confirmed"), (5, "undecided")):
+        values = tables(results[:kept])
+        (judged,) = (j for j in judge_findings(values) if j.finding.label == "6b")
+        assert judged.verdict == verdict
+    shares = values["share_to_90"]["field-proximity-2m"]
+    # 90 % of the way to 20, 21, 22 %.
+    assert list(shares.values()) == pytest.approx([18, 18.9, 19.8, 100, 100])
+
+
+def test_a_value_that_only_some_seeds_have_says_how_many(tmp_path: Path):
+    folder, manifest = StudyFolder(tmp_path), resolve(SMOKE)
+    folder.plan(manifest)
+    # The second seed avoids no first ball, and thus has no later ones.
+    for seed, success in enumerate((50.0, 0.0)):
+        run = manifest.run(f"field-proximity-2m-seed{seed}")
+        store(folder, manifest, run, success)
+    write_report(folder, tmp_path / "report")
+    text = (tmp_path / "report" / "report.md").read_text()
+    (row,) = (x for x in text.splitlines() if x.startswith("| field-proximity-2m |"))
+    assert row.count("n = ") == 1
+    assert "| 40.0, n = 1 |" in row
 
 
 def test_the_tables_hold_what_there_is(folder: StudyFolder, manifest: Manifest):

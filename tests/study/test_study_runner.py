@@ -9,6 +9,7 @@ import json
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -18,12 +19,14 @@ from pathlib import Path
 import pytest
 
 from calling import call, hide, limit_file_size, succeed, wait_for
+from egoskin.commands.study import print_status, show
 from egoskin.runs.run import Run
 from egoskin.storage.formats import read_sealed, sealed_json
 from egoskin.storage.serialization import to_plain
+from egoskin.study import cost as cost_module
 from egoskin.study import store
 from egoskin.study.claims import claimed
-from egoskin.study.cost import cost, measure
+from egoskin.study.cost import cost, measure, measure_all
 from egoskin.study.job import CLAIMED, STOPPED, Stop, work
 from egoskin.study.manifest import EvaluationPlan, Manifest, PlannedRun, Study, resolve
 from egoskin.study.metrics import runs_csv
@@ -239,6 +242,35 @@ def test_a_run_with_another_skin_is_refused(folder: StudyFolder):
         work(folder, NAME, Never())
 
 
+def test_a_run_whose_first_networks_have_changed_is_refused(tmp_path: Path):
+    folder = StudyFolder(tmp_path / "study")
+    cell = {"sensor.coverage": "none", "init_from": "blind"}
+    study = dataclasses.replace(SHORT, cells=(cell,), base={"num_envs": 16})
+    manifest = folder.plan(resolve(study))
+    assert folder.open_run(manifest.runs[0]).config.init_from == Path("blind")
+    old = dataclasses.replace(manifest.cells[0], init_sha256="0" * 64)
+    manifest = dataclasses.replace(manifest, cells=(old,), seeds=(1,))
+    with pytest.raises(ValueError, match="blind has changed: it is not what the study"):
+        folder.open_run(manifest.runs[0])
+    # It can be restored: no folder was made.
+    assert not folder.run_path(manifest.runs[0].name).exists()
+
+
+def test_a_link_to_a_run_that_cannot_be_read_is_removed(
+    folder: StudyFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    made = tmp_path / "made"
+    shutil.move(folder.run_path(NAME), made)
+
+    def fail(path: Path) -> None:
+        raise OSError(f"the disk of {path} is gone")
+
+    monkeypatch.setattr(store, "read_json", fail)
+    with pytest.raises(OSError, match="is gone"):
+        folder.adopt(folder.manifest(), made)
+    assert not os.path.lexists(folder.run_path(NAME))
+
+
 def test_a_result_that_was_edited_or_exchanged_is_refused(folder: StudyFolder):
     (file,) = folder.result_path(NAME).glob("evaluation_*.json")
     content = json.loads(file.read_text())
@@ -283,6 +315,39 @@ def test_status_tells_failures_and_what_is_left(folder: StudyFolder):
     assert folder.status(manifest)[1].state == "missing"
 
 
+def test_the_last_words_of_a_worker_have_its_reason(folder: StudyFolder):
+    path = folder.log_path(NAME)
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(
+        "--- started\nerror: worker 0 of 1 raised\nTraceback\n  line 1\nValueError: x\n"
+    )
+    assert folder.last_words(NAME) == "worker 0 of 1 raised: ValueError: x"
+    path.write_text("--- started\nnote\nerror: the disk is full\n")
+    assert folder.last_words(NAME) == "the disk is full"
+
+
+def test_a_failure_stays_on_a_terminal(monkeypatch: pytest.MonkeyPatch, capsys):
+    for live, text in (
+        (True, "\rprogress\x1b[K\rfailed\x1b[K\n"),
+        (False, "progress\nfailed\n"),
+    ):
+        monkeypatch.setattr(sys.stdout, "isatty", lambda live=live: live)
+        show("progress", False)
+        show("failed", True)
+        assert capsys.readouterr().out == text
+
+
+def test_status_says_where_a_run_is_running(folder: StudyFolder, capsys):
+    shutil.rmtree(folder.result_path(NAME))
+    manifest = folder.manifest()
+    with claimed(folder.claims, NAME):
+        print_status(folder, manifest, folder.status(manifest))
+    where = f"{NAME}: running on {socket.gethostname()}, process {os.getpid()}\n"
+    assert where in capsys.readouterr().out
+    print_status(folder, manifest, folder.status(manifest))
+    assert "running on" not in capsys.readouterr().out
+
+
 def test_a_failure_that_is_forgotten_meanwhile_is_none(
     folder: StudyFolder, monkeypatch: pytest.MonkeyPatch
 ):
@@ -303,6 +368,15 @@ def test_a_study_costs_whole_runs_on_whole_cores(tiny: Manifest):
     assert total.core_s == pytest.approx(12.288)
     assert total.wall_s(3) == pytest.approx(2 * 3.072)
     assert total.wall_s(64) == pytest.approx(3.072)
+
+
+def test_only_numbers_of_cores_that_all_cells_can_use_are_measured(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    monkeypatch.setattr(cost_module, "measure", lambda run, *numbers: numbers)
+    cells = ({"num_envs": 16}, {"num_envs": 6})
+    manifest = resolve(dataclasses.replace(SHORT, cells=cells))
+    assert measure_all(manifest, manifest.runs[0], 4) == [(1, 4), (2, 2)]
 
 
 @pytest.mark.slow
@@ -347,6 +421,52 @@ def test_no_process_is_begun_for_a_run_that_ppo_trains(folder: StudyFolder):
         runner._start([planned])
     with pytest.raises(InterruptedError, match=NAME):
         Asked(folder, parallel=1)._start([planned])
+
+
+def test_cores_that_do_not_divide_the_agents_are_refused_before_a_run_starts(
+    folder: StudyFolder,
+):
+    text = "--cores-per-run 3 must divide num_envs of every cell; that of blind is 16"
+    with pytest.raises(ValueError, match=text):
+        LocalRunner(folder, cores_per_run=3)
+
+
+class Waiting(Asked):
+    """A runner whose only run takes a second."""
+
+    def __init__(self, folder: StudyFolder) -> None:
+        super().__init__(folder)
+        self._until = time.monotonic() + 1
+
+    def _running(self) -> list[str]:
+        return [NAME] if time.monotonic() < self._until else []
+
+    def _ended(self) -> dict[str, tuple[int, str]]:
+        return {} if self._running() else {NAME: (0, "")}
+
+
+def test_a_runner_that_waits_leaves_the_file_system_alone(
+    folder: StudyFolder, monkeypatch: pytest.MonkeyPatch
+):
+    manifest = folder.plan(resolve(dataclasses.replace(SHORT, seeds=(0, 1))))
+    other, looks = manifest.runs[1].name, []
+    failure = folder.failure
+
+    def noted(name: str) -> Failure | None:
+        looks.append(name)
+        return failure(name)
+
+    folder.note_failure(other, "error")
+    monkeypatch.setattr(folder, "failure", noted)
+    runner = Waiting(folder)
+    runner._tries = 1
+    began = time.monotonic()
+    status = runner.run()
+    # The progress line and the final status read it once each, as do the first look
+    # and the one after the end of the run.
+    assert looks == [other] * 4
+    assert [each.state for each in status] == ["done", "failed"]
+    assert time.monotonic() - began < 3
 
 
 class Runner:

@@ -121,7 +121,6 @@ def replay_raw(physics: MujocoPhysics, written: list[tuple[str, tuple]]) -> None
 
 def loop(config: LoopConfig) -> list[Row]:
     """Return the rows of the loop benchmark, for the field and the ray grid."""
-    check_num_workers(config.num_envs, config.num_workers)
     rows = []
     for coverage in ("field", "ray"):
         sensor = replace(config.env.sensor, coverage=coverage, reduce="none")

@@ -15,13 +15,13 @@ class Row:
     """One line of the result."""
 
     name: str
-    """Layer measured."""
+    """Name of the quantity."""
     value: float
-    """Median."""
+    """Its value."""
     unit: str
     """Unit of the value."""
     ratio: float
-    """Median ratio to the first row, over pairs measured in turn."""
+    """Ratio to the reference that the benchmark's function names; 1 without one."""
 
 
 def median_row(
