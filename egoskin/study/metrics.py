@@ -45,7 +45,8 @@ def frames_to(result: Result, share: float) -> float | None:
         return None
     late = frames > (1 - _END_SHARE) * frames[-1]
     end = float(success[late].mean())
-    if end < _LEAST_END:
+    # Also if no episode was long enough to tell (NaN).
+    if not end >= _LEAST_END:
         return float(result.run.end)
     first = int(np.argmax(success >= share * end))
     if first == 0:

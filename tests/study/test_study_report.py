@@ -290,6 +290,11 @@ def test_frames_to_a_share_are_read_off_the_curve(
     # A run that has not learnt has used its whole budget.
     blind = folder.result(manifest.run("blind-seed0"))
     assert frames_to(blind, 0.5) == blind.run.end
+    # So has one without an episode that was long enough to tell.
+    unknown = np.full_like(blind.stored.success, np.nan)
+    stored = dataclasses.replace(blind.stored, success=unknown)
+    blind = dataclasses.replace(blind, stored=stored)
+    assert frames_to(blind, 0.5) == blind.run.end
     # Between stored lines it is linear: 0, 0.2, 0.4 and then 0.8.
     stored = dataclasses.replace(
         result.stored,
