@@ -208,8 +208,6 @@ def test_an_evaluation_may_mask_all_sensors_or_those_of_some_links(
         (["--mask", "torso_lnk"], "no sensor on 'torso_lnk'; links with sensors"),
         (["--mask", "all", "torso_link"], "no sensor on 'all'"),
         (["--standard", "3"], "--standard"),
-        (["--throw", "standard"], "--throw"),
-        (["--numb"], "--numb"),
         (["--map", "map.txt"], ".png"),
         (["--map", "no/map.png"], "no folder no"),
         (["--throw-set", str(2**32)], "throw_set must be in [0, 2**32)"),
@@ -270,9 +268,10 @@ def test_the_workers_of_an_evaluation_are_those_of_all_its_parts(
         return []
 
     monkeypatch.setattr(command, "perturb", noted)
-    figures_of(tmp_path, trained, "--perturbed", "--num-workers", "2")
-    # A quarter of the episodes on as many workers as divide it.
-    assert used == [(1, 1)]
+    args = ("--perturbed", "--episodes", "8", "--num-workers", "2")
+    assert call("evaluate", trained, *args).returncode == 0
+    # A quarter of the episodes, on as many workers as divide it.
+    assert used == [(2, 2)]
 
 
 def test_a_table_names_the_ages_of_the_task():

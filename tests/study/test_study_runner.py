@@ -290,7 +290,6 @@ def test_a_failure_that_is_forgotten_meanwhile_is_none(
     folder.note_failure(NAME, "error")
     (path,) = folder.path.glob("failed/*.json")
     path.unlink()
-    monkeypatch.setattr(Path, "exists", lambda path: True)
     assert folder.failure(NAME) is None
     monkeypatch.setattr(Path, "glob", lambda folder, pattern: [path])
     folder.forget_failures()
