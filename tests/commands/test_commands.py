@@ -17,7 +17,9 @@ from tensordict import TensorDict
 
 import egoskin
 import egoskin.commands.evaluate as command
-from calling import BATCH, SMALL, call, fail, succeed
+from calling import BATCH, SCHEDULES, SMALL, call, fail, succeed
+from egoskin.agents.ppo import PPO
+from egoskin.agents.rollout import collect
 from egoskin.commands.evaluate import EvaluateConfig
 from egoskin.commands.verify import run_hash
 from egoskin.envs.dodgeball import DodgeballConfig
@@ -30,6 +32,7 @@ from egoskin.evaluation.throw_set import (
     evaluate,
     standard_task,
 )
+from egoskin.runs import trainer
 from egoskin.runs.run import Run
 from egoskin.sensors import MASK_ALL
 from egoskin.storage.tensor_file import load_tensors
@@ -57,12 +60,31 @@ def test_a_run_folder_holds_what_is_needed_to_understand_it(trained: Path):
     assert names == ["000000000000", f"{4 * BATCH:012d}"]
 
 
-def test_a_resumed_run_equals_one_that_never_stopped(trained: Path, tmp_path: Path):
+def test_a_resumed_run_equals_one_that_never_stopped(
+    trained: Path, tmp_path: Path, monkeypatch
+):
+    correlations, frames = [], []
+    update = PPO.update
+
+    def collecting(*args):
+        correlations.append(args[-1])
+        return collect(*args)
+
+    def updating(self: PPO, rollout: TensorDict, now: int):
+        frames.append(now)
+        return update(self, rollout, now)
+
+    monkeypatch.setattr(trainer, "collect", collecting)
+    monkeypatch.setattr(PPO, "update", updating)
     args = ("--run-dir", tmp_path / "halves", "--total-frames", 2 * BATCH)
-    succeed("train", *SMALL, *args)
+    succeed("train", *SMALL, *SCHEDULES, *args)
     succeed("train", "--resume", tmp_path / "halves", "--total-frames", 4 * BATCH)
     whole, halves = (Run.open(path) for path in (trained, tmp_path / "halves"))
     assert run_hash(halves) == run_hash(whole)
+    # The schedules change with the frames of the run, not of the call.
+    now = halves.config.ppo.noise_correlation
+    assert correlations == [0, now, now, now]
+    assert frames == [0, BATCH, 2 * BATCH, 3 * BATCH]
 
 
 def test_ctrl_c_leaves_a_checkpoint_and_says_how_to_go_on(tmp_path: Path):
