@@ -18,7 +18,10 @@ from pathlib import Path
 import pytest
 
 from calling import call, hide, limit_file_size, succeed, wait_for
+from egoskin.evaluation.throw_set import evaluate, standard_task
+from egoskin.make import EnvConfig
 from egoskin.runs.run import Run
+from egoskin.sensors import MASK_ALL
 from egoskin.storage.formats import read_sealed, sealed_json
 from egoskin.storage.serialization import to_plain
 from egoskin.study import store
@@ -29,6 +32,7 @@ from egoskin.study.manifest import EvaluationPlan, Manifest, PlannedRun, Study, 
 from egoskin.study.metrics import runs_csv
 from egoskin.study.runner import LocalRunner, Progress, slurm_script
 from egoskin.study.store import Failure, RunStatus, StudyFolder
+from making import make_policy
 
 # 16 agents x 16 steps are 256 frames a rollout.
 BATCH = 256
@@ -253,6 +257,21 @@ def test_a_result_that_was_edited_or_exchanged_is_refused(folder: StudyFolder):
     shutil.copy(policies / "000000000000.safetensors", policy)
     with pytest.raises(ValueError, match="does not belong to the policy"):
         table(folder)
+
+
+def test_a_policy_is_judged_with_and_without_its_skin():
+    # With random weights it soon falls, one way or another.
+    policy, plan = make_policy(EnvConfig()), EvaluationPlan(episodes=8)
+    result = store.judge(policy, plan)
+    config = standard_task(policy.env_config, plan.standard)
+    which = {"throw_set": plan.throw_set, "episodes": plan.episodes}
+    seen, masked = (
+        dataclasses.asdict(evaluate(policy, config, policy.skin, mask=mask, **which))
+        for mask in ((), MASK_ALL)
+    )
+    assert {name: result[name] for name in seen} == seen
+    assert result["masked"] == masked
+    assert seen != masked
 
 
 # --- progress -----------------------------------------------------------------------
