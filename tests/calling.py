@@ -26,6 +26,8 @@ from egoskin.interrupts import ENDING
 SCRIPTS = Path(__file__).parents[1] / "scripts"
 SMALL = ("--num-envs", "32", "--num-workers", "2", "--ppo.num-mini-batches", "2")
 """Options of a small training."""
+SCHEDULES = ("--ppo.noise-correlation-start", "512", "--ppo.entropy-frames", "1024")
+"""Options with which a small training reaches the ends of its schedules."""
 BATCH = 512
 """Environment steps of one rollout of it: 32 agents x 16 steps."""
 

@@ -20,7 +20,7 @@ import torch
 from hypothesis import settings
 from tensordict import TensorDict
 
-from calling import BATCH, SMALL, succeed
+from calling import BATCH, SCHEDULES, SMALL, succeed
 from egoskin.robots.config import H1_2, RobotConfig
 from egoskin.sensors import Skin, place_sensors
 from egoskin.sensors.kernels import compilation
@@ -107,7 +107,8 @@ def random_state(
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run of four rollouts; tests that change it must copy it."""
     folder = tmp_path_factory.mktemp("runs") / "trained"
-    succeed("train", *SMALL, "--run-dir", folder, "--total-frames", 4 * BATCH)
+    size = ("--total-frames", 4 * BATCH)
+    succeed("train", *SMALL, *SCHEDULES, *size, "--run-dir", folder)
     return folder
 
 

@@ -142,6 +142,18 @@ def test_a_watchdog_stops_it_for_good(controller, state, change, why):
     assert controller.stopped is None
 
 
+def test_an_action_that_is_not_finite_stops_it_for_good(controller, state, monkeypatch):
+    last = controller.step(**state)
+    # Exporting refuses policies that give such actions.
+    broken = SimpleNamespace(run=lambda *args: [np.full((1, 21), np.nan)])
+    with monkeypatch.context() as patch:
+        patch.setattr(controller, "_session", broken)
+        np.testing.assert_array_equal(controller.step(**state), last)
+    assert controller.stopped == "the policy's action is not finite"
+    moved = {**state, "distance": np.full(64, 0.3)}
+    np.testing.assert_array_equal(controller.step(**moved), last)
+
+
 def test_a_stop_from_the_first_step_on_leaves_the_robot_as_it_is(controller, state):
     state["joint_pos"] = state["joint_pos"] + 0.1
     controller.stop("the operator let go of the button")

@@ -70,11 +70,10 @@ def test_the_state_for_sparse_sources_has_no_history():
 
 
 @pytest.mark.parametrize("kind", [FieldSensor, RaySensor])
-@pytest.mark.parametrize("compiled", [False, True])
-def test_one_shape_needs_no_list(kind, compiled, robot, skin, random_state):
+def test_one_shape_needs_no_list(kind, robot, skin, random_state):
     ball, state = Sphere(radius=0.3), random_state(50, objects=1)
     one, listed = (
-        kind(skin, robot.chain, objects, 2.0, compile=compiled)(state.clone())
+        kind(skin, robot.chain, objects, 2.0)(state.clone())
         for objects in (ball, [ball])
     )
     assert one["object_detected"].any()

@@ -407,7 +407,14 @@ def test_nan_is_passed_on(shape, dtype, coordinate):
     not any(map(shutil.which, (os.environ.get("CXX", "g++"), "clang++"))),
     reason="torch.compile needs a C++ compiler",
 )
-@every_shape
+@pytest.mark.parametrize(
+    "shape",
+    [
+        # By default the one whose parts are those of two others.
+        pytest.param(shape, id=kind, marks=[pytest.mark.slow] * (kind != "capsule"))
+        for kind, shape in SMALL.items()
+    ],
+)
 def test_compiled_code_gives_the_same_bits(shape):
     # Not a multiple of any vector length: the rest is computed one by one.
     p, d = draw_beams(1003, torch.float32)

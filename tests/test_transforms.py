@@ -421,13 +421,20 @@ def run(env, steps: int) -> list[TensorDict]:
     return out
 
 
-@pytest.mark.parametrize("sensor", SENSORS.values(), ids=SENSORS)
-def test_environment_keeps_its_specs(sensor):
-    config = EnvConfig(task=TASK, sensor=sensor)
-    env = make_worker_env(config, SKIN, num_envs=6, seed=0)
-    check_env_specs(env)
-    env = make_worker_env(config, SKIN, num_envs=6, seed=0, keep_raw=True)
-    check_env_specs(env)
+FORMS = {name: {"sensor": sensor} for name, sensor in SENSORS.items()}
+FORMS |= {
+    "history": {"sensor": SENSORS["binary"], "history": 3},
+    "velocity": {"sensor": SENSORS["oracle"], "privileged": "velocity"},
+    "previous action": {"sensor": SENSORS["blind"], "previous_action": True},
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_environment_keeps_its_specs(form):
+    config = EnvConfig(task=TASK, **FORMS[form])
+    for keep_raw in (False, True):
+        env = make_worker_env(config, SKIN, num_envs=6, seed=0, keep_raw=keep_raw)
+        check_env_specs(env)
 
 
 @pytest.mark.parametrize("sparse", [False, True])
@@ -461,8 +468,10 @@ def test_masked_sensors_detect_nothing_and_the_critic_still_observes(sparse, kee
     check_env_specs(masked)
 
 
-@pytest.mark.parametrize("content", ["objects", "velocity"])
-@pytest.mark.parametrize("signal", ["proximity", "localization", "binary"])
+@pytest.mark.parametrize(
+    ("signal", "content"),
+    [("proximity", "objects"), ("localization", "velocity"), ("binary", "objects")],
+)
 def test_signals_are_those_of_the_state_under_staggered_resets(signal, content):
     # Fixed actions, rows that end at different steps: what stands in the tensordict
     # must always be what the raw state beside it gives offline.

@@ -203,13 +203,13 @@ def build_stuck(skin, loop: bool) -> TransformedEnv:
 
 @pytest.mark.parametrize("loop", [False, True])
 def test_a_worker_that_hangs_is_ended(skin, loop, monkeypatch):
-    monkeypatch.setattr(workers, "HANG_LIMIT", 2.0)
     stuck = partial(build_stuck, skin, loop)
     pool = WorkerPool([partial(build_faulty, skin), stuck])
     root = pool.reset()
     processes = list(pool._workers)
     root["action"] = torch.zeros(*root.batch_size, 21)
     pool.step_and_maybe_reset(root.clone())
+    monkeypatch.setattr(workers, "HANG_LIMIT", 2.0)
     start = time.monotonic()
     with pytest.raises(WorkerError, match="worker 1 of 2 hung: no answer in 2 s"):
         pool.step_and_maybe_reset(root)
@@ -424,9 +424,13 @@ def build_badly(parent: int, fault: str, skin) -> TransformedEnv:
 def test_a_worker_that_fails_while_it_starts_is_reported(
     skin, fault, message, monkeypatch
 ):
-    # The other one starts in time.
-    monkeypatch.setattr(workers, "HANG_LIMIT", 5.0)
     good = partial(make_worker_env, EnvConfig(), skin, num_envs=4, seed=0)
+    if fault == "hang":
+        # With the imports done, the other one starts in time.
+        pool = WorkerPool([good])
+        pool.reset()
+        pool.close()
+        monkeypatch.setattr(workers, "HANG_LIMIT", 5.0)
     pool = WorkerPool([good, partial(build_badly, os.getpid(), fault, skin)])
     with pytest.raises(WorkerError, match=f"worker 1 of 2 {message}"):
         pool.reset()
@@ -440,9 +444,9 @@ def test_a_worker_that_fails_when_asked_is_reported(skin, monkeypatch):
     with pytest.raises(WorkerError, match=r"raised\n(.|\n)*AttributeError.*'nonsense'"):
         pool._ask("nonsense")
     pool.close()
-    monkeypatch.setattr(workers, "HANG_LIMIT", 1.0)
     pool = make_pool(skin, 2)
     pool.reset()
+    monkeypatch.setattr(workers, "HANG_LIMIT", 1.0)
     os.kill(pool._workers[0].pid, signal.SIGSTOP)
     with pytest.raises(WorkerError, match="worker 0 of 2 hung: no answer in 1 s"):
         pool.simulation_state()

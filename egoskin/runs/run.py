@@ -361,11 +361,11 @@ class Run:
             raise ValueError(f"{self.path} has not been trained: it has no metrics.csv")
         return self._metrics_path.read_text()
 
-    def start_metrics(self, frames: int) -> None:
-        """Open the logs, dropping entries after a number of frames.
+    def tidy(self) -> None:
+        """Remove unfinished files; create the policies' folder again if it was removed.
 
-        The folder of the policies is created again if it was removed, and so is the log
-        of metrics if it was removed, edited or damaged.
+        Raises:
+            ValueError: If the folder of the policies is a link.
         """
         policies = self.path / "policies"
         if policies.is_symlink():
@@ -374,6 +374,12 @@ class Run:
         for folder in (self.path, policies):
             for left in folder.glob(PARTIAL):
                 left.unlink()
+
+    def start_metrics(self, frames: int) -> None:
+        """Open the logs, dropping entries after a number of frames.
+
+        The log of metrics is created again if it was removed, edited or damaged.
+        """
         path, text = self._metrics_path, self._metrics.encode()
         try:
             if not read_regular(path, sys.maxsize).startswith(text):

@@ -302,6 +302,7 @@ def open_trainer(run: Run, num_threads: int = 1) -> Iterator[Trainer]:
         # Unreadable files are reported before the workers start.
         skin = run.load_skin()
         checkpoint = None if run.is_new() else run.load_checkpoint()
+        run.tidy()
         if config.engine == "mujoco":
             # The server imports while the rest is built.
             start_server()

@@ -41,6 +41,21 @@ def test_bench_loop_gives_its_rows(tmp_path: Path):
     assert sum(parts) == pytest.approx(1e6 / by_name["train_field"]["value"])
 
 
+@pytest.mark.parametrize(
+    ("name", "args", "unit"),
+    [
+        ("physics", ("--steps", "1"), "environment steps/s of one core"),
+        ("sensors", ("--snapshots", "1"), "ms"),
+    ],
+)
+def test_a_bench_of_parts_gives_positive_rows(name, args, unit, tmp_path: Path):
+    size = ("--num-envs", "2", "--rounds", "1", *args)
+    succeed("bench", name, *size, "--json", tmp_path / "rows.json")
+    rows = json.loads((tmp_path / "rows.json").read_text())["rows"]
+    assert len({row["name"] for row in rows}) == len(rows) > 1
+    assert all(row["value"] > 0 and row["unit"] == unit for row in rows)
+
+
 @pytest.mark.slow
 def test_bench_gradients_compares_rollouts_and_leaves_the_run_alone(
     trained: Path, tmp_path: Path

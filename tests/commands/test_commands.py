@@ -17,7 +17,9 @@ from tensordict import TensorDict
 
 import egoskin
 import egoskin.commands.evaluate as command
-from calling import BATCH, SMALL, call, fail, succeed
+from calling import BATCH, SCHEDULES, SMALL, call, fail, succeed
+from egoskin.agents.ppo import PPO
+from egoskin.agents.rollout import collect
 from egoskin.commands.evaluate import EvaluateConfig
 from egoskin.commands.upper_bound import table
 from egoskin.commands.verify import run_hash
@@ -32,6 +34,7 @@ from egoskin.evaluation.throw_set import (
     standard_task,
 )
 from egoskin.evaluation.upper_bound import Outcome, UpperBound
+from egoskin.runs import trainer
 from egoskin.runs.run import Run
 from egoskin.sensors import MASK_ALL
 from egoskin.storage.tensor_file import load_tensors
@@ -59,12 +62,31 @@ def test_a_run_folder_holds_what_is_needed_to_understand_it(trained: Path):
     assert names == ["000000000000", f"{4 * BATCH:012d}"]
 
 
-def test_a_resumed_run_equals_one_that_never_stopped(trained: Path, tmp_path: Path):
+def test_a_resumed_run_equals_one_that_never_stopped(
+    trained: Path, tmp_path: Path, monkeypatch
+):
+    correlations, frames = [], []
+    update = PPO.update
+
+    def collecting(*args):
+        correlations.append(args[-1])
+        return collect(*args)
+
+    def updating(self: PPO, rollout: TensorDict, now: int):
+        frames.append(now)
+        return update(self, rollout, now)
+
+    monkeypatch.setattr(trainer, "collect", collecting)
+    monkeypatch.setattr(PPO, "update", updating)
     args = ("--run-dir", tmp_path / "halves", "--total-frames", 2 * BATCH)
-    succeed("train", *SMALL, *args)
+    succeed("train", *SMALL, *SCHEDULES, *args)
     succeed("train", "--resume", tmp_path / "halves", "--total-frames", 4 * BATCH)
     whole, halves = (Run.open(path) for path in (trained, tmp_path / "halves"))
     assert run_hash(halves) == run_hash(whole)
+    # The schedules change with the frames of the run, not of the call.
+    now = halves.config.ppo.noise_correlation
+    assert correlations == [0, now, now, now]
+    assert frames == [0, BATCH, 2 * BATCH, 3 * BATCH]
 
 
 def test_ctrl_c_leaves_a_checkpoint_and_says_how_to_go_on(tmp_path: Path):
@@ -210,8 +232,6 @@ def test_an_evaluation_may_mask_all_sensors_or_those_of_some_links(
         (["--mask", "torso_lnk"], "no sensor on 'torso_lnk'; links with sensors"),
         (["--mask", "all", "torso_link"], "no sensor on 'all'"),
         (["--standard", "3"], "--standard"),
-        (["--throw", "standard"], "--throw"),
-        (["--numb"], "--numb"),
         (["--map", "map.txt"], ".png"),
         (["--map", "no/map.png"], "no folder no"),
         (["--throw-set", str(2**32)], "throw_set must be in [0, 2**32)"),
@@ -272,9 +292,10 @@ def test_the_workers_of_an_evaluation_are_those_of_all_its_parts(
         return []
 
     monkeypatch.setattr(command, "perturb", noted)
-    figures_of(tmp_path, trained, "--perturbed", "--num-workers", "2")
-    # A quarter of the episodes on as many workers as divide it.
-    assert used == [(1, 1)]
+    args = ("--perturbed", "--episodes", "8", "--num-workers", "2")
+    assert call("evaluate", trained, *args).returncode == 0
+    # A quarter of the episodes, on as many workers as divide it.
+    assert used == [(2, 2)]
 
 
 def test_a_table_names_the_ages_of_the_task():
@@ -331,20 +352,16 @@ def test_all_throws_include_those_aimed_above_the_last_group():
     assert lines[-1].split() == ["all", *"32232"]
 
 
-def test_a_policy_file_runs_on_a_tensordict_without_any_environment(trained: Path):
+def test_a_run_and_its_last_policy_act_alike_without_any_environment(trained: Path):
     policy = egoskin.load_policy(trained / "policies" / f"{4 * BATCH:012d}.safetensors")
-    assert policy.in_keys == ["observation", "signal"]
     td = policy.env_config.sensor
     assert (td.coverage, td.signal, td.range) == ("field", "proximity", 2.0)
     assert len(policy.skin) == 64
     batch = TensorDict(
         {"observation": torch.zeros(7, 48), "signal": torch.ones(7, 64)}, [7]
     )
-    assert policy(batch)["action"].shape == (7, 21)
-    same = egoskin.load_policy(trained)(batch.clone())
-    assert torch.equal(same["action"], batch["action"])
-    with pytest.raises(KeyError, match="'signal' is missing"):
-        policy(batch.select("observation"))
+    action = policy(batch)["action"]
+    assert torch.equal(egoskin.load_policy(trained)(batch)["action"], action)
 
 
 CELLS = [

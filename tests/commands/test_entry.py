@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import inspect
 import os
 import re
@@ -26,6 +27,12 @@ ROOT = SCRIPTS.parent
 # Scripts that are not commands: development tools and examples.
 OWN = {"fit_shell", "deploy_mujoco", "reuse_gymnasium", "reuse_recording"}
 OWN |= {"reuse_urdf_arm", "train_sb3"}
+
+
+@functools.cache
+def described(*words: str) -> str:
+    """Return the help of a command or subcommand."""
+    return succeed(*words, "--help")
 
 
 def egoskin(monkeypatch, *args: str) -> None:
@@ -95,14 +102,12 @@ def test_every_command_has_a_first_page(monkeypatch, capsys):
 @pytest.mark.parametrize("name", [n for n in COMMANDS if n not in WITH_SUBCOMMANDS])
 def test_the_first_page_says_what_the_options_are(name):
     """Names, choices and defaults are the same as in the parser."""
-    usage, described = re.split(
-        r"\boptions  *[-─ ]", succeed(name, "--help"), maxsplit=1
-    )
+    usage, options = re.split(r"\boptions  *[-─ ]", described(name), maxsplit=1)
     assert usage.startswith(f"usage: egoskin {name} ")
-    whole = " ".join(described.replace("│", " ").split())
-    options = re.split(r"\n  (?=--)", PAGES[name].split("\n\n  egoskin")[0])[1:]
-    assert len(options) <= 10
-    for text in options:
+    whole = " ".join(options.replace("│", " ").split())
+    first = re.split(r"\n  (?=--)", PAGES[name].split("\n\n  egoskin")[0])[1:]
+    assert len(first) <= 10
+    for text in first:
         option, choices = re.match(r"(\S+) ?(\{[\w,]+\})?", text).groups()
         told = re.search(rf" {option}[ ,](.*?)\((?:default: (.*?)|required)\)", whole)
         assert told, option
@@ -116,7 +121,7 @@ def test_the_first_page_says_what_the_options_are(name):
 
 def test_the_pages_of_commands_with_subcommands_name_them_all():
     for name in WITH_SUBCOMMANDS:
-        usage, *_ = succeed(name, "--help").split("}")
+        usage, *_ = described(name).split("}")
         first, subcommands = usage.split("{")
         assert first.startswith(f"usage: egoskin {name} ")
         named = re.findall(rf"^  egoskin {name} (\S+)", PAGES[name], re.MULTILINE)
@@ -130,9 +135,9 @@ def test_the_examples_of_a_page_have_options_that_there_are(name):
     for example in found:
         words = example.split(" > ")[0].split()
         subcommand = words[:1] if name in WITH_SUBCOMMANDS else []
-        described = succeed(name, *subcommand, "--help")
+        text = described(name, *subcommand)
         for option in filter(lambda word: word.startswith("--"), words):
-            assert re.search(rf"{option}[ ,\n│]", described), example
+            assert re.search(rf"{option}[ ,\n│]", text), example
 
 
 @pytest.mark.parametrize("args", [(), ("-h",), ("--help",)])

@@ -12,10 +12,9 @@ from calling import call, succeed
 from owning import MODEL, TOML, write_robot
 
 
-@pytest.mark.parametrize("script", ["robot", "robot.py"])
-def test_a_robot_that_stands_is_told_so_and_drawn(script, tmp_path):
+def test_a_robot_that_stands_is_told_so_and_drawn(tmp_path):
     picture = tmp_path / "walker.png"
-    out = succeed(script, "check", write_robot(tmp_path / "walker"), "--out", picture)
+    out = succeed("robot", "check", write_robot(tmp_path / "walker"), "--out", picture)
     # 10 + 2 x (1 + 2 + 0.5) kg; 0.69 + 0.4 m.
     assert out.startswith("walker: 6 joints, 7 links, 17.00 kg\n")
     assert "1.09 m tall, its base 0.69 m up" in out

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from calling import fail, succeed
+from calling import call, fail, succeed
+from egoskin.commands import verify
 from egoskin.commands.verify import agree, run_hash
 from egoskin.parallel import WorkerPool
 from egoskin.runs.config import TrainConfig
@@ -68,6 +69,17 @@ def test_a_difference_of_one_bit_is_found(exact, monkeypatch, tmp_path, capsys):
     # One worker and four give the same result in both cases.
     assert one == four
     assert (one == two == resumed) == exact
+
+
+@pytest.mark.parametrize("results", [(False, True), (True, False), (True, True)])
+def test_one_difference_is_the_verdict(results, monkeypatch):
+    # Both numbers of agents are tried; a blind robot has no sensors to corrupt.
+    given = iter(results)
+    monkeypatch.setattr(verify, "agree", lambda *args: next(given))
+    done = call("verify", "--num-envs", "16", "--sensor.coverage", "none")
+    assert next(given, None) is None
+    assert done.returncode == (0 if all(results) else 1)
+    assert ("NOT equal" in done.stderr) == (not all(results))
 
 
 def test_the_hash_is_of_values_alone(tmp_path):

@@ -168,9 +168,15 @@ def test_a_split_gives_the_same_bits_and_so_does_a_resume():
     other = DodgeballEnv(H1_2, config, num_envs=6, seed=2)
     other.reset()
     other.load_simulation_state(saved)
-    again, _ = play(other, 15, kept)
+    again, _ = play(other, 15, kept.clone())
+    # A worker that resumes some of the rows.
+    part = DodgeballEnv(H1_2, config, num_envs=4, seed=2, row_offset=2)
+    part.reset()
+    part.load_simulation_state(saved)
+    rows, _ = play(part, 15, kept[2:].clone())
     for key in ("joint_pos", "base_pose", "torque_saturation", "reward"):
         assert torch.equal(rest[key], again[key])
+        assert torch.equal(rest[key][:, 2:], rows[key])
 
 
 def test_it_is_a_matter_of_training_a_standard_judges_the_model():

@@ -197,16 +197,6 @@ def test_what_another_shape_covers_gets_no_points(small_robot):
     assert (points.position[small, 0] + 1).min() >= 0.875 - 1e-5
 
 
-def test_links_share_points_by_exposed_area(points):
-    # Independent count: points of every primitive in proportion to its whole area,
-    # minus those in other primitives, which a different seed must reproduce.
-    other = sample_surface(H1_2, H1_2.links, N, seed=99)
-    for i in range(len(H1_2.links)):
-        share = (other.link == i).mean()
-        error = 5 * (share * (1 - share) * (1 / N + 1 / len(points.link))) ** 0.5
-        assert (points.link == i).mean() == pytest.approx(share, abs=error + 1e-9)
-
-
 def test_only_the_links_asked_for_get_points():
     points = sample_surface(H1_2, ["left_elbow_link", "torso_link"], 500, seed=0)
     names = {H1_2.links[i] for i in points.link}

@@ -13,6 +13,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -31,6 +32,7 @@ from egoskin.runs.events import EventFile
 from egoskin.runs.films import FilmMaker
 from egoskin.runs.run import Run
 from egoskin.runs.starts import git_state
+from egoskin.runs.survival import SurvivalCurve
 from egoskin.runs.trainer import METRIC_KEYS, Trainer, open_trainer, train
 from egoskin.sensors.config import SensorConfig
 from egoskin.storage.formats import read_sealed, sealed_json
@@ -172,6 +174,23 @@ def test_policies_are_kept_at_the_start_in_between_and_at_the_end(config: TrainC
     assert egoskin.load_policy(found[-1]).policy_spec.frames == 192
 
 
+@pytest.mark.parametrize(("interval", "frames"), [(1e-6, [64, 128]), (1e9, [0, 0])])
+def test_checkpoints_are_written_at_their_interval(
+    interval: float, frames: list[int], config: TrainConfig
+):
+    run = Run.create(replace(config, checkpoint_interval=interval))
+    found = []
+
+    def read(_: object) -> None:
+        found.append(load_tensors(run.checkpoint_path)[1]["frames"])
+
+    with open_trainer(run) as trainer:
+        train(trainer, show=read)
+    # When the second and the third rollout are shown.
+    assert found[1:] == frames
+    assert load_tensors(run.checkpoint_path)[1]["frames"] == 192
+
+
 @pytest.mark.slow
 def test_films_are_made_of_policies_on_the_way(config: TrainConfig, capfd):
     with open_trainer(Run.create(replace(config, film_every=128))) as trainer:
@@ -256,11 +275,16 @@ def test_metrics_go_to_weights_and_biases(config: TrainConfig, monkeypatch):
     assert [step for step, _ in given["rows"]] == [256]
 
 
-def test_a_commit_is_recorded_only_of_a_repository_that_holds_the_source(tmp_path):
+def test_a_commit_is_recorded_only_of_a_repository_that_holds_the_source(
+    tmp_path, monkeypatch
+):
     # An installed copy in an ignored folder of a user's repository.
     source = tmp_path / "site" / "run.py"
     source.parent.mkdir()
     source.write_text("")
+    # A developer's own settings, such as signed commits, do not apply.
+    for name in ("GIT_CONFIG_GLOBAL", "GIT_CONFIG_SYSTEM"):
+        monkeypatch.setenv(name, os.devnull)
     git = ["git", "-c", "user.name=a", "-c", "user.email=a@b", "-C", str(tmp_path)]
     (tmp_path / ".gitignore").write_text("site\n")
     for command in (["init", "-q"], ["add", "."], ["commit", "-q", "-m", "mine"]):
@@ -316,7 +340,10 @@ def test_a_link_that_cannot_be_replaced_is_refused(
         open_trainer(run),
     ):
         pass
-    assert elsewhere.is_dir() or elsewhere.read_text() == "mine"
+    if name == "lock":
+        assert elsewhere.read_text() == "mine"
+    else:
+        assert not list(elsewhere.iterdir())
 
 
 def test_a_metrics_file_turned_into_a_link_while_it_trains_is_not_followed(
@@ -463,6 +490,38 @@ def test_an_episode_ends_by_one_cause(finished: Trainer):
     metrics = finished._episode_metrics(info)
     assert metrics["episode/ended_by_ball"] == pytest.approx(2 / 3)
     assert metrics["episode/ended_by_fall"] == pytest.approx(1 / 3)
+
+
+def test_success_and_survival_count_from_the_first_throw(
+    finished: Trainer, monkeypatch
+):
+    task = finished.config.env.task
+
+    def metrics(later: int) -> dict[str, float]:
+        curve = SurvivalCurve(task.episode_steps)
+        monkeypatch.setattr(finished, "survival", curve)
+        # Steps 30 to 30 + 3 s of four agents, thrown at after step 30; one ends at 31.
+        steps = torch.arange(30, 31 + round(task.success_s * task.physics.control_hz))
+        info = TensorDict(batch_size=[len(steps), 4])
+        for key in METRIC_KEYS:
+            info[key] = torch.zeros(*info.shape, 1, dtype=torch.bool)
+        info["episode_step"] = (later + steps)[:, None, None].expand(-1, 4, 1).clone()
+        info["first_throw_step"] = torch.full((*info.shape, 1), later + 30)
+        info["terminated"][1, 0] = True
+        # It has started again, and waits for its first throw.
+        info["episode_step"][2:, 0] = 1
+        info["reward"] = torch.zeros(*info.shape, 1)
+        info["reward_terms"] = torch.zeros(*info.shape, len(TERMS))
+        return finished._episode_metrics(info)
+
+    found = metrics(0)
+    # 3 of 4 survive age 1, and all three the rest.
+    assert found["episode/success"] == pytest.approx(3 / 4)
+    # Ages 0 to 3 s have been reached: 1 step of survival 1 and 3 s of 3/4.
+    expected = 1 / task.physics.control_hz + 3 / 4 * task.success_s
+    assert found["episode/survival_s"] == pytest.approx(expected)
+    # Only the age counts.
+    np.testing.assert_equal(metrics(7), found)
 
 
 @pytest.mark.parametrize("back", [False, True])

@@ -181,10 +181,8 @@ def test_only_full_grids_have_hits(form, random_state):
 # --- environments ---------------------------------------------------------------
 
 
-@COMPILED
 @pytest.mark.parametrize("sensor", SENSORS.values(), ids=SENSORS)
-def test_a_masked_link_is_one_without_sensors(sensor, compiled, monkeypatch):
-    monkeypatch.setenv(SETTING, str(int(compiled)))
+def test_a_masked_link_is_one_without_sensors(sensor):
     mask = ("torso_link", "left_elbow_link")
     masked = SENSING.masked(mask)
     assert 0 < len(masked) < len(SKIN)

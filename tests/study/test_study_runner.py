@@ -20,7 +20,10 @@ import pytest
 
 from calling import call, hide, limit_file_size, succeed, wait_for
 from egoskin.commands.study import print_status, show
+from egoskin.evaluation.throw_set import evaluate, standard_task
+from egoskin.make import EnvConfig
 from egoskin.runs.run import Run
+from egoskin.sensors import MASK_ALL
 from egoskin.storage.formats import read_sealed, sealed_json
 from egoskin.storage.serialization import to_plain
 from egoskin.study import cost as cost_module
@@ -32,6 +35,7 @@ from egoskin.study.manifest import EvaluationPlan, Manifest, PlannedRun, Study, 
 from egoskin.study.metrics import runs_csv
 from egoskin.study.runner import LocalRunner, Progress, slurm_script
 from egoskin.study.store import Failure, RunStatus, StudyFolder
+from making import make_policy
 
 # 16 agents x 16 steps are 256 frames a rollout.
 BATCH = 256
@@ -287,6 +291,21 @@ def test_a_result_that_was_edited_or_exchanged_is_refused(folder: StudyFolder):
         table(folder)
 
 
+def test_a_policy_is_judged_with_and_without_its_skin():
+    # With random weights it soon falls, one way or another.
+    policy, plan = make_policy(EnvConfig()), EvaluationPlan(episodes=8)
+    result = store.judge(policy, plan)
+    config = standard_task(policy.env_config, plan.standard)
+    which = {"throw_set": plan.throw_set, "episodes": plan.episodes}
+    seen, masked = (
+        dataclasses.asdict(evaluate(policy, config, policy.skin, mask=mask, **which))
+        for mask in ((), MASK_ALL)
+    )
+    assert {name: result[name] for name in seen} == seen
+    assert result["masked"] == masked
+    assert seen != masked
+
+
 # --- progress -----------------------------------------------------------------------
 
 
@@ -355,7 +374,6 @@ def test_a_failure_that_is_forgotten_meanwhile_is_none(
     folder.note_failure(NAME, "error")
     (path,) = folder.path.glob("failed/*.json")
     path.unlink()
-    monkeypatch.setattr(Path, "exists", lambda path: True)
     assert folder.failure(NAME) is None
     monkeypatch.setattr(Path, "glob", lambda folder, pattern: [path])
     folder.forget_failures()

@@ -13,7 +13,8 @@ from egoskin.runs.run import Run, TrainConfig
 from egoskin.study.store import StudyFolder
 from egoskin.study.stored import load_run, record, thin
 
-ARCHIVE = Path(__file__).parents[2] / "studies" / "version-1"
+STUDIES = Path(__file__).parents[2] / "studies"
+ARCHIVE = STUDIES / "version-1"
 
 
 def test_thinned_metrics_keep_a_line_for_each_block_and_the_last():
@@ -62,6 +63,16 @@ def test_a_folder_that_is_not_whole_is_named(missing, tmp_path: Path):
         path.unlink()
     with pytest.raises(ValueError, match=rf"half is incomplete: .*{missing}"):
         load_run(half)
+
+
+def test_the_runs_so_far_of_the_study_in_progress_are_read():
+    folder = StudyFolder(STUDIES / "findings")
+    manifest = folder.manifest()
+    results = folder.results(manifest)
+    stored = {path.name for path in (folder.path / "results").iterdir()}
+    assert {r.run.name for r in results} == stored
+    standards = {r.stored.config.env.standard for r in results}
+    assert standards == {manifest.evaluation.standard}
 
 
 def test_the_runs_of_version_1_are_kept_as_a_study():

@@ -276,13 +276,14 @@ def test_darts_stick_unless_they_meet_one_that_stuck_before(seed, n, most):
 
 def test_the_time_of_an_elimination_grows_as_the_number_of_points():
     rng, times = np.random.default_rng(0), []
-    for n in (3_000, 30_000):
+    # The shorter one three times, as a disturbance weighs more there.
+    for n in (3_000, 3_000, 3_000, 30_000):
         points = rng.random((n, 3)) * [1, 1, 0]
         start = time.process_time()
         left = eliminate(points, np.ones(n), n // 5, 1.0)
         times.append(time.process_time() - start)
     # Ten times as many; comparing all pairs takes a hundred times as long.
-    assert times[1] < 35 * times[0]
+    assert times[3] < 35 * min(times[:3])
     # As far apart as if there were few: most keep the minimum distance.
     closest = 2 * (1 / (2 * 3**0.5 * n / 5)) ** 0.5 * 0.65 * (1 - 0.2**1.5)
     kept = throw_darts(points[left], np.full(len(left), closest / 2), n)

@@ -1,0 +1,45 @@
+"""Success on perturbed robots: what is reported is what was played."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from egoskin.envs.randomization import RandomizationConfig
+from egoskin.evaluation.perturbations import PERTURBATIONS, Perturbed, perturb
+from egoskin.evaluation.throw_set import play_throws, standard_task, summarize
+from egoskin.policies.policy import load_policy
+
+
+def test_each_perturbation_is_played_and_so_is_the_mask(monkeypatch):
+    names = ("none", "gains 0.8 to 1.2", "actions two steps late")
+    for name in PERTURBATIONS.keys() - names:
+        monkeypatch.delitem(PERTURBATIONS, name)
+    policy = load_policy("field_proximity")
+    config = standard_task(policy.env_config)
+    task = replace(config.task, success_s=2.0, episode_length_s=2.0)
+    which = {"throw_set": 0, "episodes": 12}
+
+    def played(
+        name: str, ranges: RandomizationConfig, mask: tuple[str, ...]
+    ) -> Perturbed:
+        own = replace(task, randomization=ranges)
+        subject = policy, replace(config, task=own), policy.skin
+        episodes = play_throws(*subject, mask=mask, **which)
+        result = summarize(episodes, episodes, own)
+        return Perturbed(
+            name=name,
+            success=result.success,
+            success_5s=result.success_5s,
+            ended_by_fall=result.ended_by_fall,
+        )
+
+    mask = ("torso_link",)
+    # The configuration's own randomization, masses, is replaced.
+    heavy = replace(task, randomization=RandomizationConfig(link_mass=(2.0, 2.0)))
+    subject = policy, replace(config, task=heavy), policy.skin
+    found = perturb(*subject, mask=mask, **which)
+    assert found == [played(name, PERTURBATIONS[name], mask) for name in names]
+    # They are not the same by chance.
+    assert len({row.success.mean for row in found}) == 3
+    unmasked = played("none", PERTURBATIONS["none"], ())
+    assert unmasked.success.mean > found[0].success.mean
