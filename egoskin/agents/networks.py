@@ -47,7 +47,7 @@ class NetworkConfig:
         low, high = self.std_bounds
         if not low <= self.init_std <= high:
             raise ValueError(
-                f"need std_bounds[0] <= init_std <= std_bounds[1], got init_std "
+                "need std_bounds[0] <= init_std <= std_bounds[1], got init_std "
                 f"{self.init_std} and std_bounds ({low}, {high})"
             )
         if not self.hidden:

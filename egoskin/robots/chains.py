@@ -140,9 +140,8 @@ def build_chain(
         not at the body's origin, has additional frames, ``body:joint``.
 
     Raises:
-        ValueError: If the model has no body of the base's name.
-        ValueError: If a joint below the base is neither hinge nor slide, or too many
-            bodies are nested in each other.
+        ValueError: If the model has no body of the base's name, a joint below the base
+            is neither hinge nor slide, or too many bodies are nested in each other.
     """
     joint = pk_frame.Joint(f"{base}_fixed", dtype=dtype)
     root = pk_frame.Frame(base, link=pk_frame.Link(base), joint=joint)
