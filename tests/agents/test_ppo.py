@@ -237,13 +237,13 @@ def test_gaussian_kl_equals_torch_distributions():
 
 def bandit_rollout(agent: Agent) -> TensorDict:
     """One-step episodes whose reward is highest at the action (1, 1)."""
-    rollout = TensorDict({"observation": torch.randn(16, 256, 3)}, [16, 256])
+    rollout = TensorDict({"observation": torch.randn(16, 64, 3)}, [16, 64])
     with torch.no_grad():
         rollout.update(agent.critic(agent.actor(agent.encode(rollout))))
     miss = (rollout["action"] - 1).square().sum(-1, keepdim=True)
     rollout["reward"] = -miss
-    rollout["next_state_value"] = torch.zeros(16, 256, 1)
-    rollout["done"] = rollout["terminated"] = torch.ones(16, 256, 1, dtype=torch.bool)
+    rollout["next_state_value"] = torch.zeros(16, 64, 1)
+    rollout["done"] = rollout["terminated"] = torch.ones(16, 64, 1, dtype=torch.bool)
     return rollout
 
 
@@ -256,7 +256,7 @@ def bandit_agent() -> Agent:
 def test_updates_move_the_mean_action_to_the_best():
     agent = bandit_agent()
     ppo = PPO(agent, PPOConfig(num_mini_batches=2))
-    for _ in range(30):
+    for _ in range(20):
         metrics = ppo.update(bandit_rollout(agent))
     loc, _ = agent.head(torch.randn(1000, 3))
     assert (loc - 1).abs().mean() < 0.15

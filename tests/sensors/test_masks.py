@@ -75,7 +75,7 @@ def without(skin: Skin, masked: list[int]) -> tuple[Skin, list[int]]:
     return skin.select(kept), kept
 
 
-def flown(sensor: SensorConfig, skin: Skin, mask=(), steps: int = 45) -> torch.Tensor:
+def flown(sensor: SensorConfig, skin: Skin, mask=(), steps: int = 20) -> torch.Tensor:
     """Outputs of an environment while the first balls arrive, ``[B, T]``."""
     config = EnvConfig(task=TASK, sensor=sensor)
     env = make_worker_env(config, skin, num_envs=8, seed=0, keep_raw=True, mask=mask)
