@@ -202,6 +202,50 @@ def test_shapes_that_only_look_are_dropped_and_their_masses_stay(tmp_path):
         portable(read_folder(write_robot(tmp_path, model=touching)))
 
 
+def test_settings_of_what_is_left_out_are_left_out(tmp_path):
+    before = portable(read_folder(write_robot(tmp_path / "before")))
+    # As in most published files.
+    settings = (
+        '<size memory="10M" nuserdata="2"/><statistic meansize="0.1" extent="2"/>'
+        '<visual><global azimuth="120"/><headlight ambient="0.1 0.1 0.1"/></visual>'
+    )
+    defaults = (
+        '<mesh scale="0.001 0.001 0.001"/><light diffuse="1 0 0"/><camera fovy="60"/>'
+        '<equality solref="0.01 1"/><tendon width="0.01"/><motor gear="2"/>'
+        '<geom rgba="1 0 0 1"/><site size="0.01"/><material specular="0.1"/>'
+        '<pair condim="1"/><default class="own"><position kp="50" ctrllimited="true" '
+        'ctrlrange="-1 1"/><joint damping="4"/></default>'
+    )
+    model = MODEL.replace("<worldbody>", f"{settings}<worldbody>")
+    model = model.replace("<default>", f"<default>{defaults}")
+    model = model.replace('"left_ankle" axis', '"left_ankle" class="own" axis')
+    robot = portable(read_folder(write_robot(tmp_path / "after", model=model)))
+    assert (robot.links, robot.joints) == (before.links, before.joints)
+    # What applies to the robot is kept.
+    np.testing.assert_array_equal(robot.torque_limit, before.torque_limit)
+    assert robot.model.joint("left_ankle").damping == 4
+    assert robot.model.geom_rgba[-1].tolist() == [1, 0, 0, 1]
+    for tag in ("size ", "statistic", "visual", "motor", "general", "tendon", "camera"):
+        assert f"<{tag}" not in (robot.model_xml or "<")
+    # A robot without any of them is stored as MuJoCo writes it, as it always was.
+    text = mujoco.MjSpec.from_string(before.model_xml or "").to_xml()
+    assert before.model_xml == text
+
+
+@pytest.mark.parametrize(
+    ("tag", "elements"),
+    [
+        ("equality", '<weld body1="left_arm" body2="right_arm"/>'),
+        ("tendon", '<fixed><joint joint="left_hip" coef="1"/></fixed>'),
+    ],
+)
+def test_elements_that_move_a_robot_are_not_left_out(tag, elements, tmp_path):
+    model = MODEL.replace("<actuator>", f"<{tag}>{elements}</{tag}><actuator>")
+    robot = read_folder(write_robot(tmp_path, model=model))
+    with pytest.raises(ValueError, match=f"its model contains <{tag}>"):
+        portable(robot)
+
+
 def test_the_base_of_a_urdf_floats(tmp_path):
     (tmp_path / "stump.urdf").write_text(URDF)
     (tmp_path / "robot.toml").write_text(
