@@ -19,7 +19,7 @@ from torchrl.envs.utils import check_env_specs
 
 from egoskin.envs.dodgeball import DodgeballEnv
 from egoskin.envs.observations import Oracle, Privileged, Proprioception, approaches_b
-from egoskin.envs.throws import GRAVITY
+from egoskin.envs.physics.contract import GRAVITY
 from egoskin.make import EnvConfig, make_worker_env
 from egoskin.robots.config import H1_2
 from egoskin.sensors import (

@@ -17,13 +17,13 @@ import torch
 from torch import Tensor
 
 from egoskin.bounds import Interval, check_bounds
+from egoskin.envs.physics.contract import GRAVITY
 from egoskin.rng import Stream, uniform
 from egoskin.robots.config import RobotConfig
 from egoskin.robots.kinematics import LinkKinematics, axis_vectors, rotate
 from egoskin.robots.surface import sample_surface
 from egoskin.shapes import Sphere
 
-GRAVITY = 9.81
 # Target points on the body: dense enough that neighbours are 2 cm apart, and fixed, so
 # that a throw set is the same in every run.
 NUM_AIM_POINTS, _AIM_SEED = 4096, 0
