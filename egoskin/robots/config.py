@@ -31,6 +31,8 @@ from egoskin.robots.model_text import checked_model
 from egoskin.storage.files import check_regular, read_regular
 
 ASSETS = Path(__file__).parents[1] / "assets"
+# Largest component of the quaternion of a base that counts as upright.
+_TILT = 1e-3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -218,13 +220,19 @@ class RobotConfig:
         return tuple(joint_name(self.model, joint) for joint in self._joint_ids)
 
     def check_floating_base(self) -> None:
-        """Raise ValueError unless the base floats and all other joints are hinges."""
+        """Raise ValueError unless the base floats, upright, and the rest are hinges."""
         model, kinds = self.model, self.model.jnt_type
         free = model.njnt > 0 and kinds[0] == mujoco.mjtJoint.mjJNT_FREE
         if not free or model.jnt_bodyid[0] != self._bodies[0]:
             raise ValueError(
                 f"{self.name}: the first joint must be the free joint of its base "
                 f"{self.base!r} (required to throw balls, not to place sensors)"
+            )
+        # Both components are 0 in a rotation about z.
+        if np.abs(model.qpos0[4:6]).max() > _TILT:
+            raise ValueError(
+                f"{self.name}: its base {self.base!r} must be upright in the file "
+                "(turned about z at most); an episode starts so"
             )
         hinges = kinds[self._joint_ids] == mujoco.mjtJoint.mjJNT_HINGE
         if hinges.sum() != model.njnt - 1:
