@@ -180,12 +180,7 @@ def make_worker_env(
             observed.append("previous_action")
         transforms += [
             Proprioception(default, observed, out_keys=[f"observation{suffix}"]),
-            Privileged(
-                config.privileged,
-                len(robot.joints),
-                throws.num_balls,
-                throws.gravity,
-            ),
+            Privileged(config.privileged, throws.gravity),
         ]
         if masks_all(mask):
             transforms.append(HideObjects())
