@@ -97,6 +97,20 @@ def check_bounds(config: Any) -> None:
                 raise BoundsError(type(config), f"{name} must {wrong}, got {value}")
 
 
+def check_ranges(config: Any) -> None:
+    """Raise ValueError if a tuple of a dataclass is not (low, high), low <= high.
+
+    Args:
+        config: The dataclass; its tuples are pairs of numbers.
+    """
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if isinstance(value, tuple) and not value[0] <= value[1]:
+            raise ValueError(
+                f"{field.name} must be (low, high) with low <= high, got {value}"
+            )
+
+
 @functools.cache
 def _intervals(kind: type) -> Mapping[str, Interval]:
     """Return the interval of each field of a dataclass."""

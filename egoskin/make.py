@@ -143,8 +143,9 @@ def make_worker_env(
         device: Device of the simulation and of all tensors.
 
     Raises:
-        ValueError: If the skin does not fit the robot, ``sparse`` is combined with a
-            history or a mask of some links, or the engine is not installed.
+        ValueError: If the skin does not fit the robot, part of ``mask`` has no effect,
+            ``sparse`` is combined with a history or a mask of some links, or the engine
+            is not installed.
     """
     if sparse and config.history > 1:
         raise ValueError(
@@ -154,6 +155,7 @@ def make_worker_env(
     if sparse and mask and not masks_all(mask):
         raise ValueError("sparse sources cannot mask only some links: turn sparse off")
     sensors, robot = config.pipeline(skin), config.robot_config
+    sensors.check_mask(mask)
     env = DodgeballEnv(
         robot,
         config.task,
@@ -178,12 +180,7 @@ def make_worker_env(
             observed.append("previous_action")
         transforms += [
             Proprioception(default, observed, out_keys=[f"observation{suffix}"]),
-            Privileged(
-                config.privileged,
-                len(robot.joints),
-                throws.num_balls,
-                throws.gravity,
-            ),
+            Privileged(config.privileged, throws.gravity),
         ]
         if masks_all(mask):
             transforms.append(HideObjects())

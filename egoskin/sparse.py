@@ -64,15 +64,6 @@ class SparseRows:
         column, value = self.column[entry], self.value[entry]
         return replace(self, offsets=offsets, column=column, value=value)
 
-    def to(self, device: torch.device) -> SparseRows:
-        """Return the matrix on a device."""
-        return replace(
-            self,
-            offsets=self.offsets.to(device),
-            column=self.column.to(device),
-            value=self.value.to(device),
-        )
-
     def is_finite(self) -> Tensor:
         """Return which rows hold only finite values, ``[B]`` bool."""
         finite = torch.ones(len(self), dtype=torch.bool, device=self.value.device)

@@ -44,7 +44,7 @@ class _KeyedTransform(Transform):
             ) from error
         self._check_one_each("out_specs", specs)
         for key, spec in zip(self.out_keys, specs, strict=True):
-            observation_spec[key] = spec
+            observation_spec[key] = _on_device_of(observation_spec, spec)
         return observation_spec
 
     def _read(
@@ -101,6 +101,11 @@ class _KeyedTransform(Transform):
             return None
         rows = mask.reshape(total, -1).any(-1).nonzero()[:, 0]
         return rows, pad_rows(rows if len(rows) else rows.new_zeros(1))
+
+
+def _on_device_of(spec: Composite, own: TensorSpec) -> TensorSpec:
+    """Return a spec on the device of the spec that it becomes an entry of."""
+    return own if spec.device is None else own.to(spec.device)
 
 
 def _spread(values: Tensor, rows: Tensor, total: int) -> Tensor:
@@ -234,7 +239,7 @@ class StatefulTransform(_KeyedTransform):
         specs = self.out_specs(parent.observation_spec)
         for key, spec in zip(self.out_keys, specs, strict=True):
             if key in self.state_keys:
-                state_spec[key] = spec
+                state_spec[key] = _on_device_of(state_spec, spec)
         return state_spec
 
     def _state_of(self, values: Sequence[Tensor]) -> list[Tensor]:

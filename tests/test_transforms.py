@@ -19,7 +19,7 @@ from torchrl.envs.utils import check_env_specs
 
 from egoskin.envs.dodgeball import DodgeballEnv
 from egoskin.envs.observations import Oracle, Privileged, Proprioception, approaches_b
-from egoskin.envs.throws import GRAVITY
+from egoskin.envs.physics.contract import GRAVITY
 from egoskin.make import EnvConfig, make_worker_env
 from egoskin.robots.config import H1_2
 from egoskin.sensors import (
@@ -68,8 +68,8 @@ BUILDERS = {
         in_keys=(*Proprioception.STATE_KEYS, "previous_action"),
     ),
     "oracle": Oracle,
-    "privileged objects": partial(Privileged, "objects", JOINTS, len(BALLS), GRAVITY),
-    "privileged velocity": partial(Privileged, "velocity", JOINTS, len(BALLS), GRAVITY),
+    "privileged objects": partial(Privileged, "objects", GRAVITY),
+    "privileged velocity": partial(Privileged, "velocity", GRAVITY),
 }
 every_transform = pytest.mark.parametrize("build", BUILDERS.values(), ids=BUILDERS)
 
@@ -258,7 +258,7 @@ def test_a_reset_works_on_batches_of_workers(build, full_state):
 
 def test_privileged_refuses_the_wrong_number_of_keys():
     with pytest.raises(ValueError, match="in_keys must name base_pose, base_lin_vel_w"):
-        Privileged("velocity", JOINTS, 2, GRAVITY, in_keys=["base_pose"])
+        Privileged("velocity", GRAVITY, in_keys=["base_pose"])
 
 
 # --- layouts by hand ------------------------------------------------------------
@@ -515,7 +515,7 @@ def outside(config: EnvConfig, parallel, **kwargs) -> TransformedEnv:
     gravity = config.task.throws.gravity
     transforms = [
         Proprioception(DEFAULT),
-        Privileged("objects", JOINTS, len(BALLS), gravity),
+        Privileged("objects", gravity),
         *config.pipeline(SKIN).transforms(BALLS, dt=1 / 60),
     ]
     return TransformedEnv(parallel(2, bases, **kwargs), Compose(*transforms))

@@ -80,7 +80,7 @@ class Place:
     seed: int = 0
     """Seed of the placement."""
     links: tuple[str, ...] | None = None
-    """Links to cover; None: the robot's upper body."""
+    """Links to cover; None: the robot's skin_links."""
     density: tuple[str, ...] = ()
     """Relative density of sensors on links, LINK=WEIGHT, where LINK may be a shell
     pattern; 1 on the others."""

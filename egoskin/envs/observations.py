@@ -195,8 +195,6 @@ class Privileged(RowTransform):
 
     Args:
         content: "objects" for everything above, "velocity" for the paper's critic.
-        num_joints: ``J``.
-        num_objects: ``O``.
         gravity: Downward acceleration of the objects [m/s^2].
         in_keys: Keys of the inputs, in the order above.
         out_keys: Key of the observation.
@@ -217,17 +215,13 @@ class Privileged(RowTransform):
     def __init__(
         self,
         content: Literal["objects", "velocity"],
-        num_joints: int,
-        num_objects: int,
         gravity: float,
         in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] = ("privileged_observation",),
     ) -> None:
         read = self._VELOCITY_KEYS
-        self._size = 3
         if content == "objects":
             read = (*read, *self._OBJECT_KEYS)
-            self._size += 3 + num_joints + 11 * num_objects + 1
         if in_keys is not None and len(in_keys) != len(read):
             raise ValueError(f"in_keys must name {', '.join(read)}, got {in_keys}")
         super().__init__(in_keys or read, out_keys)
@@ -251,5 +245,10 @@ class Privileged(RowTransform):
 
     def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
         """Return the spec of the observation."""
-        dtype = spec[self.in_keys[0]].dtype
-        return (Unbounded(shape=torch.Size((*spec.shape, self._size)), dtype=dtype),)
+        base_pose, _, *rest = (spec[key] for key in self.in_keys)
+        size = 3
+        if rest:
+            _, previous_action, *_, active = rest
+            size += 3 + previous_action.shape[-1] + 11 * active.shape[-1] + 1
+        shape = torch.Size((*spec.shape, size))
+        return (Unbounded(shape=shape, dtype=base_pose.dtype),)

@@ -8,13 +8,13 @@ is drawn, and results are bit-identical to those without randomisation.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Annotated
 
 import torch
 from torch import Tensor
 
-from egoskin.bounds import Interval, check_bounds
+from egoskin.bounds import Interval, check_bounds, check_ranges
 from egoskin.envs.physics.contract import Physics, Variation
 from egoskin.rng import Stream, uniform
 
@@ -35,7 +35,7 @@ class RandomizationConfig:
     torque_limit: _Factor = _NONE
     """Factor on the torque limit of each joint."""
     delay_steps: Annotated[tuple[int, int], Interval(ge=0, le=100)] = (0, 0)
-    """Delay of all actions of an episode [control steps]."""
+    """Delay of the actions [control steps], drawn once per episode."""
     push_speed: Annotated[tuple[float, float], Interval(ge=0, le=100)] = (0.0, 0.0)
     """Pushes: change of the base velocity, in a random horizontal direction [m/s]; 0:
     none."""
@@ -45,13 +45,7 @@ class RandomizationConfig:
     def __post_init__(self) -> None:
         """Raise ValueError for invalid ranges."""
         check_bounds(self)
-        for field in fields(self):
-            low, high = getattr(self, field.name)
-            if low > high:
-                raise ValueError(
-                    f"{field.name} must be (low, high) with low <= high, got "
-                    f"{low, high}"
-                )
+        check_ranges(self)
         if self.push_interval != RandomizationConfig.push_interval and not self.pushes:
             raise ValueError("push_interval has no effect without push_speed")
 

@@ -24,19 +24,19 @@ class RewardConfig:
     """Weights of the reward terms, per control step; costs are negative."""
 
     survival: _Weight = 0.1
-    """For every control step without contact or fall."""
+    """Reward of a control step without contact or fall."""
     upright: _Weight = 0.01
-    """Posture: times ``exp(-|gravity_xy|^2 / 0.2)``, gravity in the base frame."""
+    """Weight of ``exp(-|gravity_xy|^2 / 0.2)``, gravity in the base frame."""
     posture: _Weight = -0.05
-    """Posture: times the mean squared deviation from the default pose [rad^2]."""
+    """Weight of the mean squared deviation from the default pose [rad^2]."""
     energy: _Weight = -5e-7
-    """Times the mechanical power, sum of ``|torque x velocity|`` [W]."""
+    """Weight of the mechanical power, sum of ``|torque x velocity|`` [W]."""
     drift_speed: _Weight = -0.01
-    """Drift: times the squared planar speed of the base [m^2/s^2]."""
+    """Weight of the squared planar speed of the base [m^2/s^2]."""
     drift_distance: _Weight = -0.1
-    """Drift: times the squared planar distance from the start [m^2], at most 4."""
+    """Weight of the squared planar distance from the start [m^2], at most 4."""
     action_rate: _Weight = -5e-4
-    """Times the mean squared change of the action since the last step."""
+    """Weight of the mean squared change of the action since the last step."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for values out of bounds."""

@@ -9,21 +9,21 @@ every policy.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Literal
 
 import torch
 from torch import Tensor
 
-from egoskin.bounds import Interval, check_bounds
+from egoskin.bounds import Interval, check_bounds, check_ranges
+from egoskin.envs.physics.contract import GRAVITY
 from egoskin.rng import Stream, uniform
 from egoskin.robots.config import RobotConfig
 from egoskin.robots.kinematics import LinkKinematics, axis_vectors, rotate
 from egoskin.robots.surface import sample_surface
 from egoskin.shapes import Sphere
 
-GRAVITY = 9.81
 # Target points on the body: dense enough that neighbours are 2 cm apart, and fixed, so
 # that a throw set is the same in every run.
 NUM_AIM_POINTS, _AIM_SEED = 4096, 0
@@ -38,11 +38,6 @@ _Seconds = Annotated[tuple[float, float], Interval(gt=0, le=1000)]
 _MetresPerSecond = Annotated[tuple[float, float], Interval(ge=0.01, le=1000)]
 _Degrees = Annotated[tuple[float, float], Interval(ge=-360, le=360)]
 _Metres = Annotated[tuple[float, float], Interval(gt=0, le=1000)]
-# Options that have an effect only with one value of another option.
-_ONLY_WITH = {
-    "box_half_width": ("aim", "box"),
-    "box_height": ("aim", "box"),
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +47,8 @@ class ThrowConfig:
     radius: Annotated[float, Interval(ge=1e-3, le=10)] = 0.15
     """Radius of the balls [m]."""
     num_balls: Annotated[int, Interval(ge=1, le=100)] = 2
-    """Balls thrown in turn; with several, a slow one can finish its flight."""
+    """Number of balls, thrown in turn; with several, a slow ball can land before its
+    next throw."""
     first_delay: _Delay = (0.0, 2.0)
     """Time from the start of an episode to the first throw [s]. A random delay makes
     fixed motions useless; with (0, 0) a blind robot learns to duck at once."""
@@ -77,21 +73,18 @@ class ThrowConfig:
     lead: Annotated[float, Interval(ge=0, le=10)] = 1.0
     """Share of the base's planar velocity used to lead the aim."""
     flight: Literal["ballistic", "straight"] = "straight"
-    """With gravity, or without it at constant speed (the last 2 m take longer)."""
+    """ballistic: under gravity; straight: without gravity, at constant speed. (Of equal
+    ``speed``, a straight ball is the slower one: a ballistic one has a vertical
+    velocity as well.)"""
 
     def __post_init__(self) -> None:
         """Raise ValueError for invalid values, or options without effect."""
         check_bounds(self)
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, tuple) and not value[0] <= value[1]:
-                raise ValueError(
-                    f"{field.name} must be (low, high) with low <= high, got {value}"
-                )
-        for name, (option, value) in _ONLY_WITH.items():
+        check_ranges(self)
+        for name in ("box_half_width", "box_height"):
             changed = getattr(self, name) != getattr(ThrowConfig, name)
-            if changed and getattr(self, option) != value:
-                raise ValueError(f"{name} has no effect without {option}={value}")
+            if changed and self.aim != "box":
+                raise ValueError(f"{name} has no effect without aim=box")
 
     @property
     def gravity(self) -> float:

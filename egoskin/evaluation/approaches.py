@@ -19,7 +19,8 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from egoskin.envs.throws import GRAVITY, ThrowConfig, Thrower
+from egoskin.envs.physics.contract import GRAVITY
+from egoskin.envs.throws import ThrowConfig, Thrower
 from egoskin.robots.config import RobotConfig
 from egoskin.robots.surface import default_frames, distance_to, sample_surface
 from egoskin.sensors import Ray, SensorPipeline, Skin

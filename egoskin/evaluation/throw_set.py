@@ -176,7 +176,6 @@ def play_throws(
     """
     assert first == 0 or watch is not None
     seed = throw_seed(config, throw_set)
-    config.pipeline(skin).check_mask(mask)
     shared: dict[str, Any] = {
         "num_envs": episodes,
         "seed": seed,

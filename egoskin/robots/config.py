@@ -8,7 +8,6 @@ in the properties of the configuration.
 from __future__ import annotations
 
 import fnmatch
-import glob
 import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, fields, replace
@@ -31,6 +30,8 @@ from egoskin.robots.model_text import checked_model
 from egoskin.storage.files import check_regular, read_regular
 
 ASSETS = Path(__file__).parents[1] / "assets"
+# Largest component of the quaternion of a base that counts as upright.
+_TILT = 1e-3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,24 +44,33 @@ class Gain:
     """Damping [N m s/rad]."""
 
 
-def resolve(table: Mapping[str, object], names: tuple[str, ...], what: str) -> list:
+def resolve(
+    table: Mapping[str, object],
+    names: tuple[str, ...],
+    what: str,
+    default: object = None,
+) -> list:
     """Return the value of each name from a table keyed by name patterns.
 
     Args:
         table: Values by shell pattern (``*_knee_joint``).
         names: Names to look up.
         what: Name of the table, for the error text.
+        default: Value of names that match no pattern; None: they are refused.
 
     Returns:
         One value for each name.
 
     Raises:
-        ValueError: If a name matches no pattern or several, or a pattern matches no
-            name.
+        ValueError: If a name matches several patterns or, without a default, none, or a
+            pattern matches no name.
     """
     values = []
     for name in names:
         matches = [p for p in table if fnmatch.fnmatchcase(name, p)]
+        if not matches and default is not None:
+            values.append(default)
+            continue
         if len(matches) != 1:
             raise ValueError(
                 f"{what}: {name!r} must match exactly one of the patterns "
@@ -218,13 +228,19 @@ class RobotConfig:
         return tuple(joint_name(self.model, joint) for joint in self._joint_ids)
 
     def check_floating_base(self) -> None:
-        """Raise ValueError unless the base floats and all other joints are hinges."""
+        """Raise ValueError unless the base floats, upright, and the rest are hinges."""
         model, kinds = self.model, self.model.jnt_type
         free = model.njnt > 0 and kinds[0] == mujoco.mjtJoint.mjJNT_FREE
         if not free or model.jnt_bodyid[0] != self._bodies[0]:
             raise ValueError(
                 f"{self.name}: the first joint must be the free joint of its base "
                 f"{self.base!r} (required to throw balls, not to place sensors)"
+            )
+        # Both components are 0 in a rotation about z.
+        if np.abs(model.qpos0[4:6]).max() > _TILT:
+            raise ValueError(
+                f"{self.name}: its base {self.base!r} must be upright in the file "
+                "(turned about z at most); an episode starts so"
             )
         hinges = kinds[self._joint_ids] == mujoco.mjtJoint.mjJNT_HINGE
         if hinges.sum() != model.njnt - 1:
@@ -235,13 +251,7 @@ class RobotConfig:
     @cached_property
     def default_joint_pos(self) -> np.ndarray:
         """Joint positions of the default pose [rad], for slides [m], ``[J]``."""
-        rest = {
-            glob.escape(name): 0.0
-            for name in self.joints
-            if not any(fnmatch.fnmatchcase(name, p) for p in self.default_pose)
-        }
-        table = {**self.default_pose, **rest}
-        return np.array(resolve(table, self.joints, "default_pose"))
+        return np.array(resolve(self.default_pose, self.joints, "default_pose", 0.0))
 
     @cached_property
     def torque_limit(self) -> np.ndarray:

@@ -29,6 +29,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
+from xml.etree import ElementTree
 
 import mujoco
 from tyro.constructors import PrimitiveConstructorSpec
@@ -337,11 +338,12 @@ def _no_match(pattern: str, names: Sequence[str], what: str) -> str:
 def portable(robot: RobotConfig) -> RobotConfig:
     """Return a robot as self-contained data: an MJCF of primitives, as text.
 
-    Visual meshes, actuators, sensors, key frames and everything that is not below the
-    base are left out; masses are kept. A cylinder becomes the capsule inside it, of the
-    same length and radius, or, if it is flat, a box. The base of a URDF floats. If the
-    file does not use this package's collision bits (see ``egoskin/assets/h1_2.xml``),
-    self-collision stays as in the file, and balls and floor collide with all shapes.
+    Visual meshes, actuators, sensors, key frames, their defaults, and everything that
+    is not below the base are left out; masses are kept. A cylinder becomes the capsule
+    inside it, of the same length and radius, or, if it is flat, a box. The base of a
+    URDF floats. If the file does not use this package's collision bits (see
+    ``egoskin/assets/h1_2.xml``), self-collision stays as in the file, and balls and
+    floor collide with all shapes.
 
     Args:
         robot: A robot of the task; `RobotConfig.model_path` is read.
@@ -402,10 +404,26 @@ def portable(robot: RobotConfig) -> RobotConfig:
     except ValueError as error:
         text = " ".join(str(error).split())
         raise ValueError(f"{robot.name} cannot be stored as data: {text}") from error
-    data = replace(robot, model_path=None, model_xml=spec.to_xml())
+    data = replace(robot, model_path=None, model_xml=_robot_only(spec.to_xml()))
     # This raises for any other element that cannot be kept.
     _ = data.model
     return data
+
+
+# Elements of a default class that apply to what is kept.
+_KEPT_DEFAULTS = ("default", "joint", "geom", "site", "material", "pair")
+
+
+def _robot_only(text: str) -> str:
+    """Return an MJCF without the settings of elements that have been left out."""
+    root = ElementTree.fromstring(text)
+    surplus = [(root, e) for e in root if e.tag in ("size", "statistic", "visual")]
+    for default in root.iter("default"):
+        surplus += [(default, e) for e in default if e.tag not in _KEPT_DEFAULTS]
+    for parent, element in surplus:
+        parent.remove(element)
+    # Otherwise the very text, to which stored robots are compared.
+    return ElementTree.tostring(root, encoding="unicode") if surplus else text
 
 
 _PRIMITIVES = (

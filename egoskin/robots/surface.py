@@ -37,7 +37,8 @@ class SurfacePoints:
     area: Mapping[str, float]
     """Outer area of each link sampled [m^2], estimated by the share of samples kept."""
     rejected: Mapping[str, float]
-    """Share of each link's samples that lay inside other shapes, 0 to 1."""
+    """Share of each link's samples that are not on the outer surface (see `Surface`), 0
+    to 1."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

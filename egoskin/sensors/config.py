@@ -23,7 +23,7 @@ class SkinConfig:
     """Where the sensors sit."""
 
     path: Path | None = None
-    """Skin file; None places sensors at random on the upper body."""
+    """Skin file; None places sensors at random on the robot's skin_links."""
     num_sensors: Annotated[int, Interval(ge=1, le=MAX_SENSORS)] = 64
     """Number of sensors to place (not with a file)."""
     seed: Annotated[int, NOT_NEGATIVE] = 0

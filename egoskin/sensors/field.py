@@ -88,8 +88,14 @@ class FieldSensor(ProximitySensor):
         # None if every sensor sees in all directions.
         cos_half = None
         if any(f.half_angle_deg < 180 for f in fields):
-            angles = [math.cos(math.radians(f.half_angle_deg)) for f in fields]
-            cos_half = torch.tensor(angles, dtype=torch.float64)[:, None]
+            cosines = [
+                # Rounding would hide an object straight behind a sensor of 180 degrees.
+                math.cos(math.radians(f.half_angle_deg))
+                if f.half_angle_deg < 180
+                else -math.inf
+                for f in fields
+            ]
+            cos_half = torch.tensor(cosines, dtype=torch.float64)[:, None]
         self.register_buffer("_cos_half", cos_half)
         if compile:
             cone = None if cos_half is None else cos_half.numpy()

@@ -2,8 +2,10 @@
 
 Computations use a structure of arrays with the batch last (``[S, B]``), sensors in the
 order of the skin, and only +, -, x, /, `sincos` and `exact_sqrt` (`egoskin.rounding`).
-The result of a row is therefore bitwise the same whatever other rows are in the batch,
-here or, for balls without occlusion, in C++ (``egoskin/sensors/kernels/kernels.cpp``).
+The result of a row is therefore bitwise the same whatever other rows are in the batch.
+For balls without occlusion it is also the same in C++
+(``egoskin/sensors/kernels/kernels.cpp``); a float64 number may differ there in its last
+bit or two, because PyTorch's float64 root is not exact.
 
 Contract: a reading of infinity means that nothing is in range; NaN in the input gives
 a reading of NaN, never of infinity.
@@ -384,7 +386,6 @@ class ProximitySensor(RowTransform):
                 device.
         """
         self._check(inputs)
-        self._kinematics.check(inputs[1])
         batch, objects = inputs[3].shape
         each = (objects,) if self.per_object else ()
         out = _writable(out, (*each, batch, *self.readings), inputs[0])
@@ -437,6 +438,7 @@ class ProximitySensor(RowTransform):
                     f"{self.in_keys[i]!r} must hold 7 numbers per pose (position, "
                     f"quaternion w x y z), got {inputs[i].shape[-1]}"
                 )
+        self._kinematics.check(inputs[1])
 
     def _poison(
         self, base_pose: Tensor, joint_pos: Tensor, object_pose: Tensor

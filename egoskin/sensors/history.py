@@ -72,7 +72,9 @@ class History(StatefulTransform):
                     torch.cat([bound.expand(one.shape)] * self.length, -1)
                     for bound in (one.space.low, one.space.high)
                 )
-                specs.append(Bounded(low, high, shape=shape, dtype=one.dtype))
+                specs.append(
+                    Bounded(low, high, shape=shape, dtype=one.dtype, device=one.device)
+                )
             else:
                 specs.append(Unbounded(shape=shape, dtype=one.dtype))
         return specs

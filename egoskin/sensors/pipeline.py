@@ -111,11 +111,16 @@ class SensorPipeline:
     # --- masks ------------------------------------------------------------------
 
     def check_mask(self, mask: Sequence[str]) -> None:
-        """Raise ValueError if part of a mask has no effect; the text lists valid links.
+        """Raise ValueError if a mask, or part of it, has no effect.
+
+        The text lists the valid links.
 
         Args:
             mask: Links whose sensors detect nothing, or `MASK_ALL`.
         """
+        if isinstance(mask, str):
+            # Its letters would be the links.
+            raise ValueError(f"mask must be a sequence of links, got {mask!r}")
         if not mask:
             return
         if self.config.coverage == "none":

@@ -275,10 +275,12 @@ class RaySensor(ProximitySensor):
             anything, ascending ``[n]`` int64, and its reading [m], ``[n]``.
 
         Raises:
-            ValueError: If the sensor has ``reduce`` or ``per_object``.
+            ValueError: If the sensor has ``reduce`` or ``per_object``, or an input is
+                wrong (as in `compute`).
         """
         if self.reduce != "none" or self.per_object:
             raise ValueError("hits are of full grids: without reduce and per_object")
+        self._check(inputs)
         if self._kernels is not None and self._kernels.can(*inputs[:3]):
             return self._kernels.hits(inputs)
         rows = self._rows_in_reach(*inputs)

@@ -502,12 +502,17 @@ def _build_model(
     # The texture has 2 x 2 tiles and is 2 m wide, so tiles are 1 m wide.
     tiles = spec.add_material(name="tiles", texuniform=True, texrepeat=[1, 1])
     tiles.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "tiles"
+    # New geoms start from these defaults, not from the robot's (a hidden group, say).
+    plain = mujoco.MjSpec()
     world.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.05], material="tiles"
+        default=plain.default,
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=[0, 0, 0.05],
+        material="tiles",
     )
     for i, shape in enumerate(objects):
         body = world.add_body(name=f"ball_{i}", mocap=True)
-        shape.add_geom(body, name=f"object_{i}", rgba=_BALL_RGBA)
+        shape.add_geom(body, default=plain.default, name=f"object_{i}", rgba=_BALL_RGBA)
     # The light moves with the camera, so its shadow map covers the robot's vicinity.
     world.add_body(name="lamp", mocap=True).add_light(
         pos=[-1.6, 1.2, 4.0],

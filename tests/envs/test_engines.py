@@ -69,6 +69,33 @@ def test_no_tensor_of_the_loop_is_made_on_a_default_device(config, monkeypatch):
     assert metrics["kl"] > 0
 
 
+OF_RAYS = SensorConfig(coverage="ray", corruption="acoustic", reduce="min")
+
+
+@pytest.mark.parametrize(
+    ("config", "mask"),
+    [
+        (EnvConfig(), ("torso_link",)),
+        (EnvConfig(sensor=OF_RAYS, history=3, previous_action=True), ()),
+        (EnvConfig(sensor=SensorConfig(signal="localization", keep_last=True)), ()),
+        (EnvConfig(sensor=SensorConfig(coverage="oracle"), history=2), ("all",)),
+    ],
+    ids=["field", "ray", "localization", "oracle"],
+)
+def test_all_specs_and_constants_are_on_the_device_of_the_environment(
+    config, mask, monkeypatch
+):
+    # TorchRL compares the values of bounds; meta tensors have none.
+    monkeypatch.setattr(torch, "allclose", lambda *args, **options: True)
+    env = make_worker_env(config, num_envs=2, seed=0, mask=mask, device="meta")
+    for spec in (env.observation_spec, env.input_spec, env.output_spec):
+        for key, entry in spec.items(True, True):
+            assert entry.device.type == "meta", key
+    assert {x.device.type for x in env.fake_tensordict().values(True, True)} == {"meta"}
+    constants = [*env.transform.buffers(), *env.transform.parameters()]
+    assert all(x.device.type == "meta" for x in constants)
+
+
 @pytest.mark.skipif(find_spec("mujoco_warp") is not None, reason="it is installed")
 def test_an_engine_that_is_not_installed_is_refused_in_one_line(tmp_path):
     message = "engine warp needs mujoco_warp: `pip install 'egoskin[gpu]'`"

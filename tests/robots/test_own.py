@@ -17,6 +17,9 @@ import torch
 import egoskin
 from calling import SMALL, call, succeed
 from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
+from egoskin.envs.physics import PhysicsConfig, Scene
+from egoskin.envs.physics.contract import GRAVITY
+from egoskin.envs.physics.model import build_scene
 from egoskin.make import EnvConfig
 from egoskin.robots.config import G1, H1_2, RobotConfig
 from egoskin.robots.own import find_robot, portable, read_folder, robot_of
@@ -200,6 +203,50 @@ def test_shapes_that_only_look_are_dropped_and_their_masses_stay(tmp_path):
     touching = text.replace('contype="0" conaffinity="0"', "")
     with pytest.raises(ValueError, match=r"link .trunk. has a collision shape.* mesh"):
         portable(read_folder(write_robot(tmp_path, model=touching)))
+
+
+def test_settings_of_what_is_left_out_are_left_out(tmp_path):
+    before = portable(read_folder(write_robot(tmp_path / "before")))
+    # As in most published files.
+    settings = (
+        '<size memory="10M" nuserdata="2"/><statistic meansize="0.1" extent="2"/>'
+        '<visual><global azimuth="120"/><headlight ambient="0.1 0.1 0.1"/></visual>'
+    )
+    defaults = (
+        '<mesh scale="0.001 0.001 0.001"/><light diffuse="1 0 0"/><camera fovy="60"/>'
+        '<equality solref="0.01 1"/><tendon width="0.01"/><motor gear="2"/>'
+        '<geom rgba="1 0 0 1"/><site size="0.01"/><material specular="0.1"/>'
+        '<pair condim="1"/><default class="own"><position kp="50" ctrllimited="true" '
+        'ctrlrange="-1 1"/><joint damping="4"/></default>'
+    )
+    model = MODEL.replace("<worldbody>", f"{settings}<worldbody>")
+    model = model.replace("<default>", f"<default>{defaults}")
+    model = model.replace('"left_ankle" axis', '"left_ankle" class="own" axis')
+    robot = portable(read_folder(write_robot(tmp_path / "after", model=model)))
+    assert (robot.links, robot.joints) == (before.links, before.joints)
+    # What applies to the robot is kept.
+    np.testing.assert_array_equal(robot.torque_limit, before.torque_limit)
+    assert robot.model.joint("left_ankle").damping == 4
+    assert robot.model.geom_rgba[-1].tolist() == [1, 0, 0, 1]
+    for tag in ("size ", "statistic", "visual", "motor", "general", "tendon", "camera"):
+        assert f"<{tag}" not in (robot.model_xml or "<")
+    # A robot without any of them is stored as MuJoCo writes it, as it always was.
+    text = mujoco.MjSpec.from_string(before.model_xml or "").to_xml()
+    assert before.model_xml == text
+
+
+@pytest.mark.parametrize(
+    ("tag", "elements"),
+    [
+        ("equality", '<weld body1="left_arm" body2="right_arm"/>'),
+        ("tendon", '<fixed><joint joint="left_hip" coef="1"/></fixed>'),
+    ],
+)
+def test_elements_that_move_a_robot_are_not_left_out(tag, elements, tmp_path):
+    model = MODEL.replace("<actuator>", f"<{tag}>{elements}</{tag}><actuator>")
+    robot = read_folder(write_robot(tmp_path, model=model))
+    with pytest.raises(ValueError, match=f"its model contains <{tag}>"):
+        portable(robot)
 
 
 def test_the_base_of_a_urdf_floats(tmp_path):
@@ -403,3 +450,64 @@ def test_a_robot_without_collision_shapes_has_a_height():
     robot = RobotConfig(name="bare", model_xml=xml, base="a", skin_links=())
     assert robot.default_base_height == robot.standing_height == 0.5
     assert robot.lowest_link == "b"
+
+
+# --- in the scene -----------------------------------------------------------------
+
+
+def scene_of(robot: RobotConfig) -> mujoco.MjModel:
+    """The scene of a robot and two balls."""
+    balls = DodgeballConfig().throws.balls
+    return build_scene(Scene(robot=robot, objects=balls, config=PhysicsConfig()))
+
+
+def test_the_defaults_of_a_robot_apply_to_the_robot_alone(tmp_path):
+    joint = 'range="-1.5 1.5" damping="3" frictionloss="2" armature="0.02"'
+    shared = (
+        '<geom friction="0.1 0.2 0.3" condim="6" margin="0.5" solref="0.1 2"/>'
+        '<general ctrllimited="true" ctrlrange="-0.01 0.01" gear="7"/>'
+    )
+    model = MODEL.replace('range="-1.5 1.5" armature="0.02"', joint)
+    model = model.replace("<default>", f"<default>{shared}")
+    # As in a file that holds the robot alone.
+    model = model.replace('<actuator><motor joint="left_hip"/></actuator>', "")
+    scene = scene_of(read_folder(write_robot(tmp_path / "walker", model=model)))
+    balls = np.flatnonzero(scene.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE)
+    assert len(balls) == 6
+    assert not scene.jnt_limited[balls].any()
+    assert not scene.jnt_actfrclimited[balls].any()
+    dofs = scene.jnt_dofadr[balls]
+    for value in (scene.dof_damping, scene.dof_frictionloss, scene.dof_armature):
+        assert not value[dofs].any()
+    plain = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><geom size='1'/></worldbody></mujoco>"
+    ).geom(0)
+    for name in ("floor", "object_0"):
+        for value in ("friction", "condim", "margin", "solref"):
+            own = getattr(scene.geom(name), value)
+            np.testing.assert_array_equal(own, getattr(plain, value), value)
+    assert not scene.actuator_ctrllimited.any()
+    assert np.all(scene.actuator_gear[:, 0] == 1)
+    # The robot keeps them.
+    assert scene.joint("left_hip").damping == 3
+    assert scene.geom_condim[scene.body("trunk").geomadr[0]] == 6
+
+
+def test_the_options_of_a_robots_file_are_not_those_of_the_scene(tmp_path):
+    option = (
+        '<option solver="PGS" gravity="0 0 -3.7" density="900" wind="5 0 0" '
+        'impratio="10" actuatorgroupdisable="0" timestep="0.1">'
+        '<flag contact="disable" actuation="disable" energy="enable"/></option>'
+    )
+    model = MODEL.replace("<worldbody>", f"{option}<worldbody>")
+    robot = portable(read_folder(write_robot(tmp_path / "walker", model=model)))
+    assert "PGS" in (robot.model_xml or "")
+    own, expected = scene_of(robot).opt, scene_of(H1_2).opt
+    names = [n for n in dir(own) if n[0] != "_" and not callable(getattr(own, n))]
+    for name in names:
+        values = getattr(own, name), getattr(expected, name)
+        np.testing.assert_array_equal(*values, name)
+    # The built-in robots have no options of their own.
+    assert expected.solver == mujoco.mjtSolver.mjSOL_NEWTON
+    assert expected.gravity.tolist() == [0, 0, -GRAVITY]
+    assert expected.disableflags == expected.enableflags == 0

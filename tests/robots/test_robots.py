@@ -323,6 +323,21 @@ def test_the_task_wants_a_floating_base_that_is_the_chains(make_arm, tmp_path):
     refused(RobotConfig(name="s", model_path=still, base="b", skin_links=()), text)
 
 
+@pytest.mark.parametrize("euler", ["0 30 0", "180 0 0", "5 0 90"])
+def test_the_task_wants_an_upright_base(tmp_path, euler):
+    text = (
+        "<mujoco><worldbody><body name='b' EULER><freejoint/><geom size='.1'/><body "
+        "name='c'><joint/><geom size='.1'/></body></body></worldbody></mujoco>"
+    )
+    path = tmp_path / "tilted.xml"
+    path.write_text(text.replace("EULER", f"euler='{euler}'"))
+    fields = {"name": "t", "model_path": path, "base": "b", "skin_links": ()}
+    refused(RobotConfig(**fields), "t: its base 'b' must be upright in the file")
+    # A turn about z is a heading: episodes draw their own.
+    path.write_text(text.replace("EULER", "euler='0 0 120'"))
+    RobotConfig(**fields).check_floating_base()
+
+
 @pytest.mark.parametrize("inside", [True, False])
 def test_the_task_wants_hinges_below_the_base_alone(tmp_path, inside):
     joint = "slide" if inside else "hinge"

@@ -102,5 +102,9 @@ def test_inputs_of_a_wrong_form_are_refused(
 ):
     state = random_state(4, seed=0, objects=2)
     state[key] = change(state[key])
+    sensor = kind(skin, H1_2.chain, SHAPES[:2], RANGE)
     with pytest.raises(ValueError, match=message):
-        measure(kind(skin, H1_2.chain, SHAPES[:2], RANGE), state)
+        measure(sensor, state)
+    if isinstance(sensor, RaySensor):
+        with pytest.raises(ValueError, match=message):
+            sensor.hits(*(state[key] for key in KEYS))

@@ -307,6 +307,7 @@ def test_a_policy_whose_sensors_are_masked_does_what_one_does_without_sensors():
         ({}, ("torso_lnk",), r"no sensor on 'torso_lnk'.*: .*torso_link"),
         ({}, ("torso_link", "pelvis"), "no sensor on 'pelvis'"),
         ({}, ("all", "torso_link"), "no sensor on 'all'"),
+        ({}, "all", "mask must be a sequence of links, got 'all'"),
         ({"coverage": "none"}, MASK_ALL, "a blind robot has no sensors to mask"),
         ({"coverage": "none"}, ("torso_link",), "a blind robot has no sensors"),
         (
@@ -322,6 +323,9 @@ def test_a_mask_that_masks_nothing_is_refused(sensor, mask, message):
         config.pipeline(SKIN).check_mask(mask)
     with pytest.raises(ValueError, match=message):
         play_throws(None, config, SKIN, throw_set=0, episodes=2, mask=mask)
+    for make in (make_env, make_worker_env):
+        with pytest.raises(ValueError, match=message):
+            make(config, SKIN, num_envs=2, seed=0, mask=mask)
 
 
 @pytest.mark.parametrize("mask", [(), MASK_ALL, ["all"], ("torso_link",)])

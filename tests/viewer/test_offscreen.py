@@ -13,6 +13,7 @@ from tensordict import TensorDict
 from egoskin.evaluation.throw_set import play_throws, throw_seed
 from egoskin.make import EnvConfig, make_worker_env
 from egoskin.robots.config import RobotConfig
+from egoskin.robots.own import portable
 from egoskin.sensors import Skin
 from egoskin.sensors.config import SensorConfig
 from egoskin.shapes import Sphere
@@ -100,6 +101,19 @@ def test_a_ball_is_drawn_only_in_play(painter: Painter, standing: TensorDict):
     parked["object_active"][:] = False
     assert count_orange(painter.draw(inside, time=0.0)) > 50
     assert count_orange(painter.draw(parked, time=0.0)) == 0
+
+
+def test_a_ball_is_drawn_although_the_robot_hides_shapes_by_default(
+    painter: Painter, robot: RobotConfig, standing: TensorDict
+):
+    text = portable(robot).model_xml or ""
+    # The first geom is that of the defaults; MuJoCo draws no group above 2.
+    hidden = text.replace("<geom ", '<geom group="4" ', 1)
+    assert hidden.index('group="4"') < hidden.index("<worldbody")
+    robot = replace(robot, model_path=None, model_xml=hidden)
+    with Painter(robot, None, (Sphere(), Sphere()), size=SIZE) as other:
+        seen = other.draw(place_ball(standing, 0.3, 0.6, 1.2), time=0.0)
+    assert count_orange(seen) > 20
 
 
 def test_a_line_leads_from_a_sensor_that_detects_to_the_ball(

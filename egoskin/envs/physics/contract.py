@@ -6,9 +6,9 @@ unless stated otherwise; rows are selected by int64 indices. ``B`` rows, ``J`` j
 ``L`` links, ``O`` objects; quaternions are (w, x, y, z), unit; suffix ``_w`` world,
 ``_b`` base frame.
 
-The world is a floor at height 0, the robot, and objects. Objects collide only with the
-robot (not with the floor or each other) and never rotate: their quaternion stays
-(1, 0, 0, 0).
+The world is a floor at height 0, the robot, and objects, under `GRAVITY`. Objects
+collide only with the robot (not with the floor or each other) and never rotate: their
+quaternion stays (1, 0, 0, 0).
 
 - **Rows are independent.** The results of a row depend only on the calls for that row:
   not on the number of rows or threads, nor on a row that diverged.
@@ -35,6 +35,8 @@ from egoskin.bounds import Interval, check_bounds
 from egoskin.robots.config import RobotConfig
 from egoskin.shapes import Shape
 
+GRAVITY = 9.81
+"""Downward acceleration [m/s^2]."""
 OBJECT_MASS = 0.4
 """Mass of each object [kg]; contact ends the episode, so it hardly matters."""
 

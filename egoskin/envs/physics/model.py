@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from egoskin.envs.physics.contract import OBJECT_MASS, Scene
+from egoskin.envs.physics.contract import GRAVITY, OBJECT_MASS, Scene
 
 # Contact bits of the model files: in a geom's conaffinity, 1 is balls and 2 the floor;
 # higher bits are self-collision. Objects and floor have conaffinity 0.
@@ -24,7 +24,8 @@ def build_scene(scene: Scene) -> mujoco.MjModel:
     Position actuators implement the PD law, evaluated in every substep.
 
     Args:
-        scene: The scene; the robot's MJCF has no floor, actuators or sensors.
+        scene: The scene; the robot's MJCF has no floor, actuators or sensors, and its
+            options (``<option>``) are ignored.
 
     Raises:
         ValueError: If the robot's base does not float, a joint is not a hinge, or
@@ -33,15 +34,22 @@ def build_scene(scene: Scene) -> mujoco.MjModel:
     robot, config = scene.robot, scene.config
     robot.check_floating_base()
     spec = robot.spec()
+    # A new specification has no settings of the robot's file.
+    plain = mujoco.MjSpec()
+    spec.option = plain.option
     option = spec.option
+    option.gravity = [0, 0, -GRAVITY]
     option.timestep = config.timestep
+    option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
     # Dense: MuJoCo 4.0.0's Newton solver can be wrong with a sparse Jacobian.
     option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     option.iterations = _SOLVER_ITERATIONS
 
+    # Elements start from the default class they are given; the robot's is not ours.
     spec.worldbody.add_geom(
+        default=plain.default,
         name="floor",
         type=mujoco.mjtGeom.mjGEOM_PLANE,
         size=[0, 0, 1],
@@ -59,12 +67,14 @@ def build_scene(scene: Scene) -> mujoco.MjModel:
         )
         for axis, letter in zip(axes, "xyz", strict=True):
             body.add_joint(
+                default=plain.default,
                 name=f"object_{i}_{letter}",
                 type=mujoco.mjtJoint.mjJNT_SLIDE,
                 axis=axis,
             )
         shape.add_geom(
             body,
+            default=plain.default,
             name=f"object_{i}",
             mass=OBJECT_MASS,
             contype=_BALL_BIT,
@@ -75,6 +85,7 @@ def build_scene(scene: Scene) -> mujoco.MjModel:
     kp, kd = robot.joint_gains(config.gains)
     for name, p, d, limit in zip(robot.joints, kp, kd, robot.torque_limit, strict=True):
         actuator = spec.add_actuator(
+            default=plain.default,
             name=name,
             trntype=mujoco.mjtTrn.mjTRN_JOINT,
             target=name,

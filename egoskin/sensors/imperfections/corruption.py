@@ -466,10 +466,6 @@ class Corruption(StatefulTransform):
         ]
         values = self.start(torch.zeros(1, dtype=torch.int64), inputs, None)
         return [
-            Unbounded(
-                shape=torch.Size((*batch, *value.shape[1:])),
-                dtype=value.dtype,
-                device=spec.device,
-            )
+            Unbounded(shape=torch.Size((*batch, *value.shape[1:])), dtype=value.dtype)
             for value in values
         ]

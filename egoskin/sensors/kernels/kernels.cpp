@@ -3,9 +3,11 @@
 // stay in the cache. compilation.py builds and binding.py calls them; the PyTorch
 // code is the reference.
 //
-// Contract: every number is bit-identical to that of the PyTorch code (except for the
-// sign of zero). Sums are therefore in the order of the Python code, and nothing may be
-// contracted or reassociated: compile with -ffp-contract=off, never with -ffast-math.
+// Contract: every float32 number is bit-identical to that of the PyTorch code (except
+// for the sign of zero); a float64 number may differ in its last bit or two, because
+// PyTorch's float64 root is not exact (egoskin/rounding.py). Sums are therefore in the
+// order of the Python code, and nothing may be contracted or reassociated: compile with
+// -ffp-contract=off, never with -ffast-math.
 //
 // Only float32 and float64 kernels with C linkage are exported; all pointers are to
 // contiguous arrays unless a stride is given.
@@ -42,7 +44,7 @@ struct Tables {
   const void *radius, *squared, *bound; // of each object              [objects]
   const void *farthest;        // largest distance from base in range  [objects]
   // Field.
-  const void *cos_half;        // null: all are omnidirectional        [sensors]
+  const void *cos_half;        // -inf: sees everything; null: all do   [sensors]
   // Ray.
   const void *reach;           // largest distance of a hit            [sensors]
   const void *pyramid;         // cosines, then sines of the half angles [sensors, 4]
@@ -668,7 +670,8 @@ void ray(const Tables &t, const Inputs &in, T *out, uint8_t *detected) {
   const int64_t planes = t.apart ? t.objects : 1, plane = in.rows * size;
   const bool past_cache = Stream<T>::serves(out, beams, planes * plane);
   std::vector<Stream<T>> streams;
-  for (int64_t i = 0; i < planes; i++) streams.emplace_back(out + i * plane, past_cache);
+  for (int64_t i = 0; i < planes; i++)
+    streams.emplace_back(out + i * plane, past_cache);
   rays<T>(t, in, detected,
           [&](int64_t row, const Pair<T> &pair, const T *reading, T nearest) {
             const int64_t i = t.apart ? pair.object : 0;

@@ -6,8 +6,6 @@ normals point outward, and the same arguments give the same skin.
 
 from __future__ import annotations
 
-import fnmatch
-import glob
 import heapq
 import math
 from collections.abc import Mapping, Sequence
@@ -145,12 +143,7 @@ def _link_weights(
                 f"density: the weight of {pattern!r} must be finite and not negative, "
                 f"got {weight}"
             )
-    plain = {
-        glob.escape(link): 1.0
-        for link in links
-        if not any(fnmatch.fnmatchcase(link, pattern) for pattern in density)
-    }
-    weights = resolve({**density, **plain}, tuple(links), "density")
+    weights = resolve(density, tuple(links), "density", 1.0)
     return dict(zip(links, weights, strict=True))
 
 
@@ -253,7 +246,7 @@ def place_sensors(
 
     Returns:
         Sensors with z along the outward normal. The provenance holds the arguments and
-        the share of each link's samples rejected for lying inside the robot.
+        the share of each link's samples that were not on the outer surface.
 
     Raises:
         ValueError: If an argument is out of range, the robot lacks a link or pattern,

@@ -105,6 +105,49 @@ def test_fields_have_the_same_bits(skin, random_state, seed, dtype, per_object):
 
 
 @needs_compiler
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_full_sphere_beside_a_cone_sees_what_is_straight_behind(dtype):
+    normal = np.random.default_rng(0).normal(size=(64, 3))
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    skin = Skin(
+        robot="h1_2",
+        links=("pelvis",) * 64,
+        position=np.zeros((64, 3)),
+        normal=normal,
+        coverage=(Field(half_angle_deg=60.0), *[Field()] * 63),
+    )
+    # In row i the ball is behind sensor i.
+    pose = torch.zeros(64, 1, 7, dtype=dtype)
+    pose[:, 0, :3] = -0.7 * torch.from_numpy(normal)
+    base = torch.zeros(64, 7, dtype=dtype)
+    pose[..., 3] = base[:, 3] = 1.0
+    joints = torch.zeros(64, len(H1_2.joints), dtype=dtype)
+    inputs = (base, joints, pose, torch.ones(64, 1, dtype=torch.bool))
+    for sensor in pair(FieldSensor, skin, H1_2.chain, BALLS[:1], 1.0):
+        behind = sensor.compute(*inputs)[0].diagonal()
+        assert behind[0].isinf()
+        assert behind[1:].isfinite().all()
+    # Gradients are finite, too; they are those of a skin without a cone.
+    plain = FieldSensor(skin, H1_2.chain, BALLS[:1], 1.0)
+    place = pose.clone().requires_grad_()
+    reading = plain.compute(base, joints, place, inputs[3])[0].diagonal()
+    (gradient,) = torch.autograd.grad(reading[1:].sum(), place)
+    expected = -torch.from_numpy(normal).to(dtype)
+    torch.testing.assert_close(gradient[1:, 0, :3], expected[1:])
+
+
+@needs_compiler
+def test_hits_of_wrong_inputs_are_refused(skin, random_state):
+    _, fast = pair(RaySensor, skin, H1_2.chain, BALLS[:2], 1.0)
+    inputs = [random_state(4)[key] for key in KEYS]
+    for i, wrong in enumerate((inputs[0][:, :6], inputs[1][:, :3], inputs[2][:2])):
+        with pytest.raises(ValueError, match=r"must|rows"):
+            fast.hits(*inputs[:i], wrong, *inputs[i + 1 :])
+    with pytest.raises(ValueError, match="must have the same floating-point type"):
+        fast.hits(inputs[0].double(), *inputs[1:])
+
+
+@needs_compiler
 @given(SEED, DTYPES, st.sampled_from(["none", "min"]), st.booleans(), st.booleans())
 def test_rays_have_the_same_bits(
     skin, random_state, seed, dtype, reduce, per_object, cull
