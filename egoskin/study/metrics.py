@@ -130,11 +130,6 @@ are from the success in training, with exploration, and are the whole budget for
 that has not learnt (final success below 5 %)."""
 
 
-def metric(name: str) -> Metric:
-    """Return the metric with the given name."""
-    return next(m for m in METRICS if m.name == name)
-
-
 def tables(results: Sequence[Result]) -> Mapping[str, Table]:
     """Return the finite values of each metric by cell and seed."""
     found: dict[str, dict[str, dict[int, float]]] = {m.name: {} for m in METRICS}
