@@ -5,7 +5,8 @@ process ends, however it ends. It works between the processes of a host, and bet
 hosts if their shared file system supports locks. The owner file (``NAME.owner.3``: the
 third owner) is for hosts that do not share locks: its modification time is a heartbeat,
 and an owner on another host counts as dead when the heartbeat is too old. The next
-owner creates the file with the next number, which only one process can do.
+owner creates the file with the next number, which only one process can do. Numbers are
+used again after an owner has removed all files; the content tells whose a file is.
 """
 
 from __future__ import annotations
@@ -99,17 +100,21 @@ def claimed(
     """
     folder.mkdir(parents=True, exist_ok=True)
     with _lock(folder / f"{name}.lock", create=True) as free:
-        owner = _own(folder, name, stale) if free else None
+        mine = _signature()
+        owner = _own(folder, name, stale, mine) if free else None
         if owner is None:
             yield False
             return
         ended = threading.Event()
 
+        def is_mine() -> bool:
+            return _owners(folder, name)[-1:] == [owner] and owner.read_text() == mine
+
         def beat() -> None:
             while not ended.wait(heartbeat):
                 # File system errors may be temporary: the next heartbeat tries again.
                 with suppress(OSError):
-                    if _owners(folder, name)[-1:] != [owner]:
+                    if not is_mine():
                         return lost()
                     os.utime(owner)
 
@@ -120,10 +125,10 @@ def claimed(
         finally:
             ended.set()
             thread.join()
-            for path in _owners(folder, name):
-                path.unlink(missing_ok=True)
-                if path == owner:
-                    break
+            with suppress(OSError):
+                if is_mine():
+                    for path in _owners(folder, name):
+                        path.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -160,16 +165,21 @@ def _owners(folder: Path, name: str) -> list[Path]:
     return []
 
 
-def _own(folder: Path, name: str, stale: float) -> Path | None:
+def _signature() -> str:
+    """Return the content of an owner file of this process."""
+    content = {"host": this_host(), "name": socket.gethostname(), "pid": os.getpid()}
+    return json.dumps(content)
+
+
+def _own(folder: Path, name: str, stale: float, content: str) -> Path | None:
     """Become the owner; return the owner file, or None if another process is."""
     owners = _owners(folder, name)
     if _lives_elsewhere(folder, name, stale):
         return None
     number = int(owners[-1].suffix[1:]) + 1 if owners else 1
     path = folder / f"{name}.owner.{number}"
-    content = {"host": this_host(), "name": socket.gethostname(), "pid": os.getpid()}
     temporary = folder / f".{name}.{uuid.uuid4().hex}"
-    temporary.write_text(json.dumps(content))
+    temporary.write_text(content)
     try:
         # Atomic: the file appears complete, and only one process can create it.
         os.link(temporary, path)

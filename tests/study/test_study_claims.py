@@ -135,6 +135,25 @@ def test_an_owner_that_slept_learns_that_its_claim_was_taken(tmp_path: Path):
     assert is_claimed(tmp_path, "run")
 
 
+def test_an_owner_that_slept_knows_another_by_its_content(tmp_path: Path):
+    # The other took over as the second owner, ended, removed all files and began again
+    # as the first.
+    lost = threading.Event()
+    with claimed(tmp_path, "run", heartbeat=0.02, lost=lost.set) as mine:
+        assert mine
+        other = elsewhere(tmp_path, age=0)
+        assert lost.wait(10)
+    assert other.exists()
+    assert is_claimed(tmp_path, "run")
+
+
+def test_an_owner_whose_file_is_gone_leaves_a_newer_one_alone(tmp_path: Path):
+    with claimed(tmp_path, "run", heartbeat=60):
+        (tmp_path / "run.owner.1").unlink()
+        other = elsewhere(tmp_path, age=0, number=2)
+    assert other.exists()
+
+
 def test_a_heart_beats(tmp_path: Path):
     with claimed(tmp_path, "run", heartbeat=0.02):
         (owner,) = tmp_path.glob("run.owner.*")
