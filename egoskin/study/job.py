@@ -86,7 +86,8 @@ def work(folder: StudyFolder, name: str, stop: Stop, cores: int = 1) -> int:
     """
     manifest = folder.manifest()
     planned = manifest.run(name)
-    with claimed(folder.claims, name) as mine:
+    # Not a failure: if the claim is lost, another host works on the run.
+    with claimed(folder.claims, name, lost=lambda: os._exit(CLAIMED)) as mine:
         if not mine:
             return CLAIMED
         if folder.is_finished(name):

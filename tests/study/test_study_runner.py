@@ -14,6 +14,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -27,7 +28,7 @@ from egoskin.sensors import MASK_ALL
 from egoskin.storage.formats import read_sealed, sealed_json
 from egoskin.storage.serialization import to_plain
 from egoskin.study import cost as cost_module
-from egoskin.study import store
+from egoskin.study import job, store
 from egoskin.study.claims import claimed
 from egoskin.study.cost import cost, measure, measure_all
 from egoskin.study.job import CLAIMED, STOPPED, Stop, work
@@ -152,6 +153,22 @@ def test_a_run_that_somebody_works_on_is_left_alone(folder: StudyFolder):
         assert [s.state for s in folder.status(folder.manifest())] == ["running"]
         assert work(folder, NAME, Never()) == CLAIMED
     assert not folder.is_finished(NAME)
+
+
+def test_a_run_whose_claim_is_lost_has_not_failed(
+    folder: StudyFolder, monkeypatch: pytest.MonkeyPatch
+):
+    ended = []
+
+    @contextmanager
+    def lose(path: Path, name: str, *, lost: Callable[[], None]) -> Iterator[bool]:
+        lost()
+        yield False
+
+    monkeypatch.setattr(job, "claimed", lose)
+    monkeypatch.setattr(os, "_exit", ended.append)
+    work(folder, NAME, Never())
+    assert ended == [CLAIMED]
 
 
 def test_a_run_that_ppo_trains_is_left_to_it(folder: StudyFolder):
