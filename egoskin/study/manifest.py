@@ -335,7 +335,8 @@ def resolve(study: Study) -> Manifest:
     """Return the manifest of a new study, with the current defaults.
 
     Raises:
-        ValueError: If a cell is invalid or occurs twice; the text names the cell.
+        ValueError: If a cell is invalid, or has the name of another; the text names
+            the cell.
     """
     task = training_task(study.standard, TrainConfig().env.task)
     default = TrainConfig(env=EnvConfig(task=task), total_frames=study.frames)
@@ -365,9 +366,15 @@ def resolve(study: Study) -> Manifest:
             skin_sha256=digest,
             init_sha256=init,
         )
-        if cell.name in cells:
-            raise ValueError(f"{what}: cell {cell.name} is defined twice")
-        cells[cell.name] = cell
+        other = cells.setdefault(cell.name, cell)
+        if other is not cell:
+            names = [n.removeprefix("env.") for n in _differences(other.config, config)]
+            if not names:
+                raise ValueError(f"{what}: cell {cell.name} is defined twice")
+            raise ValueError(
+                f"{what}: another cell is also named {cell.name}; they only differ in "
+                f"{', '.join(names)} (files and robots need different names)"
+            )
     return Manifest(
         study=study.name,
         purpose=study.purpose,
