@@ -289,7 +289,7 @@ def slurm_script(
     return f"""#!/bin/bash
 # Study {manifest.study}: {len(manifest.runs)} runs, shared by all elements.
 # An element that reaches its time limit stops with checkpoints; one that is killed
-# loses a minute of work. Submit this again until `status` shows no missing runs.
+# loses a minute of work. Submit this again until `status` shows that all runs are done.
 #SBATCH --job-name=egoskin-{manifest.study}
 #SBATCH --array=0-{elements - 1}
 #SBATCH --nodes=1
