@@ -322,7 +322,7 @@ def entry(status: RunStatus) -> str:
             return f"{share:.0%}, {duration(status.left_s)} left"
         case "failed":
             return f"FAILED at {share:.0%}"
-        case "begun":
+        case "stopped":
             return f"stopped at {share:.0%}"
         case _:
             return "-"

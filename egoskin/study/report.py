@@ -226,8 +226,8 @@ def _blocks(
 
 
 def _missing(status: RunStatus) -> str:
-    text = {"missing": "", "begun": " (stopped)"}
-    return status.run.name + text.get(status.state, f" ({status.state})")
+    name, state = status.run.name, status.state
+    return name if state == "missing" else f"{name} ({state})"
 
 
 def _answer(judged: Sequence[Judged]) -> str:

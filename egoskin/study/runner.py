@@ -55,7 +55,7 @@ class Progress:
             tries: Maximum number of attempts for each run; those that failed as often
                 are not counted in the time left. None: there is no maximum.
         """
-        counts = {"done": 0, "running": 0, "failed": 0, "begun": 0, "missing": 0}
+        counts = {"done": 0, "running": 0, "failed": 0, "stopped": 0, "missing": 0}
         for each in status:
             counts[each.state] += 1
         total = sum(each.run.end for each in status)

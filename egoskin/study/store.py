@@ -41,8 +41,8 @@ from egoskin.study.claims import is_claimed, is_locked
 from egoskin.study.manifest import EvaluationPlan, Manifest, PlannedRun
 from egoskin.study.stored import StoredRun, load_run, record, thin, to_json
 
-State = Literal["done", "running", "failed", "begun", "missing"]
-"""State of a run; begun: no process works on it, and it can be resumed."""
+State = Literal["done", "running", "failed", "stopped", "missing"]
+"""State of a run; stopped: it was begun, and no process works on it now."""
 
 START = "--- started"
 """Beginning of the line that each start adds to a log."""
@@ -363,7 +363,7 @@ class StudyFolder:
         elif failure is not None:
             state = "failed"
         elif self.run_path(run.name).exists():
-            state = "begun"
+            state = "stopped"
         return RunStatus(
             run=run,
             state=state,

@@ -117,7 +117,7 @@ def test_a_run_that_was_trained_is_only_judged(folder: StudyFolder):
     expected = table(folder)
     shutil.rmtree(folder.result_path(NAME))
     before = files(folder.run_path(NAME))
-    assert folder.status(folder.manifest())[0].state == "begun"
+    assert folder.status(folder.manifest())[0].state == "stopped"
     assert work(folder, NAME, Never()) == 0
     assert files(folder.run_path(NAME)) == before
     assert table(folder) == expected
@@ -136,14 +136,18 @@ def test_a_policy_without_the_last_checkpoint_is_not_trained_to_its_end(
     assert not folder.is_trained(planned)
 
 
-def test_a_stop_leaves_a_checkpoint_and_no_result(tmp_path: Path):
+def test_a_stop_leaves_a_checkpoint_and_no_result(tmp_path: Path, capsys):
     folder = StudyFolder(tmp_path / "study")
     folder.plan(resolve(SHORT))
     # With other numbers of workers and threads than when it is resumed.
     assert work(folder, NAME, Never(requested=True), cores=2) == STOPPED
     assert (folder.run_path(NAME) / "checkpoint.safetensors").is_file()
     assert not folder.is_finished(NAME)
-    assert [s.state for s in folder.status(folder.manifest())] == ["begun"]
+    status = folder.status(folder.manifest())
+    assert [s.state for s in status] == ["stopped"]
+    assert str(Progress.of(status)).startswith("1 stopped; ")
+    print_status(folder, folder.manifest(), status)
+    assert "blind  stopped at 0%" in capsys.readouterr().out
 
 
 def test_a_run_that_somebody_works_on_is_left_alone(folder: StudyFolder):
@@ -606,7 +610,7 @@ def test_a_runner_that_is_killed_ends_its_runs_and_is_started_again(
     # Orphaned jobs notice it and stop with a checkpoint.
     wait_for(lambda: not jobs(study))
     before = study.status(study.manifest())
-    assert any(s.state == "begun" and s.frames for s in before)
+    assert any(s.state == "stopped" and s.frames for s in before)
     again = start(study.path)
     assert again.end() == 0, again.text()
     assert table(study) == undisturbed
@@ -653,7 +657,7 @@ def test_ctrl_c_ends_all_runs_with_checkpoints(study, start, undisturbed):
     assert not jobs(study)
     assert "Traceback" not in runner.text()
     for status in study.status(study.manifest()):
-        if status.state == "begun" and status.frames:
+        if status.state == "stopped" and status.frames:
             _, header = Run.open(study.run_path(status.run.name)).load_checkpoint()
             assert header["frames"] == status.frames
     again = start(study.path)
