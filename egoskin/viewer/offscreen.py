@@ -224,8 +224,8 @@ def check_film(hz: float, fps: float, max_seconds: float | None) -> None:
         raise ValueError(f"fps must be in (0, {hz:g}], the control rate, got {fps:g}")
     if max_seconds is not None and not max_seconds * hz >= 1:
         raise ValueError(
-            f"max_seconds must be at least one control step, {1 / hz:.3g} s, "
-            f"got {max_seconds:g}"
+            f"the film must last at least one control step, {1 / hz:.3g} s, got "
+            f"{max_seconds:g} s"
         )
 
 

@@ -253,7 +253,7 @@ def test_recordings_are_of_the_rows_of_the_throw_set(skin: Skin):
     ("options", "text"),
     [
         ({"fps": 61.0}, "fps must be in"),
-        ({"max_seconds": 0.0}, "at least one control step"),
+        ({"max_seconds": 0.0}, "the film must last at least one control step"),
     ],
 )
 def test_numbers_out_of_range_are_refused(
