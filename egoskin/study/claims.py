@@ -11,7 +11,6 @@ used again after an owner has removed all files; the content tells whose a file 
 
 from __future__ import annotations
 
-import errno
 import fcntl
 import json
 import os
@@ -23,7 +22,6 @@ import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO
 
 HEARTBEAT_S = 15.0
 """Interval between heartbeats of an owner [s]."""
@@ -133,27 +131,22 @@ def claimed(
 
 @contextmanager
 def _lock(path: Path, *, create: bool) -> Iterator[bool]:
-    """Try to lock a file; yield whether the lock was free."""
-    with _open(path, create=create) as file:
+    """Try to lock a file, or only look; yield whether no other process has locked it.
+
+    Args:
+        path: The file.
+        create: Whether to create and lock it. Otherwise the lock is shared, so that
+            those who look do not see each other; and for an exclusive lock some file
+            systems require that the file is open for writing.
+    """
+    mode, kind = ("a", fcntl.LOCK_EX) if create else ("r", fcntl.LOCK_SH)
+    with open(path, mode) as file:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(file, kind | fcntl.LOCK_NB)
         except BlockingIOError:
             yield False
             return
         yield True
-
-
-def _open(path: Path, *, create: bool) -> IO[str]:
-    """Open a file to lock; some file systems only lock files open for writing."""
-    if create:
-        return open(path, "a")
-    try:
-        return open(path, "r+")
-    except OSError as error:
-        if error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS):
-            raise
-        # Who may only read can still check the lock.
-        return open(path)
 
 
 def _owners(folder: Path, name: str) -> list[Path]:
