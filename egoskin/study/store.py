@@ -454,7 +454,6 @@ def judge(
         "trained_on": policy.env_config.standard,
         "throw_set": plan.throw_set,
         "frames": policy.policy_spec.frames,
-        "mask": [],
     }
 
 
