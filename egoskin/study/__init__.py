@@ -5,6 +5,7 @@
 * `cost`: estimate of a study's cost
 * `store`: the study folder: state and result of each run
 * `claims`: locks, so that only one process works on a run, on one host or many
+* `evaluation`: a policy on the study's throw set
 * `job`: one run and its evaluation, in its own process
 * `runner`: execution of the runs in parallel
 * `statistics`: estimates over seeds, tests, power

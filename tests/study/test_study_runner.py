@@ -28,7 +28,7 @@ from egoskin.sensors import MASK_ALL
 from egoskin.storage.formats import read_sealed, sealed_json
 from egoskin.storage.serialization import to_plain
 from egoskin.study import cost as cost_module
-from egoskin.study import job, store
+from egoskin.study import evaluation, job, store
 from egoskin.study.claims import claimed
 from egoskin.study.cost import cost, measure, measure_all
 from egoskin.study.job import CLAIMED, STOPPED, Stop, work
@@ -199,13 +199,13 @@ def test_a_run_is_judged_on_all_its_cores(
 ):
     expected, used = table(folder), []
     shutil.rmtree(folder.result_path(NAME))
-    play = store.play_throws
+    play = evaluation.play_throws
 
     def noted(*args, num_workers: int, **options):
         used.append(num_workers)
         return play(*args, num_workers=num_workers, **options)
 
-    monkeypatch.setattr(store, "play_throws", noted)
+    monkeypatch.setattr(evaluation, "play_throws", noted)
     assert work(folder, NAME, Never(), cores=2) == 0
     assert used == [2, 2]
     assert table(folder) == expected
@@ -315,7 +315,7 @@ def test_a_result_that_was_edited_or_exchanged_is_refused(folder: StudyFolder):
 def test_a_policy_is_judged_with_and_without_its_skin():
     # With random weights it soon falls, one way or another.
     policy, plan = make_policy(EnvConfig()), EvaluationPlan(episodes=8)
-    result = store.judge(policy, plan)
+    result = evaluation.evaluate_policy(policy, plan)
     config = standard_task(policy.env_config, plan.standard)
     which = {"throw_set": plan.throw_set, "episodes": plan.episodes}
     seen, masked = (
