@@ -31,7 +31,8 @@ from egoskin.storage.serialization import to_plain
 from egoskin.storage.tensor_file import write_file
 from egoskin.study.claims import owner
 from egoskin.study.cost import Speed, cost, measure_all
-from egoskin.study.manifest import Manifest, load_study, resolve, settings
+from egoskin.study.fields import settings
+from egoskin.study.manifest import Manifest, load_study, resolve
 from egoskin.study.runner import LocalRunner, Progress, Runner, slurm_script
 from egoskin.study.shipped import STUDIES
 from egoskin.study.store import RunStatus, StudyFolder

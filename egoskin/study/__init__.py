@@ -1,5 +1,6 @@
 """Studies: sets of runs that differ in a few fields, compared over seeds.
 
+* `fields`: fields of a training configuration by dotted name
 * `manifest`: definition of a study: cells, seeds, budget, evaluation
 * `shipped`: the studies that come with the package
 * `cost`: estimate of a study's cost

@@ -21,6 +21,7 @@ from egoskin.evaluation.visibility import warning_texts
 from egoskin.storage.serialization import read_json
 from egoskin.storage.tensor_file import write_file
 from egoskin.study.differences import Difference, differences
+from egoskin.study.fields import settings
 from egoskin.study.figures import (
     equivalence,
     forest,
@@ -30,7 +31,7 @@ from egoskin.study.figures import (
     success_by_range,
 )
 from egoskin.study.findings import CELLS, Judged, Tested, judge_findings
-from egoskin.study.manifest import Manifest, settings
+from egoskin.study.manifest import Manifest
 from egoskin.study.metrics import METRICS, runs_csv, tables
 from egoskin.study.statistics import (
     ALPHA,
