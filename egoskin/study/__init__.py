@@ -12,5 +12,6 @@
 * `statistics`: estimates over seeds, tests, power
 * `findings`: the paper's findings as contrasts, fixed before any run
 * `figures`: figures of the report
+* `page`: a text as one HTML page
 * `report`: report.md, index.html, runs.csv
 """

@@ -26,7 +26,8 @@ from egoskin.study.figures import (
 from egoskin.study.findings import judge_findings
 from egoskin.study.manifest import Manifest, resolve
 from egoskin.study.metrics import METRICS, frames_to, runs_csv, tables
-from egoskin.study.report import page, table, write_report
+from egoskin.study.page import page, table
+from egoskin.study.report import write_report
 from egoskin.study.shipped import FINDINGS, SMOKE
 from egoskin.study.store import StudyFolder
 from studies import expected, store, store_all
