@@ -20,11 +20,13 @@ from egoskin.viewer.film import Frame
 from egoskin.viewer.offscreen import (
     CameraConfig,
     Painter,
-    Recording,
     RenderingError,
     closest_point,
-    ending_of,
     painter_of,
+)
+from egoskin.viewer.recording import (
+    Recording,
+    ending_of,
     record_episodes,
     render_recording,
 )
