@@ -214,12 +214,12 @@ class Run:
     """Maximum number of parallel runs; None: enough to use all cores."""
     cores_per_run: Annotated[int | None, COUNT] = None
     """Workers and learner threads of each run; None: measured, half a minute for each
-    choice; or 1, if the study is short, with --parallel, and on Ray. It does not change
-    the results."""
+    choice (but 1 for a short study, with --parallel, or on Ray). It does not change the
+    results."""
     tries: Annotated[int, COUNT] = 3
     """Maximum number of attempts for each run."""
     again: bool = False
-    """Whether to try runs again that failed too often."""
+    """Whether to retry the runs that have used up their attempts."""
     nice: int = 5
     """Niceness of the runs."""
 
