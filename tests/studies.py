@@ -98,7 +98,6 @@ def store(
         "trained_on": run.config.env.standard,
         "throw_set": manifest.evaluation.throw_set,
         "frames": end,
-        "mask": [],
     }
     (path / f"evaluation_{end:012d}.json").write_bytes(sealed_json(evaluation))
 

@@ -264,6 +264,22 @@ class PPO:
         metrics["kl"] = self._divergence(batch, some)
         if config.desired_kl is not None:
             self._adapt_learning_rate(metrics["kl"], config.desired_kl)
+        self.update_norms(data)
+        metrics["explained_variance"] = float(explained)
+        metrics["learning_rate"] = self.learning_rate
+        metrics["action_std"] = float(self.agent.head.log_std.detach().exp().mean())
+        return metrics
+
+    def update_norms(self, data: TensorDictBase) -> None:
+        """Update the normalisers with the features of some rows.
+
+        Args:
+            data: Contains the features that are normalised, ``[n]``.
+
+        Raises:
+            NonFiniteError: If a mean or variance is not finite then; its batch are the
+                rows whose feature is not finite.
+        """
         for key, norm in self.agent.norms.items():
             assert isinstance(norm, RunningNorm)
             norm.update(data[key])
@@ -273,10 +289,6 @@ class PPO:
                 finite = value.is_finite() if sparse else value.isfinite().all(-1)
                 (bad,) = (~finite).nonzero(as_tuple=True)
                 raise NonFiniteError(f"normaliser of {key!r}", _rows(data, bad))
-        metrics["explained_variance"] = float(explained)
-        metrics["learning_rate"] = self.learning_rate
-        metrics["action_std"] = float(self.agent.head.log_std.detach().exp().mean())
-        return metrics
 
     def step(self, data: TensorDictBase, index: Tensor) -> dict[str, Tensor]:
         """Take one step of the optimiser on a minibatch.

@@ -42,13 +42,8 @@ from egoskin.viewer.film import (
     save_film,
     save_picture,
 )
-from egoskin.viewer.offscreen import (
-    CameraConfig,
-    check_film,
-    painter_of,
-    record_episodes,
-    render_recording,
-)
+from egoskin.viewer.offscreen import CameraConfig, painter_of
+from egoskin.viewer.recording import check_film, record_episodes, render_recording
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -29,7 +29,7 @@ Train a robot to dodge balls with a skin of proximity sensors.
   egoskin train --sensor.signal binary --sensor.range 1 --seed 1
   egoskin train --resume runs/NAME --total-frames 100e6
   egoskin train --config runs/NAME/config.json --seed 2
-  egoskin train --init-from localization --sensor.signal localization \
+  egoskin train --init-from localization --sensor.signal localization \\
       --task.randomization.friction 0.4 1
   egoskin train --film-every 5e6 --log wandb
   egoskin train --engine warp --device cuda

@@ -92,6 +92,9 @@ def main(args: list[str]) -> None:
     error = None
     try:
         ppo.step(batch, torch.arange(len(batch)))
+        # Only the dump of a failed normaliser holds the features.
+        if set(agent.norms) <= set(batch.keys()):
+            ppo.update_norms(batch)
     except NonFiniteError as again:
         error = again
     found += not_finite(

@@ -31,7 +31,8 @@ from egoskin.storage.serialization import to_plain
 from egoskin.storage.tensor_file import write_file
 from egoskin.study.claims import owner
 from egoskin.study.cost import Speed, cost, measure_all
-from egoskin.study.manifest import Manifest, load_study, resolve, settings
+from egoskin.study.fields import settings
+from egoskin.study.manifest import Manifest, load_study, resolve
 from egoskin.study.runner import LocalRunner, Progress, Runner, slurm_script
 from egoskin.study.shipped import STUDIES
 from egoskin.study.store import RunStatus, StudyFolder
@@ -213,12 +214,12 @@ class Run:
     """Maximum number of parallel runs; None: enough to use all cores."""
     cores_per_run: Annotated[int | None, COUNT] = None
     """Workers and learner threads of each run; None: measured, half a minute for each
-    choice; or 1, if the study is short, with --parallel, and on Ray. It does not change
-    the results."""
+    choice (but 1 for a short study, with --parallel, or on Ray). It does not change the
+    results."""
     tries: Annotated[int, COUNT] = 3
     """Maximum number of attempts for each run."""
     again: bool = False
-    """Whether to try runs again that failed too often."""
+    """Whether to retry the runs that have used up their attempts."""
     nice: int = 5
     """Niceness of the runs."""
 
@@ -322,7 +323,7 @@ def entry(status: RunStatus) -> str:
             return f"{share:.0%}, {duration(status.left_s)} left"
         case "failed":
             return f"FAILED at {share:.0%}"
-        case "begun":
+        case "stopped":
             return f"stopped at {share:.0%}"
         case _:
             return "-"

@@ -1,7 +1,8 @@
-"""Upper bound on dodging: the best actions once a ball is within reach of a sensor.
+"""Reference for dodging: the best actions that a search finds near a sensor.
 
-This is a search over actions, not a policy. A policy may never find these actions, but
-they are feasible for the body in the time that is left.
+The search starts once a ball is within reach of a sensor. A policy may never find these
+actions, but they are feasible for the body in the time that is left: what the body can
+do is at least this.
 """
 
 from __future__ import annotations

@@ -295,15 +295,27 @@ def see_directions(
         where no ball can come from.
 
     Raises:
-        ValueError: If the body has shapes without a distance function.
+        ValueError: If the body has shapes without a distance function, or a sensor has
+            an infinite range.
     """
     body = StandingRobot(robot)
     cells = pipelines(robot, skin, {sensor.coverage: sensor}, sensor.range)
+    # A range of the skin takes precedence.
+    ranges = cells[sensor.coverage].skin.range
+    _check_finite(ranges)
     paths = direction_paths(body, ball, farthest(cells))
     seen = trace(body, paths, skin, cells, [sensor.range], ball, progress=progress)
-    # A range of the skin takes precedence.
-    longest = float(cells[sensor.coverage].skin.range.max())
+    longest = float(ranges.max())
     return _on_grid(seen.clearance[0], seen.runway >= longest)
+
+
+def _check_finite(ranges: np.ndarray) -> None:
+    """Raise ValueError if one of the sensors' ranges, ``[S]``, is infinite."""
+    if np.isinf(ranges).any():
+        raise ValueError(
+            f"sensor {int(np.isinf(ranges).argmax())} of the skin has an infinite "
+            "range: what it sees is only defined for a finite one"
+        )
 
 
 def _share(flags: Tensor, among: Tensor) -> float | None:
@@ -339,8 +351,8 @@ def analyse(
         progress: Called with the name of the current task and its share done.
 
     Raises:
-        ValueError: If there is no coverage, range or throw, a range is repeated or not
-            positive and finite, or the seed is invalid.
+        ValueError: If there is no coverage, range or throw, a range (also of the skin)
+            is not positive and finite, one is repeated, or the seed is invalid.
     """
     if not sensors or not ranges:
         raise ValueError("an analysis needs at least one coverage and one range")
@@ -348,12 +360,7 @@ def analyse(
         raise ValueError(f"ranges must be distinct, got {list(ranges)}")
     if not all(0 < r < math.inf for r in ranges):
         raise ValueError(f"ranges must be positive and finite, got {list(ranges)}")
-    if np.isinf(skin.range).any():
-        sensor = int(np.isinf(skin.range).argmax())
-        raise ValueError(
-            f"sensor {sensor} of the skin has an infinite range: a warning time "
-            "requires a finite one"
-        )
+    _check_finite(skin.range)
     check_seed(seed)
     if num_throws < 1:
         raise ValueError(f"num_throws must be at least 1, got {num_throws}")

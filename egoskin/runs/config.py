@@ -43,8 +43,8 @@ class TrainConfig:
     num_envs: int = 4096
     """Agents simulated in parallel."""
     num_workers: int | None = None
-    """Simulation processes; None: the largest divisor of num_envs <= cores. Not used by
-    engine warp."""
+    """Simulation processes; None: the largest divisor of num_envs <= cores. Engine
+    warp: leave out (one process)."""
     engine: Engine = "mujoco"
     """Physics engine: MuJoCo on the CPU, or MuJoCo Warp on the device, made for a GPU
     (extra gpu)."""

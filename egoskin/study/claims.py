@@ -5,12 +5,12 @@ process ends, however it ends. It works between the processes of a host, and bet
 hosts if their shared file system supports locks. The owner file (``NAME.owner.3``: the
 third owner) is for hosts that do not share locks: its modification time is a heartbeat,
 and an owner on another host counts as dead when the heartbeat is too old. The next
-owner creates the file with the next number, which only one process can do.
+owner creates the file with the next number, which only one process can do. Numbers are
+used again after an owner has removed all files; the content tells whose a file is.
 """
 
 from __future__ import annotations
 
-import errno
 import fcntl
 import json
 import os
@@ -22,7 +22,6 @@ import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO
 
 HEARTBEAT_S = 15.0
 """Interval between heartbeats of an owner [s]."""
@@ -99,17 +98,21 @@ def claimed(
     """
     folder.mkdir(parents=True, exist_ok=True)
     with _lock(folder / f"{name}.lock", create=True) as free:
-        owner = _own(folder, name, stale) if free else None
+        mine = _signature()
+        owner = _own(folder, name, stale, mine) if free else None
         if owner is None:
             yield False
             return
         ended = threading.Event()
 
+        def is_mine() -> bool:
+            return _owners(folder, name)[-1:] == [owner] and owner.read_text() == mine
+
         def beat() -> None:
             while not ended.wait(heartbeat):
                 # File system errors may be temporary: the next heartbeat tries again.
                 with suppress(OSError):
-                    if _owners(folder, name)[-1:] != [owner]:
+                    if not is_mine():
                         return lost()
                     os.utime(owner)
 
@@ -120,35 +123,30 @@ def claimed(
         finally:
             ended.set()
             thread.join()
-            for path in _owners(folder, name):
-                path.unlink(missing_ok=True)
-                if path == owner:
-                    break
+            with suppress(OSError):
+                if is_mine():
+                    for path in _owners(folder, name):
+                        path.unlink(missing_ok=True)
 
 
 @contextmanager
 def _lock(path: Path, *, create: bool) -> Iterator[bool]:
-    """Try to lock a file; yield whether the lock was free."""
-    with _open(path, create=create) as file:
+    """Try to lock a file, or only look; yield whether no other process has locked it.
+
+    Args:
+        path: The file.
+        create: Whether to create and lock it. Otherwise the lock is shared, so that
+            those who look do not see each other; and for an exclusive lock some file
+            systems require that the file is open for writing.
+    """
+    mode, kind = ("a", fcntl.LOCK_EX) if create else ("r", fcntl.LOCK_SH)
+    with open(path, mode) as file:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(file, kind | fcntl.LOCK_NB)
         except BlockingIOError:
             yield False
             return
         yield True
-
-
-def _open(path: Path, *, create: bool) -> IO[str]:
-    """Open a file to lock; some file systems only lock files open for writing."""
-    if create:
-        return open(path, "a")
-    try:
-        return open(path, "r+")
-    except OSError as error:
-        if error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS):
-            raise
-        # Who may only read can still check the lock.
-        return open(path)
 
 
 def _owners(folder: Path, name: str) -> list[Path]:
@@ -160,16 +158,21 @@ def _owners(folder: Path, name: str) -> list[Path]:
     return []
 
 
-def _own(folder: Path, name: str, stale: float) -> Path | None:
+def _signature() -> str:
+    """Return the content of an owner file of this process."""
+    content = {"host": this_host(), "name": socket.gethostname(), "pid": os.getpid()}
+    return json.dumps(content)
+
+
+def _own(folder: Path, name: str, stale: float, content: str) -> Path | None:
     """Become the owner; return the owner file, or None if another process is."""
     owners = _owners(folder, name)
     if _lives_elsewhere(folder, name, stale):
         return None
     number = int(owners[-1].suffix[1:]) + 1 if owners else 1
     path = folder / f"{name}.owner.{number}"
-    content = {"host": this_host(), "name": socket.gethostname(), "pid": os.getpid()}
     temporary = folder / f".{name}.{uuid.uuid4().hex}"
-    temporary.write_text(json.dumps(content))
+    temporary.write_text(content)
     try:
         # Atomic: the file appears complete, and only one process can create it.
         os.link(temporary, path)

@@ -369,12 +369,11 @@ def sample_efficiency(manifest: Manifest, results: Sequence[Result]) -> Figure |
     rows: list[tuple[str, str, list[float], list[float]]] = []
     for cell in manifest.cells:
         own = [r for r in results if r.run.cell == cell]
-        half, most = ([frames_to(r, s) for r in own] for s in (0.5, 0.9))
-        found = [[f / 1e6 for f in x if f is not None] for x in (half, most)]
-        if found[1]:
+        half, most = ([frames_to(r, s) / 1e6 for r in own] for s in (0.5, 0.9))
+        if own:
             signal = grid[cell.name].signal if cell.name in grid else ""
             colour = _STYLES.get(signal, (_BLIND, ""))[0]
-            rows.append((cell.name, colour, found[0], found[1]))
+            rows.append((cell.name, colour, half, most))
     if not rows:
         return None
     rows.sort(key=lambda row: spread(row[3]).iqm)

@@ -24,7 +24,8 @@ from egoskin.progress import ProgressLine
 from egoskin.runs.run import RunLockedError
 from egoskin.runs.trainer import open_trainer, train
 from egoskin.study.claims import claimed
-from egoskin.study.store import StudyFolder, judge_run, now
+from egoskin.study.evaluation import evaluate_run
+from egoskin.study.store import StudyFolder, now
 
 FAILED = 1
 """Exit status after an error, which has been written to stderr."""
@@ -86,7 +87,8 @@ def work(folder: StudyFolder, name: str, stop: Stop, cores: int = 1) -> int:
     """
     manifest = folder.manifest()
     planned = manifest.run(name)
-    with claimed(folder.claims, name) as mine:
+    # Not a failure: if the claim is lost, another host works on the run.
+    with claimed(folder.claims, name, lost=lambda: os._exit(CLAIMED)) as mine:
         if not mine:
             return CLAIMED
         if folder.is_finished(name):
@@ -107,7 +109,7 @@ def work(folder: StudyFolder, name: str, stop: Stop, cores: int = 1) -> int:
                 return STOPPED
         print(f"{now()} evaluate on {manifest.evaluation.episodes} throws", flush=True)
         try:
-            judge_run(folder, planned, manifest.evaluation, stop.check, cores)
+            evaluate_run(folder, planned, manifest.evaluation, stop.check, cores)
         except _StoppedError:
             return STOPPED
         print(f"{now()} finished", flush=True)

@@ -14,7 +14,7 @@ import copy
 import dataclasses
 import math
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -26,7 +26,6 @@ from egoskin.hints import did_you_mean
 from egoskin.make import EnvConfig
 from egoskin.policies.policy import load_networks
 from egoskin.rng import check_seed
-from egoskin.robots.own import kept_robot
 from egoskin.runs.config import (
     INIT_HASH,
     MACHINE_FIELDS,
@@ -48,17 +47,19 @@ from egoskin.storage.serialization import (
     to_plain,
 )
 from egoskin.storage.tensor_file import write_file
-
-Overrides = Mapping[str, Any]
-"""Values by dotted field names, as on the command line: ``sensor.range``."""
+from egoskin.study.fields import (
+    FILES,
+    Overrides,
+    brief,
+    changed_values,
+    get_value,
+    override,
+    set_value,
+)
 
 # Fields that a study sets itself, and fields that are the same in all its cells.
 _NOT_OF_A_STUDY = RESUME_FIELDS | {"seed", "device", "engine"}
 _OF_ALL_CELLS = {"snapshot_frames", "checkpoint_interval"}
-# Compared as a whole: a robot is either a name or data.
-_ROBOT = "env.robot"
-# Files. Runs have other working directories, and the content is compared by its hash.
-_FILES = ("env.skin.path", "init_from")
 # Fields that the sensor's label already contains.
 _LABEL = ("env.sensor.coverage", "env.sensor.signal", "env.sensor.range")
 
@@ -91,7 +92,7 @@ class Study:
     purpose: str
     """Its purpose, in a few words."""
     cells: tuple[dict[str, Any], ...]
-    """`Overrides` of each cell."""
+    """`egoskin.study.fields.Overrides` of each cell."""
     seeds: tuple[int, ...]
     """Seeds of each cell, in the order in which they are run."""
     frames: Annotated[int, COUNT]
@@ -99,7 +100,7 @@ class Study:
     standard: Standard = "2"
     """Version of the standard throw used in training."""
     base: dict[str, Any] = field(default_factory=dict)
-    """`Overrides` that all cells share."""
+    """`egoskin.study.fields.Overrides` that all cells share."""
     evaluation: EvaluationPlan = field(default_factory=EvaluationPlan)
     """How the policies are evaluated."""
 
@@ -178,7 +179,7 @@ class PlannedRun:
                 compared. Their paths may differ.
         """
         old, new = to_plain(self.config), to_plain(other)
-        moved = {n for n in _FILES if None not in (_get(old, n), _get(new, n))}
+        moved = {n for n in FILES if None not in (get_value(old, n), get_value(new, n))}
         kept = RESUME_FIELDS | moved
         names = [n for n in changed_fields(old, new) if n not in kept]
         # Older runs and manifests lack some hashes.
@@ -222,11 +223,11 @@ class Manifest:
 
     def overrides(self, cell: Cell) -> dict[str, Any]:
         """Return the values in which a cell differs from the base, by field."""
-        return _differences(self.base, cell.config)
+        return changed_values(self.base, cell.config)
 
     def not_default(self) -> dict[str, Any]:
         """Return the values in which all cells differ from the default, by field."""
-        found = _differences(TrainConfig(), self.base)
+        found = changed_values(TrainConfig(), self.base)
         return {k: v for k, v in found.items() if k not in MACHINE_FIELDS}
 
     def extended(self, other: Manifest) -> Manifest:
@@ -241,7 +242,7 @@ class Manifest:
                 raise ValueError(
                     f"the manifest's {name} cannot be changed from {own} to {new}"
                 )
-        if changed := _differences(self.base, other.base):
+        if changed := changed_values(self.base, other.base):
             raise ValueError(
                 "the manifest's configuration cannot be changed; it differs in "
                 + ", ".join(changed)
@@ -250,7 +251,7 @@ class Manifest:
         for cell in other.cells:
             before = own.setdefault(cell.name, cell)
             if before != cell:
-                names = [*_differences(before.config, cell.config)] or ["files"]
+                names = [*changed_values(before.config, cell.config)] or ["files"]
                 raise ValueError(
                     f"the manifest's cell {cell.name} cannot be changed; it differs in "
                     + ", ".join(names)
@@ -298,7 +299,7 @@ class Manifest:
             # Override in the format of the file, and only then migrate.
             plain = copy.deepcopy(content["base"])
             for name, value in overrides.items():
-                _set(plain, name, value, known=False)
+                set_value(plain, name, value, known=False)
             return from_plain(TrainConfig, present_config(plain, number, what), what)
 
         try:
@@ -335,7 +336,8 @@ def resolve(study: Study) -> Manifest:
     """Return the manifest of a new study, with the current defaults.
 
     Raises:
-        ValueError: If a cell is invalid or occurs twice; the text names the cell.
+        ValueError: If a cell is invalid, or has the name of another; the text names
+            the cell.
     """
     task = training_task(study.standard, TrainConfig().env.task)
     default = TrainConfig(env=EnvConfig(task=task), total_frames=study.frames)
@@ -365,9 +367,16 @@ def resolve(study: Study) -> Manifest:
             skin_sha256=digest,
             init_sha256=init,
         )
-        if cell.name in cells:
-            raise ValueError(f"{what}: cell {cell.name} is defined twice")
-        cells[cell.name] = cell
+        other = cells.setdefault(cell.name, cell)
+        if other is not cell:
+            differs = changed_values(other.config, config)
+            if not differs:
+                raise ValueError(f"{what}: cell {cell.name} is defined twice")
+            names = ", ".join(name.removeprefix("env.") for name in differs)
+            raise ValueError(
+                f"{what}: another cell is also named {cell.name}; they only differ in "
+                f"{names} (files and robots need different names)"
+            )
     return Manifest(
         study=study.name,
         purpose=study.purpose,
@@ -378,110 +387,15 @@ def resolve(study: Study) -> Manifest:
     )
 
 
-def override(
-    config: TrainConfig, overrides: Overrides, what: str, fixed: Collection[str] = ()
-) -> TrainConfig:
-    """Return a configuration with the values of some fields replaced.
-
-    Args:
-        config: The configuration.
-        overrides: The values.
-        what: Name of their owner, for the error text.
-        fixed: Fields that cannot be overridden.
-
-    Raises:
-        ValueError: If a field does not exist or is fixed, or a value is invalid.
-    """
-    plain = to_plain(config)
-    for name, value in overrides.items():
-        full = _full_name(name)
-        if full.split(".")[0] in fixed:
-            raise ValueError(f"{what}: {name} cannot be set here")
-        try:
-            if full == _ROBOT and isinstance(value, str):
-                value = kept_robot(value)
-            # The name of a policy of the package is no path.
-            if full in _FILES and isinstance(value, str) and Path(value).exists():
-                value = Path(value).absolute()
-            _set(plain, full, to_plain(value), known=True)
-        except KeyError as error:
-            raise ValueError(f"{what}: {error.args[0]}") from None
-        except (ValueError, OSError) as error:
-            raise ValueError(f"{what}: {error}") from error
-    try:
-        return from_plain(TrainConfig, plain, what)
-    except ValueError as error:
-        text = str(error).removeprefix(f"{what}: ")
-        given = ", ".join(f"{k}={v}" for k, v in overrides.items()) or "the default"
-        raise ValueError(f"{what} ({given}): {text}") from error
-
-
 def cell_name(base: TrainConfig, config: TrainConfig) -> str:
     """Return a cell's name: its sensor's label, then other differences to the base."""
     parts = [config.env.sensor.label()]
-    for name, value in _differences(base, config).items():
-        if name in _FILES and value is not None:
+    for name, value in changed_values(base, config).items():
+        if name in FILES and value is not None:
             value = Path(value).name
         if name not in _LABEL:
             # A minus sign, as "[-1.0, 1.0]" has, is not one of the hyphens.
             words = [name.rpartition(".")[2]]
-            words += [re.sub(r"(?<!\w)-(?=\.?\d)", "minus", _brief(value))]
+            words += [re.sub(r"(?<!\w)-(?=\.?\d)", "minus", brief(value))]
             parts += [re.sub(r"[^\w.]+", "-", word).strip("-") for word in words]
     return "-".join(parts)
-
-
-def settings(values: Mapping[str, Any]) -> list[str]:
-    """Return the values of fields as text: "sensor.range = 0.5"."""
-    return [f"{k.removeprefix('env.')} = {_brief(v)}" for k, v in values.items()]
-
-
-def _brief(value: Any) -> str:
-    """Return the value of a field as text; for a robot given as data, its name."""
-    return str(value.get("name", value) if isinstance(value, dict) else value)
-
-
-def _differences(base: TrainConfig, config: TrainConfig) -> dict[str, Any]:
-    """Return the plain values in which a configuration differs, by field."""
-    old, new = to_plain(base), to_plain(config)
-    names = (
-        _ROBOT if name.startswith(f"{_ROBOT}.") else name
-        for name in changed_fields(old, new)
-    )
-    return {name: _get(new, name) for name in dict.fromkeys(names)}
-
-
-def _get(content: Any, name: str) -> Any:
-    for key in name.split("."):
-        content = content[key]
-    return content
-
-
-def _set(content: Any, name: str, value: Any, *, known: bool) -> None:
-    """Set the plain value at a dotted name; if ``known``, the field must exist."""
-    *path, last = name.split(".")
-    for i, key in enumerate(path):
-        _check_key(content, key, ".".join(path[:i]))
-        content = content[key]
-    if known:
-        _check_key(content, last, ".".join(path))
-        if isinstance(content[last], dict) and not name.startswith(_ROBOT):
-            # Its other fields would get their defaults, whatever was set before.
-            group = name.removeprefix("env.")
-            raise ValueError(
-                f"{group} is a group of fields; set them one by one, as "
-                f"{group}.{next(iter(content[last]))}"
-            )
-    content[last] = value
-
-
-def _check_key(content: Any, key: str, where: str) -> None:
-    if not isinstance(content, dict) or key not in content:
-        keys = content if isinstance(content, dict) else ()
-        full = f"{where}.{key}".lstrip(".").removeprefix("env.")
-        raise KeyError(f"there is no field {full!r}{did_you_mean(key, keys)}")
-
-
-def _full_name(name: str) -> str:
-    """Return a field's name in a stored configuration."""
-    parts = {f.name for f in dataclasses.fields(EnvConfig)}
-    return f"env.{name}" if name.split(".")[0] in parts else name

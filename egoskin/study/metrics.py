@@ -34,19 +34,17 @@ class Metric:
     """Function that computes it; None if a run has no value."""
 
 
-def frames_to(result: Result, share: float) -> float | None:
+def frames_to(result: Result, share: float) -> float:
     """Return the frames until success in training reaches a share of its final value.
 
     A run that has not learnt (final success below 5 %) has used its whole budget: left
-    out, it would make its cell look fast. None if there are no stored frames.
+    out, it would make its cell look fast.
     """
     frames, success = result.stored.frames, result.stored.success
-    if not len(frames):
-        return None
-    late = frames > (1 - _END_SHARE) * frames[-1]
-    end = float(success[late].mean())
-    # Also if no episode was long enough to tell (NaN).
-    if not end >= _LEAST_END:
+    late = frames > (1 - _END_SHARE) * frames[-1:]
+    # The curve is empty if no episode was ever long enough to tell.
+    end = float(success[late].mean()) if len(frames) else 0.0
+    if end < _LEAST_END:
         return float(result.run.end)
     first = int(np.argmax(success >= share * end))
     if first == 0:
@@ -54,19 +52,6 @@ def frames_to(result: Result, share: float) -> float | None:
     # Interpolate linearly between the stored lines.
     x, y = frames[first - 1 : first + 1], success[first - 1 : first + 1]
     return float(x[0] + (share * end - y[0]) / (y[1] - y[0]) * (x[1] - x[0]))
-
-
-def _millions(share: float) -> Callable[[Result], float | None]:
-    def of(result: Result) -> float | None:
-        frames = frames_to(result, share)
-        return None if frames is None else frames / 1e6
-
-    return of
-
-
-def _share_to_90(result: Result) -> float | None:
-    frames = frames_to(result, 0.9)
-    return None if frames is None else 100 * frames / result.run.end
 
 
 def _percent(*path: str) -> Callable[[Result], float | None]:
@@ -125,29 +110,24 @@ METRICS = (
         name="m_frames_to_50",
         label="frames to 50 % of its final success",
         unit="M frames",
-        of=_millions(0.5),
+        of=lambda result: frames_to(result, 0.5) / 1e6,
     ),
     Metric(
         name="m_frames_to_90",
         label="frames to 90 % of its final success",
         unit="M frames",
-        of=_millions(0.9),
+        of=lambda result: frames_to(result, 0.9) / 1e6,
     ),
     Metric(
         name="share_to_90",
         label="share of the budget to 90 % of its final success",
         unit="%",
-        of=_share_to_90,
+        of=lambda result: 100 * frames_to(result, 0.9) / result.run.end,
     ),
 )
 """Metrics of a run. Success, survival, balls and falls are from the throw set; frames
 are from the success in training, with exploration, and are the whole budget for a run
 that has not learnt (final success below 5 %)."""
-
-
-def metric(name: str) -> Metric:
-    """Return the metric with the given name."""
-    return next(m for m in METRICS if m.name == name)
 
 
 def tables(results: Sequence[Result]) -> Mapping[str, Table]:

@@ -55,7 +55,7 @@ class Progress:
             tries: Maximum number of attempts for each run; those that failed as often
                 are not counted in the time left. None: there is no maximum.
         """
-        counts = {"done": 0, "running": 0, "failed": 0, "begun": 0, "missing": 0}
+        counts = {"done": 0, "running": 0, "failed": 0, "stopped": 0, "missing": 0}
         for each in status:
             counts[each.state] += 1
         total = sum(each.run.end for each in status)
@@ -289,7 +289,7 @@ def slurm_script(
     return f"""#!/bin/bash
 # Study {manifest.study}: {len(manifest.runs)} runs, shared by all elements.
 # An element that reaches its time limit stops with checkpoints; one that is killed
-# loses a minute of work. Submit this again until `status` shows no missing runs.
+# loses a minute of work. Submit this again until `status` shows that all runs are done.
 #SBATCH --job-name=egoskin-{manifest.study}
 #SBATCH --array=0-{elements - 1}
 #SBATCH --nodes=1

@@ -19,6 +19,8 @@ ALPHA = 0.05
 """Significance level of every test, and of all together after Holm's correction."""
 POWER = 0.8
 """Power at which a number of seeds is considered enough."""
+# Values that differ by less than this share of the largest are equal.
+_ROUNDING = 1e-12
 # Numbers of seeds beyond this are not considered.
 _MOST_SEEDS = 1000
 
@@ -131,7 +133,7 @@ def spread(values: Sequence[float]) -> Spread:
 def mean_effect(values: Sequence[float]) -> Effect:
     """Return the mean of values over seeds."""
     n = len(values)
-    sd = float(np.std(values, ddof=1)) if n > 1 else math.nan
+    sd = _sd(values) if n > 1 else math.nan
     return Effect(
         mean=float(np.mean(values)),
         error=sd / math.sqrt(n),
@@ -166,7 +168,7 @@ def contrast(weights: Mapping[str, float], table: Table) -> Effect | None:
     if fewest == 1:
         return Effect(mean=mean, error=math.nan, df=1, seeds=1)
     terms = [
-        (w**2 * float(np.var(list(own[k].values()), ddof=1)), len(own[k]))
+        (w**2 * _sd(list(own[k].values())) ** 2, len(own[k]))
         for k, w in weights.items()
     ]
     variance = sum(v / n for v, n in terms)
@@ -260,7 +262,16 @@ def seed_sd(table: Table) -> float:
 
     NaN if no cell has two seeds.
     """
-    groups = [np.array(list(x.values())) for x in table.values() if len(x) > 1]
+    groups = [list(x.values()) for x in table.values() if len(x) > 1]
     df = sum(len(g) - 1 for g in groups)
-    squares = sum(float(((g - g.mean()) ** 2).sum()) for g in groups)
+    squares = sum((len(g) - 1) * _sd(g) ** 2 for g in groups)
     return math.sqrt(squares / df) if df else math.nan
+
+
+def _sd(values: Sequence[float]) -> float:
+    """Return the standard deviation of two or more values; 0 if only rounding differs.
+
+    The mean of equal values is rounded: that of three times 0.1 is not 0.1.
+    """
+    sd = float(np.std(values, ddof=1))
+    return sd if sd > _ROUNDING * float(np.abs(values).max()) else 0.0

@@ -21,28 +21,23 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-from egoskin.evaluation.throw_set import play_throws, standard_task, summarize
-from egoskin.parallel import default_num_workers
-from egoskin.policies.policy import Policy, load_policy
 from egoskin.runs.config import INIT_HASH, read_config
 from egoskin.runs.run import Run
-from egoskin.sensors import MASK_ALL
 from egoskin.storage.formats import content_hash, read_sealed, sealed_json
 from egoskin.storage.serialization import read_json
 from egoskin.storage.tensor_file import load_tensors, write_file
 from egoskin.study.claims import is_claimed, is_locked
-from egoskin.study.manifest import EvaluationPlan, Manifest, PlannedRun
+from egoskin.study.manifest import Manifest, PlannedRun
 from egoskin.study.stored import StoredRun, load_run, record, thin, to_json
 
-State = Literal["done", "running", "failed", "begun", "missing"]
-"""State of a run; begun: no process works on it, and it can be resumed."""
+State = Literal["done", "running", "failed", "stopped", "missing"]
+"""State of a run; stopped: it was begun, and no process works on it now."""
 
 START = "--- started"
 """Beginning of the line that each start adds to a log."""
@@ -238,7 +233,7 @@ class StudyFolder:
 
         Args:
             planned: The run.
-            evaluation: Result of `judge` for its policy.
+            evaluation: Result of `egoskin.study.evaluation.evaluate_policy`.
         """
         source, end = self.run_path(planned.name), planned.end
         run, folder = Run.open(source), self.result_path(planned.name)
@@ -363,7 +358,7 @@ class StudyFolder:
         elif failure is not None:
             state = "failed"
         elif self.run_path(run.name).exists():
-            state = "begun"
+            state = "stopped"
         return RunStatus(
             run=run,
             state=state,
@@ -416,59 +411,6 @@ def _check_files(planned: PlannedRun, run: Run) -> None:
             f"{planned.config.init_from} has changed: it is not what the study's cell "
             f"{cell.name} starts from"
         )
-
-
-def judge(
-    policy: Policy,
-    plan: EvaluationPlan,
-    on_step: Callable[[int, int], None] | None = None,
-    cores: int = 1,
-) -> dict[str, Any]:
-    """Evaluate a policy on a study's throw set; return the results as JSON values.
-
-    Args:
-        policy: The policy.
-        plan: The throw set and how to evaluate on it.
-        on_step: Called with (steps done, episodes still running).
-        cores: Number of cores to use; the results do not depend on it.
-    """
-    config = standard_task(policy.env_config, plan.standard)
-    play = partial(
-        play_throws,
-        config=config,
-        skin=policy.skin,
-        throw_set=plan.throw_set,
-        episodes=plan.episodes,
-        num_workers=default_num_workers(plan.episodes, cores),
-        on_step=on_step,
-    )
-    rigid = play(None, hold=True)
-    result = summarize(play(policy), rigid, config.task)
-    masked = None
-    if plan.masked and config.sensor.coverage != "none":
-        masked = summarize(play(policy, mask=MASK_ALL), rigid, config.task)
-    return {
-        **dataclasses.asdict(result),
-        "masked": None if masked is None else dataclasses.asdict(masked),
-        "standard": plan.standard,
-        "trained_on": policy.env_config.standard,
-        "throw_set": plan.throw_set,
-        "frames": policy.policy_spec.frames,
-        "mask": [],
-    }
-
-
-def judge_run(
-    folder: StudyFolder,
-    planned: PlannedRun,
-    plan: EvaluationPlan,
-    on_step: Callable[[int, int], None] | None = None,
-    cores: int = 1,
-) -> None:
-    """Evaluate the policy of a trained run, and mark the run as finished."""
-    run = Run(folder.run_path(planned.name), planned.config)
-    policy = load_policy(run.policy_path(planned.end))
-    folder.finish(planned, judge(policy, plan, on_step, cores))
 
 
 def policy_hash(path: Path) -> str:

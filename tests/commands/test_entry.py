@@ -130,7 +130,10 @@ def test_the_pages_of_commands_with_subcommands_name_them_all():
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_the_examples_of_a_page_have_options_that_there_are(name):
-    found = re.findall(rf"^  egoskin {name} (.*)", PAGES[name], re.MULTILINE)
+    assert max(map(len, PAGES[name].splitlines())) <= 88
+    # A backslash continues an example on the next line.
+    pattern = rf"^  egoskin {name} (.*(?:(?<=\\)\n.*)*)"
+    found = re.findall(pattern, PAGES[name], re.MULTILINE)
     assert found or name == "replay"
     for example in found:
         words = example.split(" > ")[0].split()

@@ -11,7 +11,8 @@ from tensordict import TensorDict
 
 from egoskin.envs.dodgeball import DodgeballConfig
 from egoskin.envs.throws import Thrower
-from egoskin.evaluation.behaviour import Group, Watcher, _Feet, behave
+from egoskin.evaluation.behaviour import Group, Watcher, behave
+from egoskin.evaluation.feet import Feet
 from egoskin.evaluation.throw_set import Episodes, evaluate, play_throws
 from egoskin.make import EnvConfig
 from egoskin.rng import held_out
@@ -304,7 +305,7 @@ def test_round_feet_slide_but_do_not_slide_by_rolling(tmp_path: Path):
         'type="box" size="0.15 0.06 0.02"', 'type="sphere" size="0.05"'
     )
     robot = find_robot(str(write_robot(tmp_path / "pip", model=round_feet)))
-    feet = _Feet(robot)
+    feet = Feet(robot)
     before = TensorDict(
         base_pose=torch.tensor([[0.0, 0, 0.72, 1, 0, 0, 0]]),
         joint_pos=torch.zeros(1, len(robot.joints)),
@@ -328,7 +329,7 @@ def test_round_feet_slide_but_do_not_slide_by_rolling(tmp_path: Path):
 
 def test_a_robot_without_shapes_on_its_feet_has_no_slip():
     watcher = Watcher(make(), 0, 1)
-    watcher._feet = _Feet(replace(H1_2, feet=()))
+    watcher._feet = Feet(replace(H1_2, feet=()))
     watcher(state(1), state(1), torch.tensor([True]))
     assert watcher.motion().foot_slip is None
 

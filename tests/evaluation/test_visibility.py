@@ -26,7 +26,7 @@ from egoskin.evaluation.approaches import (
     trace,
     unit_vectors,
 )
-from egoskin.evaluation.visibility import Analysis, Cell, analyse
+from egoskin.evaluation.visibility import Analysis, Cell, analyse, see_directions
 from egoskin.robots.config import H1_2
 from egoskin.sensors import Field, Ray, Skin
 from egoskin.sensors.config import SensorConfig
@@ -424,6 +424,19 @@ def test_what_cannot_be_analysed_is_refused(skin, changes, message):
     arguments = {"sensors": FIELD, "ranges": [1.0], "throws": ThrowConfig()}
     with pytest.raises(ValueError, match=message):
         analyse(H1_2, skin, **(arguments | changes))
+
+
+def test_what_a_sensor_of_infinite_range_sees_is_not_defined(skin):
+    text = r"sensor 2 of the skin has an infinite range: .* for a finite one"
+    ranges = np.full(len(skin), np.nan)
+    ranges[2] = math.inf
+    own, sensor = replace(skin, range=ranges), SensorConfig(coverage="field", range=1.0)
+    with pytest.raises(ValueError, match=text):
+        see_directions(H1_2, own, sensor, BALL)
+    with pytest.raises(ValueError, match=text):
+        analyse(H1_2, own, FIELD, [1.0], ThrowConfig())
+    with pytest.raises(ValueError, match="sensor 0 of the skin has an infinite range"):
+        see_directions(H1_2, skin, replace(sensor, range=math.inf), BALL)
 
 
 # --- the command ----------------------------------------------------------------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import json
 import os
 import pty
@@ -20,7 +21,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 
 from calling import BATCH, SMALL, call, fail, limit_file_size, succeed, wait_for
 from egoskin.agents.networks import Agent, NetworkConfig
@@ -29,9 +30,13 @@ from egoskin.commands import train
 from egoskin.commands.errors import clear_errors
 from egoskin.commands.verify import run_hash
 from egoskin.runs.run import Run
+from egoskin.runs.trainer import open_trainer
+from egoskin.sensors.config import SensorConfig
 from egoskin.sensors.kernels import compilation
+from egoskin.sparse import SparseRows
 from egoskin.storage.formats import read_sealed, sealed_json
 from egoskin.storage.tensor_file import load_tensors, save_tensors
+from making import blind_run
 
 # Rollouts of the run that tests resume.
 DONE = 4
@@ -404,6 +409,43 @@ def test_an_infinite_observation_is_met_in_the_normaliser():
     with pytest.raises(NonFiniteError, match="normaliser of 'observation'") as error:
         PPO(agent, PPOConfig()).update(rollout)
     assert len(error.value.batch["observation"]) == 1
+
+
+@pytest.mark.parametrize(
+    ("key", "sensor"),
+    [
+        ("observation", SensorConfig(coverage="none")),
+        # Its features are sparse in training, and dense in the dump.
+        ("signal", SensorConfig(coverage="ray", reduce="none")),
+    ],
+)
+def test_a_failed_normaliser_is_dumped_and_replayed(key, sensor, tmp_path, monkeypatch):
+    config = blind_run(tmp_path / "run", 64)
+    env = dataclasses.replace(config.env, sensor=sensor)
+    with open_trainer(Run.create(dataclasses.replace(config, env=env))) as trainer:
+        sense = trainer.agent.sense
+
+        def spoil(state: TensorDictBase) -> TensorDict:
+            features = sense(state)
+            value = features[key]
+            if isinstance(value, SparseRows):
+                offsets = torch.ones(len(value) + 1, dtype=torch.int64)
+                offsets[0], column = 0, torch.zeros(1, dtype=torch.int64)
+                entry = {"column": column, "value": torch.tensor([torch.inf])}
+                spoilt = dataclasses.replace(value, offsets=offsets, **entry)
+                features.set_non_tensor(key, spoilt)
+            else:
+                value[0, 0] = torch.inf
+            return features
+
+        monkeypatch.setattr(trainer.agent, "sense", spoil)
+        with pytest.raises(NonFiniteError, match=f"normaliser of '{key}'"):
+            trainer.iterate()
+    (dump,) = (tmp_path / "run").glob("not-finite-*.safetensors")
+    lines = succeed("replay", dump).splitlines()
+    assert lines[0] == f"recorded: normaliser of '{key}'"
+    assert lines[-1] == f"again:    normaliser of '{key}'"
+    assert any(f"batch {key} [" in line for line in lines)
 
 
 def test_a_dump_that_is_none_is_refused(trained):

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from egoskin.study import claims
-from egoskin.study.claims import claimed, is_claimed, this_host
+from egoskin.study.claims import claimed, is_claimed, is_locked, this_host
 
 HOLD = """
 import sys, time
@@ -68,18 +68,17 @@ def test_who_may_only_read_sees_claims(tmp_path: Path, monkeypatch: pytest.Monke
     assert not is_claimed(folder, "run")
 
 
-def test_a_lock_on_a_read_only_file_system_is_seen(tmp_path: Path, monkeypatch):
+def test_those_who_look_do_not_see_each_other(tmp_path: Path):
     process = hold(tmp_path)
-
-    def refuse(path: Path, mode: str = "r"):
-        if mode == "r+":
-            raise OSError(errno.EROFS, "Read-only file system")
-        return open(path, mode)
-
-    monkeypatch.setattr(claims, "open", refuse, raising=False)
     assert is_claimed(tmp_path, "run")
+    assert is_locked(tmp_path / "run.lock")
     process.send_signal(signal.SIGKILL)
     process.communicate()
+    # Another observer looks at the same moment.
+    with claims._lock(tmp_path / "run.lock", create=False) as free:
+        assert free
+        assert not is_claimed(tmp_path, "run")
+        assert not is_locked(tmp_path / "run.lock")
 
 
 def test_a_claim_is_held_by_one_process_and_freed_by_its_death(tmp_path: Path):
@@ -133,6 +132,25 @@ def test_an_owner_that_slept_learns_that_its_claim_was_taken(tmp_path: Path):
     # The other's claim is untouched.
     assert other.exists()
     assert is_claimed(tmp_path, "run")
+
+
+def test_an_owner_that_slept_knows_another_by_its_content(tmp_path: Path):
+    # The other took over as the second owner, ended, removed all files and began again
+    # as the first.
+    lost = threading.Event()
+    with claimed(tmp_path, "run", heartbeat=0.02, lost=lost.set) as mine:
+        assert mine
+        other = elsewhere(tmp_path, age=0)
+        assert lost.wait(10)
+    assert other.exists()
+    assert is_claimed(tmp_path, "run")
+
+
+def test_an_owner_whose_file_is_gone_leaves_a_newer_one_alone(tmp_path: Path):
+    with claimed(tmp_path, "run", heartbeat=60):
+        (tmp_path / "run.owner.1").unlink()
+        other = elsewhere(tmp_path, age=0, number=2)
+    assert other.exists()
 
 
 def test_a_heart_beats(tmp_path: Path):

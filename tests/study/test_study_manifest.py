@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -129,6 +130,24 @@ def test_a_cell_is_named_by_what_differs():
 def test_a_cell_that_cannot_exist_is_named(cell, text):
     with pytest.raises(ValueError, match=rf"(?s)study small, cell 2.*({text})"):
         changed(cells=({"sensor.coverage": "none"}, cell))
+
+
+def test_two_cells_of_one_name_are_told_what_they_differ_in(tmp_path: Path):
+    cells = []
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        path = shutil.copy(POLICY, tmp_path / name / "p.safetensors")
+        cells.append({"sensor.coverage": "none", "init_from": str(path)})
+    text = (
+        "cell 2: another cell is also named blind-init_from-p.safetensors; they only "
+        "differ in init_from (files and robots need different names)"
+    )
+    with pytest.raises(ValueError, match=re.escape(text)):
+        changed(cells=tuple(cells))
+    # The name of a blind cell has no range.
+    blind = {"sensor.coverage": "none"}
+    with pytest.raises(ValueError, match=r"named blind; they .* in sensor\.range"):
+        changed(cells=(blind, {**blind, "sensor.range": 1.0}))
 
 
 @pytest.mark.parametrize(

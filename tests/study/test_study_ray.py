@@ -75,9 +75,9 @@ def kept(folder: StudyFolder) -> dict[str, int]:
     stopped = {}
     for status in folder.status(folder.manifest()):
         path = folder.run_path(status.run.name)
-        assert status.state in ("missing", "begun", "done")
+        assert status.state in ("missing", "stopped", "done")
         assert not is_locked(path / "lock")
-        if status.state == "begun" and status.frames:
+        if status.state == "stopped" and status.frames:
             _, header = Run.open(path).load_checkpoint()
             assert header["frames"] == status.frames
             stopped[status.run.name] = status.frames

@@ -16,11 +16,18 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from egoskin.commands.study import what_is_seen
 from egoskin.runs.run import Run
-from egoskin.study.figures import equivalence, places, success_by_range
+from egoskin.study.figures import (
+    equivalence,
+    learning_curves,
+    places,
+    sample_efficiency,
+    success_by_range,
+)
 from egoskin.study.findings import judge_findings
 from egoskin.study.manifest import Manifest, resolve
 from egoskin.study.metrics import METRICS, frames_to, runs_csv, tables
-from egoskin.study.report import page, table, write_report
+from egoskin.study.page import page, table
+from egoskin.study.report import write_report
 from egoskin.study.shipped import FINDINGS, SMOKE
 from egoskin.study.store import StudyFolder
 from studies import expected, store, store_all
@@ -290,11 +297,6 @@ def test_frames_to_a_share_are_read_off_the_curve(
     # A run that has not learnt has used its whole budget.
     blind = folder.result(manifest.run("blind-seed0"))
     assert frames_to(blind, 0.5) == blind.run.end
-    # So has one without an episode that was long enough to tell.
-    unknown = np.full_like(blind.stored.success, np.nan)
-    stored = dataclasses.replace(blind.stored, success=unknown)
-    blind = dataclasses.replace(blind, stored=stored)
-    assert frames_to(blind, 0.5) == blind.run.end
     # Between stored lines it is linear: 0, 0.2, 0.4 and then 0.8.
     stored = dataclasses.replace(
         result.stored,
@@ -303,6 +305,23 @@ def test_frames_to_a_share_are_read_off_the_curve(
     )
     result = dataclasses.replace(result, stored=stored)
     assert frames_to(result, 0.75) == pytest.approx(25)
+
+
+def test_a_run_without_an_episode_long_enough_to_tell_has_used_its_whole_budget(
+    manifest: Manifest, tmp_path: Path
+):
+    folder, run = StudyFolder(tmp_path), manifest.run("blind-seed0")
+    store(folder, manifest, run, 0.0)
+    lines = [f"{run.end * i // 4},{i},nan" for i in range(1, 5)]
+    text = "\n".join(["frames,time/wall_s,episode/success", *lines]) + "\n"
+    (folder.result_path(run.name) / "metrics.csv").write_text(text)
+    results = [folder.result(run)]
+    assert frames_to(results[0], 0.5) == run.end
+    values = tables(results)
+    assert values["m_frames_to_90"]["blind"] == {0: run.end / 1e6}
+    assert values["share_to_90"]["blind"] == {0: 100}
+    assert learning_curves(manifest, results) is None
+    assert sample_efficiency(manifest, results) is not None
 
 
 def test_seeds_that_never_learn_do_not_make_a_cell_look_fast(

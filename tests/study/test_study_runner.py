@@ -14,6 +14,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -27,7 +28,7 @@ from egoskin.sensors import MASK_ALL
 from egoskin.storage.formats import read_sealed, sealed_json
 from egoskin.storage.serialization import to_plain
 from egoskin.study import cost as cost_module
-from egoskin.study import store
+from egoskin.study import evaluation, job, store
 from egoskin.study.claims import claimed
 from egoskin.study.cost import cost, measure, measure_all
 from egoskin.study.job import CLAIMED, STOPPED, Stop, work
@@ -116,7 +117,7 @@ def test_a_run_that_was_trained_is_only_judged(folder: StudyFolder):
     expected = table(folder)
     shutil.rmtree(folder.result_path(NAME))
     before = files(folder.run_path(NAME))
-    assert folder.status(folder.manifest())[0].state == "begun"
+    assert folder.status(folder.manifest())[0].state == "stopped"
     assert work(folder, NAME, Never()) == 0
     assert files(folder.run_path(NAME)) == before
     assert table(folder) == expected
@@ -135,14 +136,18 @@ def test_a_policy_without_the_last_checkpoint_is_not_trained_to_its_end(
     assert not folder.is_trained(planned)
 
 
-def test_a_stop_leaves_a_checkpoint_and_no_result(tmp_path: Path):
+def test_a_stop_leaves_a_checkpoint_and_no_result(tmp_path: Path, capsys):
     folder = StudyFolder(tmp_path / "study")
     folder.plan(resolve(SHORT))
     # With other numbers of workers and threads than when it is resumed.
     assert work(folder, NAME, Never(requested=True), cores=2) == STOPPED
     assert (folder.run_path(NAME) / "checkpoint.safetensors").is_file()
     assert not folder.is_finished(NAME)
-    assert [s.state for s in folder.status(folder.manifest())] == ["begun"]
+    status = folder.status(folder.manifest())
+    assert [s.state for s in status] == ["stopped"]
+    assert str(Progress.of(status)).startswith("1 stopped; ")
+    print_status(folder, folder.manifest(), status)
+    assert "blind  stopped at 0%" in capsys.readouterr().out
 
 
 def test_a_run_that_somebody_works_on_is_left_alone(folder: StudyFolder):
@@ -152,6 +157,22 @@ def test_a_run_that_somebody_works_on_is_left_alone(folder: StudyFolder):
         assert [s.state for s in folder.status(folder.manifest())] == ["running"]
         assert work(folder, NAME, Never()) == CLAIMED
     assert not folder.is_finished(NAME)
+
+
+def test_a_run_whose_claim_is_lost_has_not_failed(
+    folder: StudyFolder, monkeypatch: pytest.MonkeyPatch
+):
+    ended = []
+
+    @contextmanager
+    def lose(path: Path, name: str, *, lost: Callable[[], None]) -> Iterator[bool]:
+        lost()
+        yield False
+
+    monkeypatch.setattr(job, "claimed", lose)
+    monkeypatch.setattr(os, "_exit", ended.append)
+    work(folder, NAME, Never())
+    assert ended == [CLAIMED]
 
 
 def test_a_run_that_ppo_trains_is_left_to_it(folder: StudyFolder):
@@ -178,13 +199,13 @@ def test_a_run_is_judged_on_all_its_cores(
 ):
     expected, used = table(folder), []
     shutil.rmtree(folder.result_path(NAME))
-    play = store.play_throws
+    play = evaluation.play_throws
 
     def noted(*args, num_workers: int, **options):
         used.append(num_workers)
         return play(*args, num_workers=num_workers, **options)
 
-    monkeypatch.setattr(store, "play_throws", noted)
+    monkeypatch.setattr(evaluation, "play_throws", noted)
     assert work(folder, NAME, Never(), cores=2) == 0
     assert used == [2, 2]
     assert table(folder) == expected
@@ -294,7 +315,7 @@ def test_a_result_that_was_edited_or_exchanged_is_refused(folder: StudyFolder):
 def test_a_policy_is_judged_with_and_without_its_skin():
     # With random weights it soon falls, one way or another.
     policy, plan = make_policy(EnvConfig()), EvaluationPlan(episodes=8)
-    result = store.judge(policy, plan)
+    result = evaluation.evaluate_policy(policy, plan)
     config = standard_task(policy.env_config, plan.standard)
     which = {"throw_set": plan.throw_set, "episodes": plan.episodes}
     seen, masked = (
@@ -412,6 +433,7 @@ def test_the_slurm_script_shares_the_folder_among_its_elements():
     manifest = resolve(SHORT)
     text = slurm_script(manifest, Path("/a/b"), cores=8, elements=3, hours=1.5)
     assert text.startswith("#!/bin/bash\n")
+    assert "until `status` shows that all runs are done" in text
     for line in ("--array=0-2", "--cpus-per-task=8", "--time=90", "--signal=B:TERM@"):
         assert f"#SBATCH {line}" in text
     assert '--dir /a/b --parallel "$SLURM_CPUS_PER_TASK"' in text
@@ -588,7 +610,7 @@ def test_a_runner_that_is_killed_ends_its_runs_and_is_started_again(
     # Orphaned jobs notice it and stop with a checkpoint.
     wait_for(lambda: not jobs(study))
     before = study.status(study.manifest())
-    assert any(s.state == "begun" and s.frames for s in before)
+    assert any(s.state == "stopped" and s.frames for s in before)
     again = start(study.path)
     assert again.end() == 0, again.text()
     assert table(study) == undisturbed
@@ -635,7 +657,7 @@ def test_ctrl_c_ends_all_runs_with_checkpoints(study, start, undisturbed):
     assert not jobs(study)
     assert "Traceback" not in runner.text()
     for status in study.status(study.manifest()):
-        if status.state == "begun" and status.frames:
+        if status.state == "stopped" and status.frames:
             _, header = Run.open(study.run_path(status.run.name)).load_checkpoint()
             assert header["frames"] == status.frames
     again = start(study.path)

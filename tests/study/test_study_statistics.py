@@ -107,6 +107,27 @@ def test_one_seed_or_no_spread_decides_nothing():
     assert contrast(DIFFERENCE, {"a": {0: 1.0}}) is None
 
 
+def test_equal_values_have_no_spread_whatever_their_rounding():
+    # The mean of three times 0.1 is not 0.1.
+    same = [0.1, 0.1, 0.1]
+    assert np.std(same, ddof=1) > 0
+    assert mean_effect(same).error == mean_effect(same).sd == 0.0
+    assert ABOVE.p_inside(mean_effect(same)) == 1.0
+    table = {"a": dict(enumerate(same)), "b": {k + 10: 0.7 for k in range(3)}}
+    effect = contrast(DIFFERENCE, table)
+    assert effect is not None
+    assert effect.error == effect.sd == 0.0
+    assert seed_sd(table) == 0.0
+    assert math.isnan(separation(table))
+    # Paired differences of equal size: 66.3 - 66.2 is not 0.3 - 0.2.
+    pairs = {"a": {0: 66.3, 1: 0.3}, "b": {0: 66.2, 1: 0.2}}
+    effect = contrast(DIFFERENCE, pairs)
+    assert effect is not None
+    assert effect.error == 0.0
+    # A small spread is one.
+    assert mean_effect([50.0, 50.0 + 1e-9]).error > 0
+
+
 def test_equivalence_is_two_one_sided_tests():
     values = np.subtract(A, B)
     effect = mean_effect(values)

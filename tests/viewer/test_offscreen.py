@@ -21,11 +21,13 @@ from egoskin.viewer.film import Frame
 from egoskin.viewer.offscreen import (
     CameraConfig,
     Painter,
-    Recording,
     RenderingError,
     closest_point,
-    ending_of,
     painter_of,
+)
+from egoskin.viewer.recording import (
+    Recording,
+    ending_of,
     record_episodes,
     render_recording,
 )
@@ -267,7 +269,7 @@ def test_recordings_are_of_the_rows_of_the_throw_set(skin: Skin):
     ("options", "text"),
     [
         ({"fps": 61.0}, "fps must be in"),
-        ({"max_seconds": 0.0}, "at least one control step"),
+        ({"max_seconds": 0.0}, "the film must last at least one control step"),
     ],
 )
 def test_numbers_out_of_range_are_refused(

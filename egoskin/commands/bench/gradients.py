@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import shutil
 import tempfile
 from dataclasses import dataclass
@@ -47,19 +46,18 @@ def gradient_rows(config: GradientBench) -> list[Row]:
     decay, is that of the cosines with the gradient at lambda 1 of all other rollouts,
     which has the least bias.
     """
+    run = Run.open(config.run)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "run"
-        stored = Run.open(config.run).config
         shutil.copytree(config.run, path)
-        planned = dataclasses.replace(stored, resume=path)
-        gradients = _gradients(config, Run(path, planned))
+        gradients = _gradients(config, Run(path, run.config))
     reference = gradients[1.0]
     others = reference.sum(0) - reference
 
     def along(g: Tensor) -> float:
         return float(torch.nn.functional.cosine_similarity(g, others, dim=1).mean())
 
-    own = stored.ppo.gae_lambda
+    own = run.config.ppo.gae_lambda
     return [
         Row(
             name=f"lambda_{decay:g}",

@@ -25,7 +25,8 @@ from egoskin.policies.policy import Policy, load_with_critic
 from egoskin.sensors import Corruption, Skin
 from egoskin.sensors.config import SensorConfig
 from egoskin.sensors.pipeline import SensorGroup
-from egoskin.viewer.offscreen import closest_point, ending_of
+from egoskin.viewer.offscreen import closest_point
+from egoskin.viewer.recording import ending_of
 from egoskin.viewer.web.body import Body
 
 # Time until the next throw [s]: never, as balls are only thrown on demand.
