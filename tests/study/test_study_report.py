@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
 from egoskin.commands.study import what_is_seen
 from egoskin.runs.run import Run
@@ -54,6 +55,16 @@ def folder(manifest: Manifest, tmp_path_factory) -> StudyFolder:
     store_all(folder, manifest, keep=lambda r: r.seed == 0 or "ray" not in r.name)
     write_report(folder, folder.path / "report")
     return folder
+
+
+@pytest.fixture
+def without_pictures(monkeypatch):
+    """Drawing takes most of the time of a report."""
+
+    def save(figure: Figure, out: Path, name: str) -> None:
+        (out / f"{name}.svg").write_text("<svg/>")
+
+    monkeypatch.setattr("egoskin.study.report.save", save)
 
 
 def test_a_report_needs_nothing_else(folder: StudyFolder):
@@ -135,7 +146,9 @@ def test_a_report_is_the_same_bytes_each_time(folder: StudyFolder, tmp_path: Pat
         assert path.read_bytes() == (tmp_path / "again" / path.name).read_bytes()
 
 
-def test_a_study_without_runs_has_a_report(manifest: Manifest, tmp_path: Path):
+def test_a_study_without_runs_has_a_report(
+    manifest: Manifest, tmp_path: Path, without_pictures
+):
     folder = StudyFolder(tmp_path)
     folder.plan(manifest)
     write_report(folder, tmp_path / "report")
@@ -161,7 +174,9 @@ def test_cells_of_other_kinds_are_reported_too(tmp_path: Path):
     assert rows.count("\n| field-proximity-2m") == 2
 
 
-def test_the_cost_of_a_decision_is_in_core_hours(manifest: Manifest, tmp_path: Path):
+def test_the_cost_of_a_decision_is_in_core_hours(
+    manifest: Manifest, tmp_path: Path, without_pictures
+):
     hours = []
     for cores in (1, 4):
         folder = StudyFolder(tmp_path / str(cores))
@@ -181,7 +196,7 @@ def test_the_cost_of_a_decision_is_in_core_hours(manifest: Manifest, tmp_path: P
 
 
 def test_runs_on_an_unknown_number_of_cores_have_no_core_hours(
-    manifest: Manifest, tmp_path: Path
+    manifest: Manifest, tmp_path: Path, without_pictures
 ):
     def cost(folder: StudyFolder) -> str:
         write_report(folder, folder.path / "report")
@@ -208,7 +223,7 @@ def test_runs_on_an_unknown_number_of_cores_have_no_core_hours(
 
 
 def test_the_visibility_of_balls_that_all_miss_is_reported(
-    manifest: Manifest, tmp_path: Path
+    manifest: Manifest, tmp_path: Path, without_pictures
 ):
     folder = StudyFolder(tmp_path)
     folder.plan(manifest)
@@ -220,7 +235,7 @@ def test_the_visibility_of_balls_that_all_miss_is_reported(
     assert "| field 0.5 m | - | - / - / - |" in text
 
 
-def test_a_study_without_a_purpose_has_a_report(tmp_path: Path):
+def test_a_study_without_a_purpose_has_a_report(tmp_path: Path, without_pictures):
     folder = StudyFolder(tmp_path)
     folder.plan(resolve(dataclasses.replace(FINDINGS, purpose="")))
     write_report(folder, tmp_path / "report")
@@ -350,7 +365,9 @@ def test_seeds_that_never_learn_do_not_make_a_cell_look_fast(
     assert list(shares.values()) == pytest.approx([18, 18.9, 19.8, 100, 100])
 
 
-def test_a_value_that_only_some_seeds_have_says_how_many(tmp_path: Path):
+def test_a_value_that_only_some_seeds_have_says_how_many(
+    tmp_path: Path, without_pictures
+):
     folder, manifest = StudyFolder(tmp_path), resolve(SMOKE)
     folder.plan(manifest)
     # The second seed avoids no first ball, and thus has no later ones.
