@@ -74,6 +74,7 @@ class WarpPhysics(Physics):
         self.device = torch.device(device)
         # Do not log each kernel that is loaded.
         wp.config.log_level = wp.LOG_WARNING
+        wp.init()
         self._mujoco, contacts = build_scene(scene), self.num_contacts()
         model = self._mujoco
         # Constraint rows: sides of each contact's friction pyramid, joint limits, etc.
@@ -102,7 +103,8 @@ class WarpPhysics(Physics):
         self._overflow = wp.to_torch(data.overflow)
         self._torque_limit = wp.to_torch(self._model.actuator_forcerange)[..., 1]
         self._overflowed = torch.zeros((), dtype=torch.bool, device=self.device)
-        self._graph = None
+        # A CUDA graph of a physics step; captured after a step that loaded the kernels.
+        self._graph, self._loaded = None, False
         num_joints = len(robot.joints)
         kp, kd = robot.joint_gains(config.gains)
         self._kd_over_kp = torch.from_numpy(kd / kp).float().to(self.device)
@@ -145,7 +147,7 @@ class WarpPhysics(Physics):
     def _substep(self) -> None:
         """Advance one physics step; on a GPU as one CUDA graph, if possible."""
         device = wp.device_from_torch(self.device)
-        if self._graph is None and device.is_cuda and device.is_mempool_enabled:
+        if self._graph is None and self._loaded and device.is_mempool_enabled:
             torch.cuda.synchronize(self.device)
             with wp.ScopedDevice(device), wp.ScopedCapture() as capture:
                 mjw.step(self._model, self._data)
@@ -153,6 +155,7 @@ class WarpPhysics(Physics):
         with self._in_order():
             if self._graph is None:
                 mjw.step(self._model, self._data)
+                self._loaded = device.is_cuda
             else:
                 wp.capture_launch(self._graph, wp.get_stream())
 
@@ -251,7 +254,7 @@ class WarpPhysics(Physics):
         with self._in_order():
             if len(self._model.body_mass) < n:
                 self._model = self._put_model(batch_sizes=dict.fromkeys(_VARIED, n))
-                self._graph = None
+                self._graph, self._loaded = None, False
                 ranges = wp.to_torch(self._model.actuator_forcerange)
                 self._torque_limit = ranges[..., 1]
             links = [body_id(model, link) for link in self.scene.robot.links]
