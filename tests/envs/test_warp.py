@@ -362,6 +362,21 @@ def test_a_training_is_repeated_and_gone_on_with_bit_for_bit(tmp_path: Path):
     assert done.returncode == 0
 
 
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_a_gpu_trains_and_its_policy_plays_on_both_engines(tmp_path: Path):
+    folder, on_gpu = tmp_path / "run", ("--engine", "warp", "--device", "cuda")
+    size = ("--num-envs", 64, "--ppo.num-mini-batches", 2)
+    succeed("train", *on_gpu, *size, "--run-dir", folder, "--total-frames", 2048)
+    succeed("train", "--resume", folder, "--total-frames", 4096)
+    env = make_worker_env(EnvConfig(), num_envs=4, seed=0, engine="warp", device="cuda")
+    env.rollout(3)
+    # The second step was captured.
+    assert env.base_env.physics._graph is not None
+    for engine in (on_gpu, ()):
+        succeed("evaluate", folder, "--episodes", 8, *engine)
+
+
 def test_an_environment_gives_what_its_specs_say():
     config = EnvConfig(sensor=SensorConfig(coverage="ray", reduce="min"))
     env = make_worker_env(config, num_envs=4, seed=0, keep_raw=True, engine="warp")
