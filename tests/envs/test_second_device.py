@@ -65,7 +65,7 @@ def test_tensors_of_two_devices_do_not_meet():
         assert own.device == device
         assert float(own.sum()) == 6.0
         with pytest.raises(RuntimeError, match=r"aten::add: a tensor \(3,\) on cpu be"):
-            own + torch.ones(3)
+            _ = own + torch.ones(3)
         with pytest.raises((RuntimeError, TypeError)):
             own.numpy()
 
