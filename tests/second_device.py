@@ -8,7 +8,7 @@ autograd asks the device, and indexing by a list.
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass, replace
 from typing import Any
@@ -139,19 +139,12 @@ def second_device() -> Iterator[torch.device]:
         yield DEVICE
 
 
-def to_cpu(value: Any) -> Any:
-    """Return a value without labels."""
+def _each(function: Callable[[Any], Any], value: Any) -> Any:
+    """Apply a function to a value or, of a dataclass, to each of its fields."""
     if is_dataclass(value) and not isinstance(value, type):
-        parts = {f.name: to_cpu(getattr(value, f.name)) for f in fields(value)}
+        parts = {f.name: _each(function, getattr(value, f.name)) for f in fields(value)}
         return replace(value, **parts)
-    return _content(value)
-
-
-def _to_device(value: Any) -> Any:
-    if is_dataclass(value) and not isinstance(value, type):
-        parts = {f.name: _to_device(getattr(value, f.name)) for f in fields(value)}
-        return replace(value, **parts)
-    return _label(value)
+    return function(value)
 
 
 class OnSecondDevice(MujocoPhysics):
@@ -169,8 +162,8 @@ def _on_device(name: str):
             tensors = [x for x in args if isinstance(x, Tensor)]
             assert all(isinstance(x, Labelled) for x in tensors), name
         with _disable_current_modes():
-            result = getattr(MujocoPhysics, name)(self, *map(to_cpu, args))
-            return _to_device(result)
+            on_cpu = [_each(_content, arg) for arg in args]
+            return _each(_label, getattr(MujocoPhysics, name)(self, *on_cpu))
 
     return method
 
