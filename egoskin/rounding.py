@@ -25,7 +25,7 @@ def exact_sqrt(x: Tensor) -> Tensor:
 
 # pi/2 = HIGH + MIDDLE + LOW. The first two have only a few bits each (Cephes), so that
 # their products with a small integer are exact.
-_HIGH, _MIDDLE, _LOW = 1.5703125, 4.837512969970703125e-4, 7.54978995489188216e-8
+HIGH, MIDDLE, LOW = 1.5703125, 4.837512969970703125e-4, 7.54978995489188216e-8
 
 
 def sincos(x: Tensor) -> tuple[Tensor, Tensor]:
@@ -39,7 +39,7 @@ def sincos(x: Tensor) -> tuple[Tensor, Tensor]:
     """
     # x = n pi/2 + r, |r| <= pi/4
     n = (x * (2 / math.pi)).round()
-    r = ((x - n * _HIGH) - n * _MIDDLE) - n * _LOW
+    r = ((x - n * HIGH) - n * MIDDLE) - n * LOW
     z, terms = r * r, 9 if x.dtype == torch.float64 else 5
     # Taylor's series; the first term left out is below half of the last bit.
     s, c = torch.zeros_like(r), torch.zeros_like(r)

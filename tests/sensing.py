@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -11,6 +13,7 @@ from hypothesis import strategies as st
 
 from egoskin.robots.config import H1_2
 from egoskin.sensors import Skin
+from egoskin.sensors.kernels.binding import Kernels
 from egoskin.shapes import Box, Capsule, Ellipsoid, Sphere
 
 KINDS = ("sphere", "box", "capsule", "ellipsoid")
@@ -23,6 +26,7 @@ SHAPES = (
 """One of each of `KINDS`."""
 KEYS = ("base_pose", "joint_pos", "object_pose", "object_active")
 """What a sensor reads, in the order of its `compute`."""
+BALLS = (Sphere(radius=0.15), Sphere(radius=0.4), Sphere(radius=0.02))
 SEED = st.integers(0, 2**32 - 1)
 
 
@@ -55,6 +59,30 @@ def look(sensor, *centres, active=None, quat=(1, 0, 0, 0)):
         torch.tensor([active or [True] * len(centres)]),
     )
     return distance[0, 0].tolist(), detected[0].tolist()
+
+
+def draw_coverages(skin: Skin, coverages, rng) -> Skin:
+    """Some sensors, with ranges, rolls and coverages drawn for each."""
+    some = skin.select(rng.permutation(len(skin))[: rng.integers(1, 40)])
+    rolls, kinds = rng.uniform(-180, 180, len(some)), len(coverages)
+    return replace(
+        some,
+        coverage=tuple(coverages[i] for i in rng.integers(kinds, size=len(some))),
+        range=np.exp(rng.uniform(math.log(0.1), math.log(4), len(some))),
+        roll_deg=rolls,
+    )
+
+
+def draw_balls(random_state, rng, dtype):
+    """(balls, state): one to three balls, near and far, some in play, some NaN."""
+    count, rows = rng.integers(1, 4), rng.integers(1, 50)
+    state = random_state(rows, int(rng.integers(1000)), dtype, objects=count)
+    state["object_pose"][::3, :, :3] *= 3
+    for key in ("base_pose", "joint_pos", "object_pose"):
+        if rng.random() < 0.3:
+            flat = state[key].view(rows, -1)
+            flat[rng.integers(rows), rng.integers(flat.shape[1])] = math.nan
+    return BALLS[:count], state
 
 
 def measure(sensor, state):
@@ -100,3 +128,15 @@ def assert_same_bits_in_any_batch(sensor, state) -> None:
         for start in (0, 3, 69):
             rows = slice(start, start + size)
             assert_same_bits(measure(sensor, state[rows]), [x[rows] for x in whole])
+
+
+def use_warp_kernels(monkeypatch) -> None:
+    """Let all sensors with kernels use those of a GPU, on Warp's CPU device."""
+    here = torch.device("cpu")
+    monkeypatch.setattr(Kernels, "can", lambda self, *_: True)
+    for name in ("measure", "hits"):
+
+        def call(self: Kernels, *args: Any, name: str = name) -> Any:
+            return getattr(self.on(here), name)(*args)
+
+        monkeypatch.setattr(Kernels, name, call)

@@ -57,7 +57,8 @@ def collect(
         for key in ("reward", "done", "terminated"):
             frame[key] = after[key].to(device)
         frames.append(frame)
-        ended.append(_readable(agent, after)[_timed_out(after)])
+        # Indices, because a mask would be searched again for each key.
+        ended.append(_readable(agent, after)[_timed_out(after).nonzero()[:, 0]])
         infos.append(after.select(*info_keys))
     rollout = agent.critic(_joined(frames)).reshape(shape[:2])
     following = _value(agent, _readable(agent, root))

@@ -47,9 +47,9 @@ class FieldSensor(ProximitySensor):
         body: The robot's shapes, for occlusion: an object is seen if the straight path
             to its closest point is free. Empty: no occlusion.
         per_object: Write one distance per object, ``distance [*B, S, O]``.
-        compile: Use C++ kernels if they can be compiled, all objects are balls and
-            there is no occlusion; results are the same (float64: to the last bit or
-            two).
+        compile: Use kernels if all objects are balls and there is no occlusion: in C++
+            if it can be compiled and, for float32 on CUDA, in Warp if it is installed;
+            results are the same (float64: to the last bit or two).
         in_keys: Keys of the four inputs, in the order above.
         out_keys: Keys of the two outputs, in the order above.
 

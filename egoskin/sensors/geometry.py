@@ -199,7 +199,7 @@ class ProximitySensor(RowTransform):
         self._kernels: Kernels | None = None
 
     def _use_kernels(self, kind: Literal["field", "ray"], **constants: Any) -> None:
-        """Use the C++ kernels if all objects are balls and there is no occlusion.
+        """Use kernels if all objects are balls and there is no occlusion.
 
         Args:
             kind: Coverage of the sensors.
@@ -292,8 +292,9 @@ class ProximitySensor(RowTransform):
         position = _writable(position, shape, joint_pos)
         rotation = _writable(rotation, (*shape, 3), joint_pos)
         out = position, rotation
-        if self._kernels is not None and self._kernels.can(joint_pos, *out):
-            self._kernels.poses(joint_pos, *out)
+        kernels = self._kernels if joint_pos.is_cpu else None
+        if kernels is not None and kernels.can(joint_pos, *out):
+            kernels.poses(joint_pos, *out)
             return out
         rotation, position = self._kinematics.link_frames(joint_pos)
         offset = self._offset.to(joint_pos)

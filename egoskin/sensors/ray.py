@@ -25,7 +25,7 @@ from egoskin.sensors.signals import Binary, Proximity
 from egoskin.sensors.skin.coverage import Ray
 from egoskin.sensors.skin.skin import Skin
 from egoskin.shapes import Shape, first_hit
-from egoskin.sparse import SparseRows, offsets_of
+from egoskin.sparse import SparseRows
 
 # Margin for rounding when pairs of sensor and object are culled [m].
 _SLACK = 1e-4
@@ -58,9 +58,9 @@ class RaySensor(ProximitySensor):
         body: The robot's shapes, for occlusion; empty: no occlusion.
         per_object: Write one distance per object, in a last dimension ``O``.
         cull: Skip pairs that cannot hit; results are the same.
-        compile: Use C++ kernels if they can be compiled, all objects are balls and
-            there is no occlusion; results are the same (float64: to the last bit or
-            two).
+        compile: Use kernels if all objects are balls and there is no occlusion: in C++
+            if it can be compiled and, for float32 on CUDA, in Warp if it is installed;
+            results are the same (float64: to the last bit or two).
         in_keys: Keys of the four inputs, in the order above.
         out_keys: Keys of the two outputs, in the order above.
 
@@ -321,9 +321,9 @@ class SparseRays:
         for part in (self._sensor, self._reading):
             part.to(given[0].device)
         place, distance = self._sensor.hits(*given)
-        counts = torch.bincount(place // self.size, minlength=len(given[0]))
+        starts = torch.arange(len(given[0]) + 1, device=place.device) * self.size
         return SparseRows(
-            offsets=offsets_of(counts),
+            offsets=torch.searchsorted(place, starts),
             column=place % self.size,
             value=self._reading.signal(distance[None])[0],
             size=self.size,

@@ -1,11 +1,13 @@
-"""Python binding of the sensors' C++ kernels (`kernels.cpp`)."""
+"""Python binding of the sensors' kernels: C++ (`kernels.cpp`) and, for CUDA, Warp."""
 
 from __future__ import annotations
 
 import ctypes
+import functools
 from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
@@ -14,6 +16,9 @@ from torch import Tensor
 from egoskin.robots.kinematics import LinkKinematics
 from egoskin.sensors.kernels.compilation import load_library
 from egoskin.shapes import Sphere
+
+if TYPE_CHECKING:
+    from egoskin.sensors.kernels.warp import WarpKernels
 
 VECTOR = 16
 """Vector size of the kernels."""
@@ -54,9 +59,10 @@ class _Inputs(ctypes.Structure):
 
 
 class Kernels:
-    """C++ implementation of the sensors for balls and without occlusion.
+    """Compiled implementation of the sensors for balls and without occlusion.
 
-    If the kernels cannot be compiled, `can` returns False.
+    It is in C++ for tensors on the CPU and in Warp for float32 on a CUDA device. `can`
+    returns False if the C++ code cannot be compiled or Warp is not installed.
 
     Args:
         kind: Coverage of all sensors.
@@ -73,7 +79,7 @@ class Kernels:
         balls: Sequence[Sphere],
         constants: Mapping[str, Any],
     ) -> None:
-        self._kind = kind
+        self._kind: Literal["field", "ray"] = kind
         self._library = load_library(SOURCE)
         steps = kinematics.steps
         radius = np.array([float(ball.radius) for ball in balls])
@@ -90,10 +96,11 @@ class Kernels:
         }
         # The arrays must be kept alive: a table holds only their addresses.
         self._tables: dict[torch.dtype, tuple[_Tables, list[np.ndarray]]] = {}
+        self._warp: dict[torch.device, WarpKernels] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state without the library, which cannot be pickled."""
-        return {**vars(self), "_library": None, "_tables": {}}
+        """Return the state without what cannot be pickled."""
+        return {**vars(self), "_library": None, "_tables": {}, "_warp": {}}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore the state and load the library again."""
@@ -108,22 +115,32 @@ class Kernels:
         """
         self._constants.update(constants)
         self._tables.clear()
+        self._warp.clear()
 
     def can(self, *inputs: Tensor) -> bool:
-        """Whether the kernels support these inputs: on the CPU and without gradients.
+        """Whether the kernels support these inputs, of one type and without gradients.
 
-        Always False if the kernels could not be compiled or under ``torch.compile``.
+        Always False under ``torch.compile``.
         """
-        if self._library is None or torch.compiler.is_compiling():
+        if torch.compiler.is_compiling():
             return False
-        grad = torch.is_grad_enabled()
-        return all(
-            x.is_cpu and x.dtype in _NAMES and not (grad and x.requires_grad)
-            for x in inputs
-        )
+        if torch.is_grad_enabled() and any(x.requires_grad for x in inputs):
+            return False
+        if all(x.is_cpu and x.dtype in _NAMES for x in inputs):
+            return self._library is not None
+        singles = all(x.is_cuda and x.dtype == torch.float32 for x in inputs)
+        return singles and _has_warp()
+
+    def on(self, device: torch.device) -> WarpKernels:
+        """Return the Warp kernels of a device."""
+        if device not in self._warp:
+            from egoskin.sensors.kernels.warp import WarpKernels
+
+            self._warp[device] = WarpKernels(self._kind, self._constants, device)
+        return self._warp[device]
 
     def poses(self, joint_pos: Tensor, position: Tensor, rotation: Tensor) -> None:
-        """Write the sensors' poses in the base frame.
+        """Write the sensors' poses in the base frame, on the CPU.
 
         Args:
             joint_pos: Joint positions, ``[B, J]``.
@@ -142,7 +159,10 @@ class Kernels:
             out: Readings [m], contiguous.
             detected: ``[B, O]``, contiguous; must be all False.
         """
-        self._call(self._kind, inputs, _address(out), _address(detected))
+        if out.is_cuda:
+            self.on(out.device).measure(inputs, out, detected)
+        else:
+            self._call(self._kind, inputs, _address(out), _address(detected))
 
     def hits(self, inputs: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
         """Return the result of `RaySensor.hits`.
@@ -150,6 +170,8 @@ class Kernels:
         Args:
             inputs: As in `measure`.
         """
+        if inputs[0].is_cuda:
+            return self.on(inputs[0].device).hits(inputs)
         # About a dozen beams per row hit. If more hit than there is room for, a second
         # call follows.
         room = 32 * len(inputs[0])
@@ -193,6 +215,12 @@ class Kernels:
                 setattr(tables, name, value)
             self._tables[dtype] = tables, arrays
         return self._tables[dtype][0]
+
+
+@functools.cache
+def _has_warp() -> bool:
+    """Whether Warp is installed, the library of that name by NVIDIA."""
+    return find_spec("mujoco_warp") is not None
 
 
 def _address(x: Tensor) -> ctypes.c_void_p:

@@ -17,7 +17,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -35,9 +34,16 @@ from egoskin.sensors import Field, FieldSensor, Ray, RaySensor, Skin
 from egoskin.sensors.kernels import compilation
 from egoskin.sensors.kernels.compilation import can_compile, load_library
 from egoskin.shapes import Box, Sphere
-from sensing import KEYS, SEED, assert_same_bits, measure
+from sensing import (
+    BALLS,
+    KEYS,
+    SEED,
+    assert_same_bits,
+    draw_balls,
+    draw_coverages,
+    measure,
+)
 
-BALLS = (Sphere(radius=0.15), Sphere(radius=0.4), Sphere(radius=0.02))
 DTYPES = st.sampled_from([torch.float32, torch.float64])
 
 needs_compiler = pytest.mark.skipif(not can_compile(), reason="needs a C++ compiler")
@@ -66,38 +72,14 @@ def assert_same(fast, plain) -> None:
         torch.testing.assert_close(a, b, rtol=0, atol=atol, equal_nan=True)
 
 
-def draw(skin: Skin, coverages, rng) -> Skin:
-    """Some sensors, with ranges, rolls and coverages drawn for each."""
-    some = skin.select(rng.permutation(len(skin))[: rng.integers(1, 40)])
-    rolls, kinds = rng.uniform(-180, 180, len(some)), len(coverages)
-    return replace(
-        some,
-        coverage=tuple(coverages[i] for i in rng.integers(kinds, size=len(some))),
-        range=np.exp(rng.uniform(math.log(0.1), math.log(4), len(some))),
-        roll_deg=rolls,
-    )
-
-
-def draw_state(random_state, rng, dtype):
-    """(balls, state): one to three balls, near and far, some in play, some NaN."""
-    count, rows = rng.integers(1, 4), rng.integers(1, 50)
-    state = random_state(rows, int(rng.integers(1000)), dtype, objects=count)
-    state["object_pose"][::3, :, :3] *= 3
-    for key in ("base_pose", "joint_pos", "object_pose"):
-        if rng.random() < 0.3:
-            flat = state[key].view(rows, -1)
-            flat[rng.integers(rows), rng.integers(flat.shape[1])] = math.nan
-    return BALLS[:count], state
-
-
 @needs_compiler
 @given(SEED, DTYPES, st.booleans())
 def test_fields_have_the_same_bits(skin, random_state, seed, dtype, per_object):
     rng = np.random.default_rng(seed)
     wide, narrow = Field(), Field(half_angle_deg=rng.uniform(5, 175))
     coverages = ([wide], [wide, narrow])[rng.integers(2)]
-    balls, state = draw_state(random_state, rng, dtype)
-    some = draw(skin, coverages, rng)
+    balls, state = draw_balls(random_state, rng, dtype)
+    some = draw_coverages(skin, coverages, rng)
     plain, fast = pair(FieldSensor, some, H1_2.chain, balls, 1.0, per_object=per_object)
     assert_same(measure(fast, state), measure(plain, state))
     joints = state["joint_pos"]
@@ -158,10 +140,10 @@ def test_rays_have_the_same_bits(
         Ray(grid=grid),
         Ray(grid=grid, fov_deg=rng.uniform(10, 170), measure="depth"),
     ][: rng.integers(1, 3)]
-    balls, state = draw_state(random_state, rng, dtype)
+    balls, state = draw_balls(random_state, rng, dtype)
     plain, fast = pair(
         RaySensor,
-        *(draw(skin, coverages, rng), H1_2.chain, balls, 1.0),
+        *(draw_coverages(skin, coverages, rng), H1_2.chain, balls, 1.0),
         reduce=reduce,
         per_object=per_object,
         cull=cull,

@@ -1,0 +1,157 @@
+"""Warp's kernels, on Warp's CPU device: the bits of the PyTorch code; `make test-warp`.
+
+The kernels of a GPU are the same code, compiled by another compiler.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import pickle
+import re
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from egoskin.robots.config import H1_2
+from egoskin.sensors import Field, FieldSensor, Ray, RaySensor
+from sensing import (
+    BALLS,
+    KEYS,
+    SEED,
+    assert_same_bits,
+    draw_balls,
+    draw_coverages,
+    measure,
+    use_warp_kernels,
+)
+
+pytestmark = [pytest.mark.slow, pytest.mark.warp]
+if find_spec("mujoco_warp") is None:
+    pytest.skip("mujoco-warp is not installed (extra gpu)", allow_module_level=True)
+
+import warp as wp  # noqa: E402 # pyright: ignore[reportMissingImports]
+
+from egoskin.sensors.kernels import warp as warp_kernels  # noqa: E402
+
+
+@pytest.fixture(autouse=True)
+def kernels(request, monkeypatch) -> None:
+    if "gpu" not in request.keywords:
+        use_warp_kernels(monkeypatch)
+
+
+def pair(kind, *args, **options):
+    """The same sensor in PyTorch and in Warp."""
+    plain, fast = (kind(*args, **options, compile=c) for c in (False, True))
+    assert plain._kernels is None
+    assert fast._kernels is not None
+    return plain, fast
+
+
+@given(SEED, st.booleans())
+def test_fields_have_the_same_bits(skin, random_state, seed, per_object):
+    rng = np.random.default_rng(seed)
+    wide, narrow = Field(), Field(half_angle_deg=rng.uniform(5, 175))
+    coverages = ([wide], [wide, narrow])[rng.integers(2)]
+    balls, state = draw_balls(random_state, rng, torch.float32)
+    some = draw_coverages(skin, coverages, rng)
+    plain, fast = pair(FieldSensor, some, H1_2.chain, balls, 1.0, per_object=per_object)
+    assert_same_bits(measure(fast, state), measure(plain, state))
+
+
+@given(SEED, st.sampled_from(["none", "min"]), st.booleans(), st.booleans())
+def test_rays_have_the_same_bits(skin, random_state, seed, reduce, per_object, cull):
+    rng = np.random.default_rng(seed)
+    grid = [(4, 4), (8, 8), (3, 5)][rng.integers(3)]
+    coverages = [
+        Ray(grid=grid),
+        Ray(grid=grid, fov_deg=rng.uniform(10, 170), measure="depth"),
+    ][: rng.integers(1, 3)]
+    balls, state = draw_balls(random_state, rng, torch.float32)
+    plain, fast = pair(
+        RaySensor,
+        *(draw_coverages(skin, coverages, rng), H1_2.chain, balls, 1.0),
+        reduce=reduce,
+        per_object=per_object,
+        cull=cull,
+    )
+    assert_same_bits(measure(fast, state), measure(plain, state))
+    if reduce == "none" and not per_object:
+        inputs = [state[key] for key in KEYS]
+        assert_same_bits(fast.hits(*inputs), plain.hits(*inputs))
+
+
+@pytest.mark.parametrize("kind", [FieldSensor, RaySensor])
+def test_no_rows_and_slices_are_fine(skin, random_state, kind):
+    plain, fast = pair(kind, skin, H1_2.chain, BALLS[:1], 2.0)
+    state = random_state(90, seed=3, objects=2)[::3]
+    inputs = [state[key] for key in KEYS]
+    inputs[2:] = [x[:, :1] for x in inputs[2:]]
+    inputs[1] = inputs[1].t().contiguous().t()
+    for rows in (slice(None), slice(0)):
+        some = [x[rows] for x in inputs]
+        assert_same_bits(fast.compute(*some), plain.compute(*some))
+
+
+def test_a_zero_quaternion_gives_nan(skin, random_state):
+    plain, fast = pair(FieldSensor, skin, H1_2.chain, BALLS[:1], 2.0)
+    state = random_state(5, objects=1)
+    state["base_pose"][2, 3:] = 0.0
+    state["object_active"][:] = True
+    distance, detected = measure(fast, state)
+    assert_same_bits((distance, detected), measure(plain, state))
+    assert distance[2].isnan().all()
+    assert detected[2].all()
+
+
+def test_a_mask_hides_sensors(skin, random_state):
+    _, fast = pair(FieldSensor, skin, H1_2.chain, BALLS[:1], math.inf)
+    state = random_state(5, objects=1)
+    state["object_active"][:] = True
+    assert measure(fast, state)[0].isfinite().all()
+    fast.mask([3, 7])
+    (masked,) = {*map(tuple, measure(fast, state)[0].isinf().tolist())}
+    assert [i for i, hidden in enumerate(masked) if hidden] == [3, 7]
+
+
+@pytest.mark.parametrize(
+    "copied", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))]
+)
+def test_a_copy_measures_the_same(skin, random_state, copied):
+    fast = RaySensor(skin, H1_2.chain, BALLS[:1], 2.0, compile=True)
+    state = random_state(5, objects=1)
+    expected = measure(fast, state)
+    assert_same_bits(measure(copied(fast), state), expected)
+
+
+def test_for_a_gpu_nothing_is_fused_and_roots_are_exact(tmp_path: Path):
+    # Warp compiles for a GPU that is not there; this is what the compiler writes.
+    wp.init()
+    wp.compile_aot_module(warp_kernels, module_dir=tmp_path, arch=90, use_ptx=True)
+    (code,) = (path.read_bytes().decode("latin1") for path in tmp_path.glob("*.ptx"))
+    numbers = set(re.findall(r"\b(?:fma|mul|sqrt|div|rcp)[.a-z0-9]*\.f(?:32|64)", code))
+    assert numbers == {"mul.rn.f32", "sqrt.rn.f32", "div.rn.f32"}
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("kind", [FieldSensor, RaySensor])
+def test_on_a_gpu_readings_have_the_bits_of_the_cpu(skin, random_state, kind):
+    plain, fast = pair(kind, skin, H1_2.chain, BALLS[:2], 2.0)
+    state = random_state(300)
+    state["joint_pos"][7, 3] = math.nan
+    on_gpu = state.to("cuda")
+    expected = measure(plain, state)
+    assert_same_bits([x.cpu() for x in measure(fast.to("cuda"), on_gpu)], expected)
+    assert fast._kernels._warp
+    if kind is RaySensor:
+        hits = fast.hits(*(on_gpu[key] for key in KEYS))
+        assert_same_bits(
+            [x.cpu() for x in hits], plain.hits(*(state[key] for key in KEYS))
+        )
