@@ -181,6 +181,7 @@ class RobotConfig:
             spec.compiler.balanceinertia = True
         try:
             _name_all(spec)
+            _fix_masses(spec)
         except ValueError as error:
             raise self._unreadable(error) from error
         return spec
@@ -440,6 +441,36 @@ def _name_all(spec: mujoco.MjSpec) -> None:
             body.name = body_name(model, body.id)
         for joint in joints:
             joint.name = joint_name(model, joint.id)
+
+
+# Settings of MuJoCo's compiler that change the masses of all bodies of a model.
+_MASS_SETTINGS = ("settotalmass", "inertiafromgeom", "inertiagrouprange")
+
+
+def _fix_masses(spec: mujoco.MjSpec) -> None:
+    """Replace settings that would also change the masses of balls by their effect."""
+    own, plain = spec.compiler, mujoco.MjSpec().compiler
+    if all(
+        np.array_equal(getattr(own, name), getattr(plain, name))
+        for name in _MASS_SETTINGS
+    ):
+        return
+    model = spec.compile()
+    for body in spec.bodies:
+        if body.name != "world":
+            set_inertia(body, model)
+    for name in _MASS_SETTINGS:
+        setattr(own, name, getattr(plain, name))
+
+
+def set_inertia(body: mujoco.MjsBody, model: mujoco.MjModel) -> None:
+    """Set the inertia of a body to that of the compiled model."""
+    which = body_id(model, body.name)
+    body.mass = model.body_mass[which]
+    body.ipos, body.iquat = model.body_ipos[which], model.body_iquat[which]
+    body.inertia = model.body_inertia[which]
+    body.fullinertia = np.full(6, np.nan)
+    body.explicitinertial = True
 
 
 def _primitive_kind(model: mujoco.MjModel, geom: int) -> str:

@@ -42,6 +42,7 @@ from egoskin.robots.config import (
     Gain,
     RobotConfig,
     read_robot,
+    set_inertia,
 )
 from egoskin.storage.files import read_regular
 
@@ -448,13 +449,8 @@ def _check_outermost(robot: RobotConfig, model: mujoco.MjModel) -> None:
 def _fix_inertia(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
     """Set the inertia of each link, which may come from shapes that are left out."""
     for body in spec.bodies:
-        if body.name == "world" or body.explicitinertial:
-            continue
-        which = body_id(model, body.name)
-        body.mass = model.body_mass[which]
-        body.ipos, body.iquat = model.body_ipos[which], model.body_iquat[which]
-        body.inertia = model.body_inertia[which]
-        body.explicitinertial = True
+        if body.name != "world" and not body.explicitinertial:
+            set_inertia(body, model)
 
 
 def _round_off(geom: mujoco.MjsGeom) -> None:

@@ -18,7 +18,7 @@ import egoskin
 from calling import SMALL, call, succeed
 from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
 from egoskin.envs.physics import PhysicsConfig, Scene
-from egoskin.envs.physics.contract import GRAVITY
+from egoskin.envs.physics.contract import GRAVITY, OBJECT_MASS
 from egoskin.envs.physics.model import build_scene
 from egoskin.make import EnvConfig
 from egoskin.robots.config import G1, H1_2, RobotConfig
@@ -511,3 +511,28 @@ def test_the_options_of_a_robots_file_are_not_those_of_the_scene(tmp_path):
     assert expected.solver == mujoco.mjtSolver.mjSOL_NEWTON
     assert expected.gravity.tolist() == [0, 0, -GRAVITY]
     assert expected.disableflags == expected.enableflags == 0
+
+
+@pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass'")
+@pytest.mark.parametrize(
+    "setting",
+    ['settotalmass="50"', 'inertiafromgeom="true"', 'inertiagrouprange="2 3"'],
+)
+def test_settings_that_change_masses_act_on_the_robot_alone(setting, tmp_path):
+    heavy = '<inertial pos="0 0 0.1" mass="30" fullinertia="1 1 1 0.1 0 0"/>'
+    model = MODEL.replace("<geom ", '<geom group="2" ')
+    model = model.replace("<freejoint/>", f"<freejoint/>{heavy}")
+    model = re.sub("<compiler ", f"<compiler {setting} ", model)
+    assert heavy in model
+    assert setting in model
+    plain = mujoco.MjModel.from_xml_string(model)
+    robot = read_folder(write_robot(tmp_path / "walker", model=model))
+    for kept in (robot, portable(robot)):
+        scene = scene_of(kept)
+        for link in robot.links:
+            own, expected = scene.body(link), plain.body(link)
+            for value in ("mass", "ipos", "inertia"):
+                # An MJCF has six digits.
+                pair = getattr(own, value), getattr(expected, value)
+                np.testing.assert_allclose(*pair, rtol=1e-5)
+        assert scene.body("object_0").mass == OBJECT_MASS
