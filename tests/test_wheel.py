@@ -333,7 +333,7 @@ def test_it_trains_and_draws_a_robot_of_ones_own(egoskin: Installed):
     )
     # Its policy no longer needs the folder.
     shutil.rmtree(egoskin.folder / "walker")
-    assert "runs/walker: 256 frames" in egoskin(
+    assert "runs/walker: trained for 256 frames" in egoskin(
         "evaluate", "runs/walker", "--episodes", "4"
     )
 
