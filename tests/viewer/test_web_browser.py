@@ -65,6 +65,14 @@ class Visit:
         picture = self.tab.screenshot(clip=clip, timeout=1000 * _WAIT)
         return np.asarray(Image.open(io.BytesIO(picture)).convert("RGB")).astype(int)
 
+    def still(self) -> np.ndarray:
+        """Return the picture once it has stopped to change, as `canvas`."""
+        before, now = None, self.canvas()
+        while before is None or differs(before, now):
+            time.sleep(5)
+            before, now = now, self.canvas()
+        return now
+
 
 @pytest.fixture
 def visit(page: Page) -> Iterator[Visit]:
@@ -129,8 +137,7 @@ def test_a_throw_is_seen_by_the_sensors(page: Page, visit: Visit):
         seen, reading=0 * seen.reading, line=np.full_like(seen.line, np.nan)
     )
     page._ask(lambda: page._draw([numb]))
-    time.sleep(5)
-    dark = visit.canvas()
+    dark = visit.still()
     page._ask(lambda: page._draw([seen]))
     wait_for(lambda: differs(dark, visit.canvas()))
     visit.press("Pause")
