@@ -323,6 +323,8 @@ class WarpKernels:
                     np.reshape(value, shape), dtype=array.dtype, device=self._device
                 )
             setattr(self._tables, name, value)
+        # The tables were copied on Warp's stream; the kernels run on PyTorch's.
+        wp.synchronize_device(self._device)
 
     def measure(self, inputs: Sequence[Tensor], out: Tensor, detected: Tensor) -> None:
         """Write readings and detections.
@@ -334,18 +336,20 @@ class WarpKernels:
         """
         base_pose, joint_pos, object_pose, active = (x.contiguous() for x in inputs)
         rows, objects = active.shape
-        frames, tables = self._tables.steps + 1, self._tables
+        tables = self._tables
+        frames = tables.steps + 1
         rotation = out.new_empty(frames, rows, 3, 3)
         position = out.new_empty(frames, rows, 3)
         centre = out.new_empty(rows, objects, tables.links, 3)
         if self._kernel is _read_ray:
             out.fill_(torch.inf)
-        given = [base_pose, joint_pos, object_pose]
         points = wp.from_torch(centre, dtype=wp.vec3)
         self._launch(
-            *(_place, rows, *map(wp.from_torch, given)),
-            *(wp.from_torch(rotation, dtype=wp.mat33),),
-            *(wp.from_torch(position, dtype=wp.vec3), points),
+            *(_place, rows),
+            *map(wp.from_torch, (base_pose, joint_pos, object_pose)),
+            wp.from_torch(rotation, dtype=wp.mat33),
+            wp.from_torch(position, dtype=wp.vec3),
+            points,
         )
         # Without `apart` a single plane, of all readings of a row.
         planes = objects if tables.apart else 1
