@@ -12,7 +12,7 @@ import torch
 from hypothesis import strategies as st
 
 from egoskin.robots.config import H1_2
-from egoskin.sensors import Skin
+from egoskin.sensors import Field, Ray, Skin
 from egoskin.sensors.kernels.binding import Kernels
 from egoskin.shapes import Box, Capsule, Ellipsoid, Sphere
 
@@ -61,6 +61,21 @@ def look(sensor, *centres, active=None, quat=(1, 0, 0, 0)):
     return distance[0, 0].tolist(), detected[0].tolist()
 
 
+def draw_fields(rng) -> list[Field]:
+    """One or two kinds of field."""
+    wide, narrow = Field(), Field(half_angle_deg=rng.uniform(5, 175))
+    return ([wide], [wide, narrow])[rng.integers(2)]
+
+
+def draw_rays(rng) -> list[Ray]:
+    """One or two kinds of grid, with as many beams."""
+    grid = [(4, 4), (8, 8), (3, 5)][rng.integers(3)]
+    return [
+        Ray(grid=grid),
+        Ray(grid=grid, fov_deg=rng.uniform(10, 170), measure="depth"),
+    ][: rng.integers(1, 3)]
+
+
 def draw_coverages(skin: Skin, coverages, rng) -> Skin:
     """Some sensors, with ranges, rolls and coverages drawn for each."""
     some = skin.select(rng.permutation(len(skin))[: rng.integers(1, 40)])
@@ -83,6 +98,15 @@ def draw_balls(random_state, rng, dtype):
             flat = state[key].view(rows, -1)
             flat[rng.integers(rows), rng.integers(flat.shape[1])] = math.nan
     return BALLS[:count], state
+
+
+def sliced_inputs(random_state) -> list[torch.Tensor]:
+    """Inputs for one object that are slices of larger tensors, with strides."""
+    state = random_state(90, seed=3, objects=2)[::3]
+    inputs = [state[key] for key in KEYS]
+    inputs[2:] = [x[:, :1] for x in inputs[2:]]
+    inputs[1] = inputs[1].t().contiguous().t()
+    return inputs
 
 
 def measure(sensor, state):

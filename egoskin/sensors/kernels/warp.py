@@ -188,6 +188,7 @@ def _read_field(
 ):
     """Write the distances of `FieldSensor` [m], ``[1 or O, B, S]``."""
     row, sensor = wp.tid()
+    nearest = float(wp.inf)
     for o in range(t.objects):
         distance = float(wp.inf)
         if active[row, o]:
@@ -206,10 +207,9 @@ def _read_field(
             detected[row, o] = True
         if t.apart != 0:
             out[o, row, sensor] = distance
-        elif o == 0:
-            out[0, row, sensor] = distance
-        else:
-            out[0, row, sensor] = _least(out[0, row, sensor], distance)
+        nearest = _least(nearest, distance)
+    if t.apart == 0:
+        out[0, row, sensor] = nearest
 
 
 @wp.func

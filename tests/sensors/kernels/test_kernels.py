@@ -30,7 +30,7 @@ from hypothesis import strategies as st
 from egoskin.parallel import start_server
 from egoskin.robots.chains import build_chain
 from egoskin.robots.config import H1_2
-from egoskin.sensors import Field, FieldSensor, Ray, RaySensor, Skin
+from egoskin.sensors import Field, FieldSensor, RaySensor, Skin
 from egoskin.sensors.kernels import compilation
 from egoskin.sensors.kernels.compilation import can_compile, load_library
 from egoskin.shapes import Box, Sphere
@@ -41,7 +41,10 @@ from sensing import (
     assert_same_bits,
     draw_balls,
     draw_coverages,
+    draw_fields,
+    draw_rays,
     measure,
+    sliced_inputs,
 )
 
 DTYPES = st.sampled_from([torch.float32, torch.float64])
@@ -76,8 +79,7 @@ def assert_same(fast, plain) -> None:
 @given(SEED, DTYPES, st.booleans())
 def test_fields_have_the_same_bits(skin, random_state, seed, dtype, per_object):
     rng = np.random.default_rng(seed)
-    wide, narrow = Field(), Field(half_angle_deg=rng.uniform(5, 175))
-    coverages = ([wide], [wide, narrow])[rng.integers(2)]
+    coverages = draw_fields(rng)
     balls, state = draw_balls(random_state, rng, dtype)
     some = draw_coverages(skin, coverages, rng)
     plain, fast = pair(FieldSensor, some, H1_2.chain, balls, 1.0, per_object=per_object)
@@ -135,11 +137,7 @@ def test_rays_have_the_same_bits(
     skin, random_state, seed, dtype, reduce, per_object, cull
 ):
     rng = np.random.default_rng(seed)
-    grid = [(4, 4), (8, 8), (3, 5)][rng.integers(3)]
-    coverages = [
-        Ray(grid=grid),
-        Ray(grid=grid, fov_deg=rng.uniform(10, 170), measure="depth"),
-    ][: rng.integers(1, 3)]
+    coverages = draw_rays(rng)
     balls, state = draw_balls(random_state, rng, dtype)
     plain, fast = pair(
         RaySensor,
@@ -213,10 +211,7 @@ def test_joints_of_every_kind_have_the_same_bits():
 @needs_compiler
 def test_inputs_may_be_slices(skin, random_state):
     plain, fast = pair(FieldSensor, skin, H1_2.chain, BALLS[:1], 2.0)
-    state = random_state(90, seed=3, objects=2)[::3]
-    inputs = [state[key] for key in KEYS]
-    inputs[2:] = [x[:, :1] for x in inputs[2:]]
-    inputs[1] = inputs[1].t().contiguous().t()
+    inputs = sliced_inputs(random_state)
     assert_same_bits(fast.compute(*inputs), plain.compute(*inputs))
 
 

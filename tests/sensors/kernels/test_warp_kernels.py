@@ -19,7 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from egoskin.robots.config import H1_2
-from egoskin.sensors import Field, FieldSensor, Ray, RaySensor
+from egoskin.sensors import FieldSensor, RaySensor
 from sensing import (
     BALLS,
     KEYS,
@@ -27,7 +27,10 @@ from sensing import (
     assert_same_bits,
     draw_balls,
     draw_coverages,
+    draw_fields,
+    draw_rays,
     measure,
+    sliced_inputs,
     use_warp_kernels,
 )
 
@@ -57,8 +60,7 @@ def pair(kind, *args, **options):
 @given(SEED, st.booleans())
 def test_fields_have_the_same_bits(skin, random_state, seed, per_object):
     rng = np.random.default_rng(seed)
-    wide, narrow = Field(), Field(half_angle_deg=rng.uniform(5, 175))
-    coverages = ([wide], [wide, narrow])[rng.integers(2)]
+    coverages = draw_fields(rng)
     balls, state = draw_balls(random_state, rng, torch.float32)
     some = draw_coverages(skin, coverages, rng)
     plain, fast = pair(FieldSensor, some, H1_2.chain, balls, 1.0, per_object=per_object)
@@ -68,11 +70,7 @@ def test_fields_have_the_same_bits(skin, random_state, seed, per_object):
 @given(SEED, st.sampled_from(["none", "min"]), st.booleans(), st.booleans())
 def test_rays_have_the_same_bits(skin, random_state, seed, reduce, per_object, cull):
     rng = np.random.default_rng(seed)
-    grid = [(4, 4), (8, 8), (3, 5)][rng.integers(3)]
-    coverages = [
-        Ray(grid=grid),
-        Ray(grid=grid, fov_deg=rng.uniform(10, 170), measure="depth"),
-    ][: rng.integers(1, 3)]
+    coverages = draw_rays(rng)
     balls, state = draw_balls(random_state, rng, torch.float32)
     plain, fast = pair(
         RaySensor,
@@ -90,10 +88,7 @@ def test_rays_have_the_same_bits(skin, random_state, seed, reduce, per_object, c
 @pytest.mark.parametrize("kind", [FieldSensor, RaySensor])
 def test_no_rows_and_slices_are_fine(skin, random_state, kind):
     plain, fast = pair(kind, skin, H1_2.chain, BALLS[:1], 2.0)
-    state = random_state(90, seed=3, objects=2)[::3]
-    inputs = [state[key] for key in KEYS]
-    inputs[2:] = [x[:, :1] for x in inputs[2:]]
-    inputs[1] = inputs[1].t().contiguous().t()
+    inputs = sliced_inputs(random_state)
     for rows in (slice(None), slice(0)):
         some = [x[rows] for x in inputs]
         assert_same_bits(fast.compute(*some), plain.compute(*some))
