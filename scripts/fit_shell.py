@@ -37,7 +37,7 @@ from scipy.spatial import cKDTree
 from trimesh import Trimesh
 
 from egoskin.commands.errors import clear_errors
-from egoskin.robots.config import H1_2
+from egoskin.robots.builtin import H1_2
 from egoskin.robots.surface import sample_surface
 from egoskin.sensors.skin.mesh_surface import openness
 

@@ -27,7 +27,7 @@ from torch import Tensor
 from egoskin.commands.errors import clear_errors
 from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
 from egoskin.envs.throws import ThrowConfig
-from egoskin.robots.config import H1_2
+from egoskin.robots.builtin import H1_2
 from egoskin.sensors import FieldSensor, Ray, RaySensor, place_sensors
 
 # The first ball comes at once, because recordings are short.

@@ -21,7 +21,8 @@ from hypothesis import settings
 from tensordict import TensorDict
 
 from calling import BATCH, SCHEDULES, SMALL, succeed
-from egoskin.robots.config import H1_2, RobotConfig
+from egoskin.robots.builtin import H1_2
+from egoskin.robots.config import RobotConfig
 from egoskin.sensors import Skin, place_sensors
 from egoskin.sensors.kernels import compilation
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from hypothesis import strategies as st
 
-from egoskin.robots.config import H1_2
+from egoskin.robots.builtin import H1_2
 from egoskin.sensors import Field, Ray, Skin
 from egoskin.sensors.kernels.binding import Kernels
 from egoskin.shapes import Box, Capsule, Ellipsoid, Sphere

@@ -27,7 +27,7 @@ from egoskin.envs.randomization import RandomizationConfig
 from egoskin.envs.throws import ThrowConfig
 from egoskin.make import EnvConfig, make_worker_env
 from egoskin.policies.export import export_onnx, observation_parts
-from egoskin.robots.config import H1_2
+from egoskin.robots.builtin import H1_2
 from egoskin.runs.config import TrainConfig, parse_config
 from egoskin.sensors.config import SensorConfig
 from owning import write_robot

@@ -51,6 +51,7 @@ MUJOCO = {
     "robots.chains",
     "robots.config",
     "robots.own",
+    "robots.spec",
     "shapes",
     "envs.physics.model",
     "envs.physics.mujoco",

@@ -23,7 +23,7 @@ from egoskin.policies.policy import (
     save_policy,
     sparse_sources,
 )
-from egoskin.robots.config import H1_2
+from egoskin.robots.builtin import H1_2
 from egoskin.sensors import Ray, RaySensor, SensorPipeline, place_sensors
 from egoskin.sensors.config import SensorConfig
 from egoskin.shapes import Sphere

@@ -21,7 +21,7 @@ from egoskin.envs.dodgeball import DodgeballEnv
 from egoskin.envs.observations import Oracle, Privileged, Proprioception, approaches_b
 from egoskin.envs.physics.contract import GRAVITY
 from egoskin.make import EnvConfig, make_worker_env
-from egoskin.robots.config import H1_2
+from egoskin.robots.builtin import H1_2
 from egoskin.sensors import (
     MASK_ALL,
     Binary,

@@ -33,7 +33,7 @@ from egoskin.parallel import (
     available_cores,
     default_num_workers,
 )
-from egoskin.robots.config import H1_2
+from egoskin.robots.builtin import H1_2
 from egoskin.sensors import place_sensors
 from egoskin.sensors.kernels.compilation import SETTING
 from throwing import TASK, assert_same
@@ -298,7 +298,7 @@ pool.step_and_maybe_reset(root)
 
 UNGUARDED = """
 from egoskin.make import EnvConfig, make_env
-from egoskin.robots.config import H1_2
+from egoskin.robots.builtin import H1_2
 from egoskin.sensors import place_sensors
 skin = place_sensors(H1_2, 8, seed=0)
 pool = make_env(EnvConfig(), skin, num_envs=8, seed=0, num_workers=2)

@@ -7,7 +7,7 @@ from tensordict import TensorDictBase
 
 from egoskin.envs.dodgeball import DodgeballConfig
 from egoskin.envs.throws import ThrowConfig
-from egoskin.robots.config import H1_2
+from egoskin.robots.builtin import H1_2
 
 AT_ONCE = ThrowConfig(first_delay=(0.0, 0.0))
 """The default throws, the first ball at the start of the episode."""

@@ -23,7 +23,8 @@ from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
 from egoskin.envs.physics import PhysicsConfig
 from egoskin.envs.throws import ThrowConfig
 from egoskin.progress import counted
-from egoskin.robots.config import ROBOTS, RobotConfig
+from egoskin.robots.builtin import ROBOTS
+from egoskin.robots.config import RobotConfig
 from egoskin.robots.own import find_robot, portable
 from egoskin.sensors.config import SkinConfig
 from egoskin.viewer.film import check_path, save_picture

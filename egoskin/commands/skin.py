@@ -25,7 +25,8 @@ from tensordict import TensorDict
 
 from egoskin.commands.errors import parse_subcommand
 from egoskin.progress import counted
-from egoskin.robots.config import ROBOTS, Primitive, RobotConfig
+from egoskin.robots.builtin import ROBOTS
+from egoskin.robots.config import Primitive, RobotConfig
 from egoskin.robots.kinematics import LinkKinematics
 from egoskin.robots.own import find_robot
 from egoskin.sensors import Skin

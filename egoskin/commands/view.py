@@ -75,7 +75,7 @@ def main(args: list[str]) -> None:
 
 def _skin_page(config: ViewConfig) -> SkinPage:
     """Return the page of a robot, of a skin, or of a skin on a robot."""
-    from egoskin.robots.config import ROBOTS
+    from egoskin.robots.builtin import ROBOTS
     from egoskin.robots.own import find_robot
     from egoskin.sensors import Skin
     from egoskin.viewer.web.skin_page import SkinPage

@@ -1,14 +1,13 @@
 """Robots: a model and the settings that a model file does not contain.
 
-The built-in robots are at the end, with their MJCF in ``assets/``; your own robots are
-read from a folder or a file (`egoskin.robots.own`). Names are resolved to indices once,
-in the properties of the configuration.
+The built-in robots are in `egoskin.robots.builtin`; your own robots are read from a
+folder or a file (`egoskin.robots.own`). Names are resolved to indices once, in the
+properties of the configuration.
 """
 
 from __future__ import annotations
 
 import fnmatch
-import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
@@ -27,9 +26,9 @@ from egoskin.robots.chains import (
     joint_name,
 )
 from egoskin.robots.model_text import checked_model
-from egoskin.storage.files import check_regular, read_regular
+from egoskin.robots.spec import compile_robot, is_urdf, load_spec
+from egoskin.storage.files import check_regular
 
-ASSETS = Path(__file__).parents[1] / "assets"
 # Largest component of the quaternion of a base that counts as upright.
 _TILT = 1e-3
 
@@ -148,11 +147,7 @@ class RobotConfig:
     @cached_property
     def model(self) -> mujoco.MjModel:
         """The compiled model of the robot alone."""
-        spec = self.spec()
-        try:
-            return spec.compile()
-        except ValueError as error:
-            raise self._unreadable(error) from error
+        return compile_robot(self.spec(), self._origin)
 
     def spec(self) -> mujoco.MjSpec:
         """Return a new, editable specification of the robot.
@@ -162,42 +157,20 @@ class RobotConfig:
                 given as text contains more than a robot of primitives.
             OSError: If there is no such file.
         """
-        path, is_urdf, text = self.model_path, self.is_urdf, ""
-        if self.model_xml is not None:
-            text = checked_model(self.model_xml, f"robot {self.name!r}")
-        try:
-            if path is None:
-                spec = mujoco.MjSpec.from_string(text)
-            else:
-                spec = mujoco.MjSpec.from_file(str(path))
-        except ValueError as error:
-            raise self._unreadable(error) from error
-        if is_urdf:
-            for element in (*_mesh_geoms(spec), *spec.meshes):
-                spec.delete(element)
-            spec.compiler.fusestatic = False
-            # A URDF may leave out masses, but MuJoCo requires them for moving bodies.
-            spec.compiler.boundmass = spec.compiler.boundinertia = 1e-6
-            spec.compiler.balanceinertia = True
-        try:
-            _name_all(spec)
-            _fix_masses(spec)
-        except ValueError as error:
-            raise self._unreadable(error) from error
-        return spec
+        source = self.model_path
+        if source is None:
+            source = checked_model(self.model_xml or "", f"robot {self.name!r}")
+        return load_spec(source, self._origin)
 
     @property
     def is_urdf(self) -> bool:
         """Whether the model is a URDF."""
-        path = self.model_path
-        return path is not None and _root_tag(read_regular(path)) == "robot"
+        return self.model_path is not None and is_urdf(self.model_path)
 
-    def _unreadable(self, error: ValueError) -> ValueError:
-        """Return the error for a model that MuJoCo cannot read, on one line."""
-        what = self.model_path or f"the model of {self.name!r}"
-        return ValueError(
-            f"MuJoCo cannot load {what} as a robot: {' '.join(str(error).split())}"
-        )
+    @property
+    def _origin(self) -> str:
+        """Where the model comes from, for error texts."""
+        return str(self.model_path or f"the model of {self.name!r}")
 
     @cached_property
     def _bodies(self) -> list[int]:
@@ -415,64 +388,6 @@ def read_robot(path: Path | str) -> RobotConfig:
     )
 
 
-def _root_tag(content: bytes) -> str:
-    """Return the tag of the root element of an XML file, "" if there is none."""
-    content = re.sub(rb"<!--.*?-->", b"", content, flags=re.DOTALL)
-    tag = re.search(rb"<([A-Za-z][\w:.-]*)", content)
-    return "" if tag is None else tag[1].decode()
-
-
-def _mesh_geoms(spec: mujoco.MjSpec) -> list[mujoco.MjsGeom]:
-    """Return the geoms that are meshes."""
-    return [g for g in spec.geoms if g.type == mujoco.mjtGeom.mjGEOM_MESH]
-
-
-def _name_all(spec: mujoco.MjSpec) -> None:
-    """Give unnamed bodies and joints the names that the robot's chain uses."""
-    bodies = [body for body in spec.bodies if not body.name]
-    joints = [
-        joint
-        for joint in spec.joints
-        if not joint.name and joint.type != mujoco.mjtJoint.mjJNT_FREE
-    ]
-    if bodies or joints:
-        model = spec.compile()
-        for body in bodies:
-            body.name = body_name(model, body.id)
-        for joint in joints:
-            joint.name = joint_name(model, joint.id)
-
-
-# Settings of MuJoCo's compiler that change the masses of all bodies of a model.
-_MASS_SETTINGS = ("settotalmass", "inertiafromgeom", "inertiagrouprange")
-
-
-def _fix_masses(spec: mujoco.MjSpec) -> None:
-    """Replace settings that would also change the masses of balls by their effect."""
-    own, plain = spec.compiler, mujoco.MjSpec().compiler
-    if all(
-        np.array_equal(getattr(own, name), getattr(plain, name))
-        for name in _MASS_SETTINGS
-    ):
-        return
-    model = spec.compile()
-    for body in spec.bodies:
-        if body.name != "world":
-            set_inertia(body, model)
-    for name in _MASS_SETTINGS:
-        setattr(own, name, getattr(plain, name))
-
-
-def set_inertia(body: mujoco.MjsBody, model: mujoco.MjModel) -> None:
-    """Set the inertia of a body to that of the compiled model."""
-    which = body_id(model, body.name)
-    body.mass = model.body_mass[which]
-    body.ipos, body.iquat = model.body_ipos[which], model.body_iquat[which]
-    body.inertia = model.body_inertia[which]
-    body.fullinertia = np.full(6, np.nan)
-    body.explicitinertial = True
-
-
 def _primitive_kind(model: mujoco.MjModel, geom: int) -> str:
     """Return "sphere", "capsule" or "box".
 
@@ -506,117 +421,3 @@ def _extent(
         reach = float(np.abs(z_row) @ size)
     centre = data.geom_xpos[geom, 2]
     return float(centre - reach), float(centre + reach)
-
-
-_ARMS = tuple(
-    f"{side}_{part}_link"
-    for side in ("left", "right")
-    for part in (
-        "shoulder_pitch",
-        "shoulder_roll",
-        "shoulder_yaw",
-        "elbow",
-        "wrist_roll",
-        "wrist_pitch",
-        "wrist_yaw",
-    )
-)
-_SHINS_AND_FEET = tuple(
-    f"{side}_{part}_link"
-    for side in ("left", "right")
-    for part in ("knee", "ankle_pitch", "ankle_roll")
-)
-
-H1_2 = RobotConfig(
-    name="h1_2",
-    model_path=ASSETS / "h1_2.xml",
-    base="pelvis",
-    # Stance of Unitree's training code for the H1-2.
-    default_pose={
-        "*_hip_pitch_joint": -0.16,
-        "*_knee_joint": 0.36,
-        "*_ankle_pitch_joint": -0.2,
-        "*_shoulder_pitch_joint": 0.4,
-        "*_elbow_joint": 0.3,
-    },
-    gains={
-        # kp = I w^2, kd = 2 zeta I w with the reflected rotor inertia I, w = 10 Hz
-        # and damping ratio zeta = 2.
-        "rotor_inertia": {
-            "*_hip_*_joint": Gain(kp=98.7, kd=6.3),
-            "*_knee_joint": Gain(kp=157.7, kd=10.1),
-            "*_ankle_*_joint": Gain(kp=19.7, kd=1.3),
-            "torso_joint": Gain(kp=98.7, kd=6.3),
-            "*_shoulder_pitch_joint": Gain(kp=19.7, kd=1.3),
-            "*_shoulder_roll_joint": Gain(kp=19.7, kd=1.3),
-            "*_shoulder_yaw_joint": Gain(kp=7.9, kd=0.5),
-            "*_elbow_joint": Gain(kp=7.9, kd=0.5),
-        },
-        # Unitree's figures for the real robot.
-        "real": {
-            "*_hip_*_joint": Gain(kp=200.0, kd=2.5),
-            "*_knee_joint": Gain(kp=300.0, kd=4.0),
-            "*_ankle_*_joint": Gain(kp=40.0, kd=2.0),
-            "torso_joint": Gain(kp=300.0, kd=3.0),
-            "*_shoulder_*_joint": Gain(kp=120.0, kd=2.0),
-            "*_elbow_joint": Gain(kp=80.0, kd=1.0),
-        },
-    },
-    feet=tuple(
-        f"{s}_ankle_{a}_link" for s in ("left", "right") for a in ("pitch", "roll")
-    ),
-    skin_links=("torso_link", *_ARMS),
-    untargeted_links=_SHINS_AND_FEET,
-)
-"""Unitree H1-2 without hands, wrists locked: 21 joints."""
-
-G1 = RobotConfig(
-    name="g1",
-    model_path=ASSETS / "g1.xml",
-    base="pelvis",
-    # Knees bent, the centre of mass above the soles; arms clear of the body.
-    default_pose={
-        "*_hip_pitch_joint": -0.28,
-        "*_knee_joint": 0.56,
-        "*_ankle_pitch_joint": -0.28,
-        "*_shoulder_pitch_joint": 0.2,
-        "left_shoulder_roll_joint": 0.2,
-        "right_shoulder_roll_joint": -0.2,
-        "*_elbow_joint": 0.6,
-    },
-    gains={
-        # As for the H1-2: from the armatures, at 10 Hz and damping ratio 2, as in
-        # public controllers of the G1 (BeyondMimic, mjlab).
-        "rotor_inertia": {
-            "*_hip_pitch_joint": Gain(kp=40.2, kd=2.56),
-            "*_hip_yaw_joint": Gain(kp=40.2, kd=2.56),
-            "*_hip_roll_joint": Gain(kp=99.1, kd=6.31),
-            "*_knee_joint": Gain(kp=99.1, kd=6.31),
-            "*_ankle_*_joint": Gain(kp=28.5, kd=1.81),
-            "waist_yaw_joint": Gain(kp=40.2, kd=2.56),
-            "waist_[rp]*_joint": Gain(kp=28.5, kd=1.81),
-            "*_shoulder_*_joint": Gain(kp=14.3, kd=0.907),
-            "*_elbow_joint": Gain(kp=14.3, kd=0.907),
-            "*_wrist_roll_joint": Gain(kp=14.3, kd=0.907),
-            "*_wrist_[py]*_joint": Gain(kp=16.8, kd=1.07),
-        },
-        # Unitree's low-level example for the real robot (unitree_sdk2).
-        "real": {
-            "*_hip_*_joint": Gain(kp=60.0, kd=1.0),
-            "*_knee_joint": Gain(kp=100.0, kd=2.0),
-            "*_ankle_*_joint": Gain(kp=40.0, kd=1.0),
-            "waist_yaw_joint": Gain(kp=60.0, kd=1.0),
-            "waist_[rp]*_joint": Gain(kp=40.0, kd=1.0),
-            "*_shoulder_*_joint": Gain(kp=40.0, kd=1.0),
-            "*_elbow_joint": Gain(kp=40.0, kd=1.0),
-            "*_wrist_*_joint": Gain(kp=40.0, kd=1.0),
-        },
-    },
-    feet=H1_2.feet,
-    skin_links=("torso_link", *_ARMS),
-    untargeted_links=_SHINS_AND_FEET,
-)
-"""Unitree G1 with rubber hands: 29 joints."""
-
-ROBOTS = {robot.name: robot for robot in (H1_2, G1)}
-"""Robots that can be chosen by name."""

@@ -36,14 +36,10 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from egoskin.bounds import is_number
 from egoskin.hints import did_you_mean
+from egoskin.robots.builtin import ROBOTS
 from egoskin.robots.chains import body_id, body_name
-from egoskin.robots.config import (
-    ROBOTS,
-    Gain,
-    RobotConfig,
-    read_robot,
-    set_inertia,
-)
+from egoskin.robots.config import Gain, RobotConfig, read_robot
+from egoskin.robots.spec import set_inertia
 from egoskin.storage.files import read_regular
 
 if sys.version_info >= (3, 11):

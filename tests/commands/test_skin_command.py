@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from calling import call, fail, succeed
-from egoskin.robots.config import H1_2
+from egoskin.robots.builtin import H1_2
 from egoskin.sensors import Field, Ray, Skin
 
 TABLE = """Index,X,Y,Z,NormX,NormY,NormZ,Radius,Parent,Object Name in Blender

@@ -7,7 +7,7 @@ import torch
 
 from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
 from egoskin.envs.throws import ThrowConfig
-from egoskin.robots.config import H1_2
+from egoskin.robots.builtin import H1_2
 from egoskin.robots.kinematics import LinkKinematics, rotate
 from egoskin.robots.surface import sample_surface
 from egoskin.shapes import Box, Capsule, Ellipsoid, Shape, Sphere

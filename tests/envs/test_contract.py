@@ -11,7 +11,7 @@ from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
 from egoskin.envs.physics import DEFAULT_ENGINE, PhysicsConfig
 from egoskin.envs.randomization import RandomizationConfig
 from egoskin.envs.throws import ThrowConfig
-from egoskin.robots.config import H1_2
+from egoskin.robots.builtin import H1_2
 from simple_physics import SimplePhysics
 
 # Balls from all sides, early and often.

@@ -11,7 +11,7 @@ import torch
 
 from egoskin.envs.physics import PhysicsConfig, Scene
 from egoskin.envs.physics.mujoco import MujocoPhysics
-from egoskin.robots.config import H1_2
+from egoskin.robots.builtin import H1_2
 from egoskin.shapes import Sphere
 from simple_physics import SimplePhysics
 

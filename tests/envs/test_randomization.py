@@ -11,7 +11,7 @@ from egoskin.envs.physics.mujoco import MujocoPhysics
 from egoskin.envs.randomization import RandomizationConfig
 from egoskin.envs.standards import evaluation_task, standard_of
 from egoskin.envs.throws import ThrowConfig
-from egoskin.robots.config import H1_2
+from egoskin.robots.builtin import H1_2
 
 NO_BALLS = ThrowConfig(first_delay=(100.0, 100.0))
 EVERYTHING = RandomizationConfig(

@@ -10,7 +10,7 @@ import egoskin
 from egoskin.envs.dodgeball import DodgeballEnv
 from egoskin.envs.state import STATE, keys_read_by, state_table
 from egoskin.make import EnvConfig, make_worker_env
-from egoskin.robots.config import H1_2
+from egoskin.robots.builtin import H1_2
 from egoskin.runs.trainer import METRIC_KEYS
 from egoskin.sensors.config import SensorConfig
 from egoskin.sensors.tactile import ContactFree

@@ -13,7 +13,7 @@ from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
 from egoskin.envs.physics import DEFAULT_ENGINE, PhysicsConfig, Scene
 from egoskin.envs.throws import Release, ThrowConfig, Thrower
 from egoskin.rng import Stream, uniform
-from egoskin.robots.config import H1_2
+from egoskin.robots.builtin import H1_2
 from egoskin.robots.kinematics import LinkKinematics, pad_rows, rotate
 from egoskin.robots.surface import distance_to, sample_surface
 

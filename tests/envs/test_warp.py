@@ -34,7 +34,7 @@ from egoskin.envs.throws import Thrower
 from egoskin.evaluation.throw_set import play_throws, standard_task
 from egoskin.make import EnvConfig, make_worker_env
 from egoskin.policies.policy import PolicySpec, load_policy
-from egoskin.robots.config import H1_2
+from egoskin.robots.builtin import H1_2
 from egoskin.runs.config import TrainConfig
 from egoskin.runs.run import Run
 from egoskin.runs.trainer import METRIC_KEYS

@@ -16,7 +16,7 @@ from egoskin.evaluation.feet import Feet
 from egoskin.evaluation.throw_set import Episodes, evaluate, play_throws
 from egoskin.make import EnvConfig
 from egoskin.rng import held_out
-from egoskin.robots.config import H1_2
+from egoskin.robots.builtin import H1_2
 from egoskin.robots.own import find_robot
 from egoskin.sensors.config import SensorConfig
 from owning import MODEL, write_robot

@@ -13,7 +13,7 @@ from egoskin.evaluation import operating_map as maps
 from egoskin.evaluation.operating_map import check_map, draw_map, operating_map
 from egoskin.evaluation.throw_set import play_throws, standard_task, summarize
 from egoskin.make import EnvConfig
-from egoskin.robots.config import H1_2
+from egoskin.robots.builtin import H1_2
 from egoskin.sensors import MASK_ALL, place_sensors
 from egoskin.sensors.config import SensorConfig
 from throwing import TASK

@@ -27,7 +27,7 @@ from egoskin.evaluation.approaches import (
     unit_vectors,
 )
 from egoskin.evaluation.visibility import Analysis, Cell, analyse, see_directions
-from egoskin.robots.config import H1_2
+from egoskin.robots.builtin import H1_2
 from egoskin.sensors import Field, Ray, Skin
 from egoskin.sensors.config import SensorConfig
 from egoskin.shapes import Sphere

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from calling import call
-from egoskin.robots.config import H1_2
+from egoskin.robots.builtin import H1_2
 
 trimesh = pytest.importorskip("trimesh")
 pytest.importorskip("embreex")

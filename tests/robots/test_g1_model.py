@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from egoskin.envs.throws import ThrowConfig, Thrower
-from egoskin.robots.config import G1, H1_2
+from egoskin.robots.builtin import G1, H1_2
 from egoskin.sensors import place_sensors
 
 LEG = ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")

@@ -13,7 +13,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from egoskin.robots.config import H1_2
+from egoskin.robots.builtin import H1_2
 from egoskin.robots.kinematics import (
     LinkKinematics,
     pad_rows,

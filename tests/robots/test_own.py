@@ -21,7 +21,8 @@ from egoskin.envs.physics import PhysicsConfig, Scene
 from egoskin.envs.physics.contract import GRAVITY, OBJECT_MASS
 from egoskin.envs.physics.model import build_scene
 from egoskin.make import EnvConfig
-from egoskin.robots.config import G1, H1_2, RobotConfig
+from egoskin.robots.builtin import G1, H1_2
+from egoskin.robots.config import RobotConfig
 from egoskin.robots.own import find_robot, portable, read_folder, robot_of
 from egoskin.storage.formats import read_sealed
 from egoskin.storage.serialization import from_plain, to_plain

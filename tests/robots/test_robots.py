@@ -16,7 +16,8 @@ from tensordict import TensorDict
 from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
 from egoskin.envs.physics import PhysicsConfig, Scene
 from egoskin.envs.physics.model import build_scene
-from egoskin.robots.config import H1_2, RobotConfig, read_robot
+from egoskin.robots.builtin import H1_2
+from egoskin.robots.config import RobotConfig, read_robot
 from egoskin.robots.kinematics import LinkKinematics
 from egoskin.robots.surface import default_frames, distance_to
 from egoskin.sensors import FieldSensor, place_sensors

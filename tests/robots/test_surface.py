@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from egoskin.robots.config import H1_2, Primitive
+from egoskin.robots.builtin import H1_2
+from egoskin.robots.config import Primitive
 from egoskin.robots.surface import area, distance_to, sample_surface
 
 

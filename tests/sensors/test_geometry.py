@@ -8,7 +8,7 @@ from functools import partial
 import pytest
 import torch
 
-from egoskin.robots.config import H1_2
+from egoskin.robots.builtin import H1_2
 from egoskin.sensors import FieldSensor, Ray, RaySensor
 from egoskin.shapes import Sphere
 from sensing import KEYS, SHAPES, measure

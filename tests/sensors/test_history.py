@@ -10,7 +10,7 @@ from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from egoskin.envs.dodgeball import DodgeballEnv
-from egoskin.robots.config import H1_2
+from egoskin.robots.builtin import H1_2
 from egoskin.sensors import FieldSensor, Localization, place_sensors
 from egoskin.sensors.history import History, KeepLast
 from throwing import TASK

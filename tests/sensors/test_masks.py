@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from egoskin.evaluation.throw_set import play_throws
 from egoskin.make import EnvConfig, make_env, make_worker_env
-from egoskin.robots.config import H1_2
+from egoskin.robots.builtin import H1_2
 from egoskin.sensors import (
     MASK_ALL,
     Field,

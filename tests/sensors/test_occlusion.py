@@ -12,7 +12,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 
-from egoskin.robots.config import H1_2
+from egoskin.robots.builtin import H1_2
 from egoskin.robots.kinematics import rotate_inverse
 from egoskin.sensors import FieldSensor, Ray, RaySensor, Skin, occlusion
 from egoskin.shapes import Box, Capsule, Ellipsoid, Sphere

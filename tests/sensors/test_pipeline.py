@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from torchrl.data import Composite, Unbounded
 
 from egoskin.make import EnvConfig, make_worker_env
-from egoskin.robots.config import H1_2
+from egoskin.robots.builtin import H1_2
 from egoskin.sensors import Field, Ray, SensorPipeline, Skin, place_sensors
 from egoskin.sensors.config import SensorConfig
 from egoskin.shapes import Sphere

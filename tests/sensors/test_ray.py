@@ -12,8 +12,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from egoskin.robots.builtin import H1_2
 from egoskin.robots.chains import build_chain
-from egoskin.robots.config import H1_2
 from egoskin.robots.kinematics import rotate
 from egoskin.sensors import BeamMinimum, Field, FieldSensor, Ray, RaySensor, Skin
 from egoskin.shapes import Box, Sphere, shape_of

@@ -17,7 +17,7 @@ from torchrl.envs import Compose, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from egoskin.envs.dodgeball import DodgeballEnv
-from egoskin.robots.config import H1_2
+from egoskin.robots.builtin import H1_2
 from egoskin.sensors.tactile import (
     ContactFree,
     ContactPenalty,

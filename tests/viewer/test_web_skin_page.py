@@ -14,7 +14,8 @@ import pytest
 pytest.importorskip("viser")
 
 from calling import fail
-from egoskin.robots.config import H1_2, read_robot
+from egoskin.robots.builtin import H1_2
+from egoskin.robots.config import read_robot
 from egoskin.viewer.web import skin_page
 from egoskin.viewer.web.skin_page import SkinPage, colour_directions, group_joints
 

@@ -15,7 +15,7 @@ from egoskin.bounds import COUNT, check_bounds
 from egoskin.commands.bench.report import Row, median_row, show
 from egoskin.make import EnvConfig, make_worker_env
 from egoskin.parallel import keep_freed_memory
-from egoskin.robots.config import H1_2
+from egoskin.robots.builtin import H1_2
 from egoskin.sensors import FieldSensor, Proximity, RaySensor, Skin
 from egoskin.shapes import Sphere
 

@@ -14,7 +14,7 @@ from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from egoskin.envs.dodgeball import DodgeballEnv
-from egoskin.robots.config import H1_2
+from egoskin.robots.builtin import H1_2
 from egoskin.sensors import FieldSensor, Proximity, place_sensors
 from egoskin.sensors.imperfections.corruption import Corruption, Moment, corrupt
 from egoskin.sensors.imperfections.models import (

@@ -28,8 +28,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from egoskin.parallel import start_server
+from egoskin.robots.builtin import H1_2
 from egoskin.robots.chains import build_chain
-from egoskin.robots.config import H1_2
 from egoskin.sensors import Field, FieldSensor, RaySensor, Skin
 from egoskin.sensors.kernels import compilation
 from egoskin.sensors.kernels.compilation import can_compile, load_library

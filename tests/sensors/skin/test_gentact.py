@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from egoskin.robots.config import H1_2
+from egoskin.robots.builtin import H1_2
 from egoskin.sensors import Field, Skin
 from egoskin.sensors.skin.gentact import load_gentact, save_gentact
 from egoskin.sensors.skin.gentact.description import Xml

@@ -10,7 +10,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from egoskin.robots.config import H1_2, RobotConfig
+from egoskin.robots.builtin import H1_2
+from egoskin.robots.config import RobotConfig
 from egoskin.robots.surface import distance_to
 from egoskin.sensors.skin.mesh_surface import (
     mesh_surface,

@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from egoskin.robots.config import H1_2, RobotConfig
+from egoskin.robots.builtin import H1_2
+from egoskin.robots.config import RobotConfig
 from egoskin.robots.surface import distance_to, sample_surface
 from egoskin.sensors import Skin
 from egoskin.sensors.skin import placement

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from egoskin.robots.config import H1_2
+from egoskin.robots.builtin import H1_2
 from egoskin.sensors import Field, Ray, Skin
 from egoskin.sensors.config import SkinConfig
 from egoskin.sensors.skin.gentact import save_gentact
