@@ -104,7 +104,8 @@ class Plan:
     """Environment steps per second and core; None: measured now, in half a minute for
     each choice of cores per run."""
     visibility: bool = False
-    """Also report what each coverage and range sees (takes minutes, no training)."""
+    """Also report what each coverage and range sees, without training; stored with the
+    study, it becomes part of the report."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for invalid values."""

@@ -98,11 +98,19 @@ def _plain(axes: Axes) -> None:
     axes.grid(axis="y", linewidth=0.4, alpha=0.5)
 
 
-def success_by_range(manifest: Manifest, table: Table) -> Figure | None:
+def success_by_range(
+    manifest: Manifest, table: Table, seen: Sequence[Mapping[str, Any]] = ()
+) -> Figure | None:
     """Draw the paper's figure, success against range; return None without its cells.
 
     One line per signal and one panel per geometry: interquartile mean and range over
-    seeds, and each seed as a small dot.
+    seeds, and each seed as a small dot. Below it: the warning time.
+
+    Args:
+        manifest: The study.
+        table: Success at 3 s [%].
+        seen: Cells of a report of `egoskin.evaluation.visibility`; empty: without the
+            warning time.
     """
     # The axis is logarithmic and finite.
     grid = {
@@ -115,8 +123,17 @@ def success_by_range(manifest: Manifest, table: Table) -> Figure | None:
     ]
     if not names:
         return None
-    figure = Figure(figsize=(1.2 + 3.5 * len(names), 4.0), layout="constrained")
-    panels = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
+    below = [_warnings(name, seen) for name in names]
+    height, rows = (6.0, (5, 3)) if any(below) else (4.0, (1,))
+    figure = Figure(figsize=(1.2 + 3.5 * len(names), height), layout="constrained")
+    panels, *lower = figure.subplots(
+        len(rows),
+        len(names),
+        sharex="col",
+        sharey="row",
+        squeeze=False,
+        height_ratios=rows,
+    )
     for axes, name in zip(panels, names, strict=True):
         cells = _geometry(name, grid)
         for signal, (colour, mark) in _STYLES.items():
@@ -138,15 +155,43 @@ def success_by_range(manifest: Manifest, table: Table) -> Figure | None:
                 label = "blind" if coverage == "none" else coverage
                 axes.axhline(own.iqm, color=colour, linestyle="--", label=label)
                 axes.axhspan(own.low, own.high, color=colour, alpha=0.15, linewidth=0)
-        ticks = sorted({p.range for p in grid.values()})
+        ticks = sorted({p.range for p in grid.values()}.union(*below))
         axes.set_xscale("log")
         axes.set_xticks(ticks, [f"{t:g}" for t in ticks], minor=False)
         axes.xaxis.minorticks_off()
-        axes.set(xlabel="detection range [m]", title=name, ylim=(0, 100))
+        axes.set(title=name, ylim=(0, 100))
         _plain(axes)
     panels[0].set_ylabel("success: untouched for 3 s [%]")
+    for row in lower:
+        for axes, times in zip(row, below, strict=True):
+            _draw_warnings(axes, times)
+        row[0].set_ylabel("warning time [ms]")
+    for axes in (lower or [panels])[-1]:
+        axes.set_xlabel("detection range [m]")
     _legend_above(figure, panels)
     return figure
+
+
+def _warnings(
+    geometry: str, seen: Sequence[Mapping[str, Any]]
+) -> dict[float, tuple[float, float, float]]:
+    """Return 5 %, 50 % and 95 % of the warning times of a geometry [ms], by range."""
+    (coverage,) = {c for (c, _), name in _GEOMETRIES.items() if name == geometry}
+    return {
+        row["range"]: tuple(1e3 * row["warning"][k] for k in ("5%", "median", "95%"))
+        for row in sorted(seen, key=lambda row: row["range"])
+        if row["coverage"] == coverage and row["warning"]["hits"]
+    }
+
+
+def _draw_warnings(
+    axes: Axes, times: Mapping[float, tuple[float, float, float]]
+) -> None:
+    low, median, high = np.array(list(times.values())).reshape(-1, 3).T
+    axes.plot(list(times), median, ".-", color=_BLIND)
+    axes.fill_between(list(times), low, high, color=_BLIND, alpha=0.18, linewidth=0)
+    axes.set_ylim(bottom=0)
+    _plain(axes)
 
 
 def _legend_above(figure: Figure, panels: Iterable[Axes]) -> None:

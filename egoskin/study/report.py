@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
+from typing import Any
 
 from matplotlib.figure import Figure
 
@@ -67,14 +68,15 @@ def write_report(folder: StudyFolder, out: Path) -> None:
         concerned = [j for j in judged if any(c.effect for c in j.claims)]
     else:
         found = differences(names, values["success_3s"])
-    pictures = _pictures(manifest, results, values["success_3s"], concerned)
+    seen = _seen(folder)
+    pictures = _pictures(manifest, results, values["success_3s"], concerned, seen)
     for name, (figure, _) in pictures.items():
         save(figure, out, name)
     shown = {
         name: f"![{caption}]({name}.png)\n\n*{caption}*"
         for name, (_, caption) in pictures.items()
     }
-    blocks = _blocks(folder, manifest, results, values, concerned, found, shown)
+    blocks = _blocks(folder, manifest, results, values, concerned, found, shown, seen)
     text = "\n\n".join(blocks) + "\n"
     contents = {
         "runs.csv": runs_csv(manifest, results),
@@ -90,13 +92,18 @@ def _pictures(
     results: Sequence[Result],
     success: Table,
     judged: Sequence[Judged],
+    seen: Sequence[Mapping[str, Any]],
 ) -> dict[str, tuple[Figure, str]]:
     """Return the figures for which there are data, with their captions."""
+    warnings = (
+        "Below: time from the first detection of a ball to its contact with a standing "
+        "robot, median and 5 to 95 %. "
+    )
     drawn = {
         "success-by-range": (
-            success_by_range(manifest, success),
+            success_by_range(manifest, success, seen),
             "Success against range: interquartile mean and range over seeds; each dot "
-            "is a seed. Infinite ranges are left out.",
+            f"is a seed. {warnings if seen else ''}Infinite ranges are left out.",
         ),
         "findings": (
             forest(judged) if judged else None,
@@ -131,6 +138,7 @@ def _blocks(
     judged: Sequence[Judged],
     found: Sequence[Difference],
     shown: Mapping[str, str],
+    seen: Sequence[Mapping[str, Any]],
 ) -> Iterator[str]:
     """Yield the parts of the report, in Markdown."""
     plan, total = manifest.evaluation, len(manifest.runs)
@@ -195,10 +203,9 @@ def _blocks(
         )
     else:
         yield "Unknown: no cell has two seeds that differ."
-    seen = folder.path / "visibility.json"
-    if seen.is_file():
+    if seen:
         yield "## What the skins see, without training"
-        yield _seen_rows(read_json(seen))
+        yield _seen_rows(seen)
     yield "## Missing runs"
     missing = [s for s in folder.status(manifest) if s.state != "done"]
     yield ", ".join(map(_missing, missing)) or "None: all runs are done."
@@ -350,9 +357,15 @@ def _spread(values: Sequence[float]) -> str:
     return f"{own.iqm:.1f} ({own.low:.1f} to {own.high:.1f})"
 
 
-def _seen_rows(seen: dict) -> str:
+def _seen(folder: StudyFolder) -> list[dict[str, Any]]:
+    """Return the cells of the analysis of visibility, none if there is none."""
+    path = folder.path / "visibility.json"
+    return read_json(path)["cells"] if path.is_file() else []
+
+
+def _seen_rows(seen: Sequence[Mapping[str, Any]]) -> str:
     rows = []
-    for row in seen["cells"]:
+    for row in seen:
         share, times = warning_texts(row)
         rows.append((f"{row['coverage']} {row['range']:g} m", share, " / ".join(times)))
     head = ("cell", "hits seen before contact", "warning [ms], 5 / 50 / 95 %")

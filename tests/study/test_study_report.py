@@ -266,6 +266,29 @@ def test_an_infinite_range_is_left_out_of_the_figure_over_ranges(manifest: Manif
     assert success_by_range(mine, {names[1]: {0: 60.0}}) is None
 
 
+def test_the_warning_time_is_drawn_below_the_success_at_its_range(manifest: Manifest):
+    warning = {"hits": 9, "5%": 0.06, "median": 0.09, "95%": 0.13}
+    longer = {**warning, "median": 0.18, "95%": 0.25}
+    seen = [
+        {"coverage": "field", "range": 1.0, "warning": longer},
+        {"coverage": "field", "range": 0.5, "warning": warning},
+        {"coverage": "field", "range": 0.2, "warning": {"hits": 0}},
+        {"coverage": "ray", "range": 2.0, "warning": warning},
+    ]
+    success = {"field-proximity-1m": {0: 60.0}}
+    figure = success_by_range(manifest, success, seen)
+    assert figure is not None
+    above, below = figure.axes
+    (line,) = below.lines
+    np.testing.assert_allclose(line.get_xdata(), (0.5, 1.0))
+    np.testing.assert_allclose(line.get_ydata(), (90.0, 180.0))
+    assert [t.get_text() for t in below.get_xticklabels()] == ["0.5", "1"]
+    assert above.get_xlim() == below.get_xlim()
+    figure = success_by_range(manifest, success, seen[-1:])
+    assert figure is not None
+    assert len(figure.axes) == 1
+
+
 def test_a_legend_fits_into_a_figure_of_one_panel():
     coverages = ({"sensor.coverage": "none"}, {"sensor.coverage": "oracle"})
     signals = ("localization", "proximity", "binary")
