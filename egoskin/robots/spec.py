@@ -16,7 +16,12 @@ from egoskin.robots.chains import body_id, body_name, joint_name
 from egoskin.storage.files import read_regular
 
 # Settings of MuJoCo's compiler that change the masses of all bodies of a model.
-_MASS_SETTINGS = ("settotalmass", "inertiafromgeom", "inertiagrouprange")
+_MASS_SETTINGS = (
+    *("settotalmass", "inertiafromgeom", "inertiagrouprange"),
+    *("boundmass", "boundinertia"),
+)
+# Lower bound of masses and inertias in a URDF [kg, kg m^2]; every ball is above it.
+_LEAST = 1e-6
 
 
 def load_spec(source: Path | str, what: str) -> mujoco.MjSpec:
@@ -92,12 +97,13 @@ def _unreadable(what: str, error: ValueError) -> ValueError:
 
 
 def _prepare_urdf(spec: mujoco.MjSpec) -> None:
+    """Leave out meshes, keep links on fixed joints, and permit links without mass."""
     meshes = [g for g in spec.geoms if g.type == mujoco.mjtGeom.mjGEOM_MESH]
     for element in (*meshes, *spec.meshes):
         spec.delete(element)
     spec.compiler.fusestatic = False
     # A URDF may leave out masses, but MuJoCo requires them for moving bodies.
-    spec.compiler.boundmass = spec.compiler.boundinertia = 1e-6
+    spec.compiler.boundmass = spec.compiler.boundinertia = _LEAST
     spec.compiler.balanceinertia = True
 
 
@@ -120,10 +126,11 @@ def _name_all(spec: mujoco.MjSpec) -> None:
 def _fix_masses(spec: mujoco.MjSpec) -> None:
     """Replace settings that would also change the masses of balls by their effect."""
     own, plain = spec.compiler, mujoco.MjSpec().compiler
-    if all(
-        np.array_equal(getattr(own, name), getattr(plain, name))
-        for name in _MASS_SETTINGS
-    ):
+    values, usual = (
+        np.hstack([np.asarray(getattr(each, name), float) for name in _MASS_SETTINGS])
+        for each in (own, plain)
+    )
+    if np.abs(values - usual).max() <= _LEAST:
         return
     model = spec.compile()
     for body in spec.bodies:

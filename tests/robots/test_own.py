@@ -517,7 +517,13 @@ def test_the_options_of_a_robots_file_are_not_those_of_the_scene(tmp_path):
 @pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass'")
 @pytest.mark.parametrize(
     "setting",
-    ['settotalmass="50"', 'inertiafromgeom="true"', 'inertiagrouprange="2 3"'],
+    [
+        'settotalmass="50"',
+        'inertiafromgeom="true"',
+        'inertiagrouprange="2 3"',
+        'boundmass="12"',
+        'boundinertia="0.3"',
+    ],
 )
 def test_settings_that_change_masses_act_on_the_robot_alone(setting, tmp_path):
     heavy = '<inertial pos="0 0 0.1" mass="30" fullinertia="1 1 1 0.1 0 0"/>'
@@ -536,4 +542,7 @@ def test_settings_that_change_masses_act_on_the_robot_alone(setting, tmp_path):
                 # An MJCF has six digits.
                 pair = getattr(own, value), getattr(expected, value)
                 np.testing.assert_allclose(*pair, rtol=1e-5)
-        assert scene.body("object_0").mass == OBJECT_MASS
+        ball = scene.body("object_0")
+        assert ball.mass == OBJECT_MASS
+        radius = scene.geom("object_0").size[0]
+        np.testing.assert_allclose(ball.inertia, 0.4 * OBJECT_MASS * radius**2)
