@@ -51,8 +51,30 @@ _OF_THE_BASE = (
     "env.task.throws",
 )
 
-Name = Annotated[str, tyro.conf.Positional]
+Name = Annotated[str | None, tyro.conf.Positional]
 Folder = Annotated[Path, tyro.conf.Positional]
+
+
+def requested(name: str | None, folder: Path | None) -> Manifest:
+    """Return the manifest that a study and a folder make together; nothing is written.
+
+    Args:
+        name: A shipped study or a file; None: the study of the folder.
+        folder: A folder, new or with a study; None: none.
+
+    Raises:
+        ValueError: If there is no such study or no such folder, or the study would
+            change the folder's.
+    """
+    if folder is None:
+        if name is None:
+            raise ValueError("a study or the --dir of an existing one is required")
+        return find_study(name)
+    check_parent(folder)
+    store = StudyFolder(folder)
+    if name is None:
+        return store.manifest()
+    return store.extended(find_study(name))
 
 
 def find_study(name: str) -> Manifest:
@@ -96,8 +118,8 @@ def check_parent(folder: Path) -> None:
 class Plan:
     """Print the runs and cost of a study; write or extend its manifest."""
 
-    name: Name
-    """Study: paper, paper-1000, findings, smoke, or a JSON file."""
+    name: Name = None
+    """Study: paper, paper-1000, findings, smoke, or a JSON file; None: the folder's."""
     dir: Path | None = None
     """Folder of a new study, or one to add cells and seeds to; None: only print."""
     steps_per_s: Annotated[float | None, POSITIVE] = None
@@ -113,11 +135,9 @@ class Plan:
 
     def execute(self) -> None:
         """Print the plan, and write the manifest."""
+        manifest = requested(self.name, self.dir)
         if self.dir is not None:
-            check_parent(self.dir)
-        manifest = find_study(self.name)
-        if self.dir is not None:
-            manifest = StudyFolder(self.dir).plan(manifest)
+            StudyFolder(self.dir).plan(manifest)
         describe(manifest)
         per_s, source, cores = self.steps_per_s, "as given", available_cores()
         if per_s is None:
@@ -203,10 +223,13 @@ def what_is_seen(manifest: Manifest) -> dict[str, Any]:
 class Run:
     """Run or resume a study; several runners may share its folder."""
 
-    name: Annotated[str | None, tyro.conf.Positional] = None
+    name: Name = None
     """Study to begin or add to; None: the study of the folder's manifest."""
     dir: Path
     """Folder of the study."""
+    only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="RUN ...")] = ()
+    """Names of the runs to execute, or patterns such as 'field-*-seed0'; empty: all
+    runs."""
     on: Literal["local", "ray"] = "local"
     """Where to run: this machine, or an existing Ray cluster (extra `ray`)."""
     ray_address: str = "auto"
@@ -232,32 +255,30 @@ class Run:
 
     def execute(self) -> None:
         """Execute the runs that are left."""
-        check_parent(self.dir)
-        folder = StudyFolder(self.dir)
-        if self.name is not None:
-            folder.plan(find_study(self.name))
-        manifest = folder.manifest()
+        manifest, folder = requested(self.name, self.dir), StudyFolder(self.dir)
+        runs = manifest.matching(self.only or ("*",))
+        folder.plan(manifest)
         if self.again:
             folder.forget_failures()
         kind = self._where()
-        runner = kind(
+        status = kind(
             folder,
+            runs=runs,
             parallel=self.parallel,
-            cores_per_run=self.cores_per_run or self._cores_per_run(folder, manifest),
+            cores_per_run=self.cores_per_run
+            or self._cores_per_run(manifest, folder.status(runs)),
             tries=self.tries,
             nice=self.nice,
             show=show,
-        )
-        status = runner.run()
+        ).run()
         print("\r\x1b[K" * sys.stdout.isatty(), end="")
-        print_status(folder, manifest, status)
+        print_status(folder, manifest, folder.status(manifest.runs))
         if any(each.state != "done" for each in status):
             raise SystemExit(1)
         print(f"done; now: egoskin study report {self.dir}")
 
-    def _cores_per_run(self, folder: StudyFolder, manifest: Manifest) -> int:
+    def _cores_per_run(self, manifest: Manifest, status: list[RunStatus]) -> int:
         """Return the number of cores per run with the highest total throughput."""
-        status = folder.status(manifest)
         left = [each for each in status if each.state != "done"]
         frames = sum(each.run.end - each.frames for each in left)
         if self.on != "local" or self.parallel or frames < _WORTH_MEASURING:
@@ -288,7 +309,7 @@ class Status:
         """Print a table by cell and seed."""
         folder = StudyFolder(self.dir)
         manifest = folder.manifest()
-        print_status(folder, manifest, folder.status(manifest))
+        print_status(folder, manifest, folder.status(manifest.runs))
 
 
 def print_status(

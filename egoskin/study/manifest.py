@@ -12,9 +12,10 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import fnmatch
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -220,6 +221,22 @@ class Manifest:
         if name not in named:
             raise ValueError(f"no run {name!r}{did_you_mean(name, named)}")
         return named[name]
+
+    def matching(self, patterns: Sequence[str]) -> tuple[PlannedRun, ...]:
+        """Return the runs whose names match any of some shell patterns.
+
+        Raises:
+            ValueError: If a pattern matches no run; the text names the closest.
+        """
+        names = [run.name for run in self.runs]
+        for pattern in patterns:
+            if not fnmatch.filter(names, pattern):
+                raise ValueError(f"no run {pattern!r}{did_you_mean(pattern, names)}")
+        return tuple(
+            run
+            for run in self.runs
+            if any(fnmatch.fnmatchcase(run.name, pattern) for pattern in patterns)
+        )
 
     def overrides(self, cell: Cell) -> dict[str, Any]:
         """Return the values in which a cell differs from the base, by field."""

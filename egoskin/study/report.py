@@ -207,7 +207,7 @@ def _blocks(
         yield "## What the skins see, without training"
         yield _seen_rows(seen)
     yield "## Missing runs"
-    missing = [s for s in folder.status(manifest) if s.state != "done"]
+    missing = [s for s in folder.status(manifest.runs) if s.state != "done"]
     yield ", ".join(map(_missing, missing)) or "None: all runs are done."
     yield "## The runs"
     yield (

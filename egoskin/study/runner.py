@@ -15,7 +15,7 @@ import subprocess
 import sys
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -83,6 +83,7 @@ class Runner(ABC):
 
     Args:
         folder: The study.
+        runs: Runs to execute; None: all runs of the study.
         parallel: Maximum number of parallel runs; None: as many as there are cores for.
         tries: Maximum number of attempts for each run.
         nice: Niceness of the runs.
@@ -98,14 +99,16 @@ class Runner(ABC):
         self,
         folder: StudyFolder,
         *,
+        runs: Sequence[PlannedRun] | None = None,
         parallel: int | None = None,
         tries: int = 3,
         nice: int = 5,
         cores_per_run: int = 1,
         show: Callable[[str, bool], None] = lambda text, stays: None,
     ) -> None:
-        self._folder, self._manifest = folder, folder.manifest()
-        for cell in self._manifest.cells:
+        self._folder = folder
+        self._runs = folder.manifest().runs if runs is None else runs
+        for cell in (run.cell for run in self._runs):
             if cell.config.num_envs % cores_per_run:
                 raise ValueError(
                     f"--cores-per-run {cores_per_run} must divide num_envs of every "
@@ -148,11 +151,11 @@ class Runner(ABC):
                 if self._reap() or time.monotonic() - looked > _LOOK:
                     open_runs = self._open_runs()
                     if not (open_runs or self._running()):
-                        return self._folder.status(self._manifest)
+                        return self._folder.status(self._runs)
                     self._start(open_runs)
                     looked = time.monotonic()
                 if time.monotonic() - shown > interval:
-                    status = self._folder.status(self._manifest)
+                    status = self._folder.status(self._runs)
                     self._show(str(Progress.of(status, self._tries)), False)
                     shown = time.monotonic()
                 time.sleep(_POLL)
@@ -162,7 +165,7 @@ class Runner(ABC):
     def _open_runs(self) -> list[PlannedRun]:
         """Return the runs that are left to do, except this runner's."""
         result = []
-        for run in self._manifest.runs:
+        for run in self._runs:
             if run.name in self._finished or run.name in self._running():
                 continue
             if self._folder.is_finished(run.name):

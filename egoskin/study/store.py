@@ -21,7 +21,7 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -144,19 +144,26 @@ class StudyFolder:
         """
         return Manifest.load(self.manifest_path)
 
+    def extended(self, manifest: Manifest) -> Manifest:
+        """Return a manifest with what the existing one, if any, has in addition.
+
+        Raises:
+            ValueError: If it would change the existing manifest.
+        """
+        if not self.manifest_path.exists():
+            return manifest
+        return self.manifest().extended(manifest)
+
     def plan(self, manifest: Manifest) -> Manifest:
         """Write a manifest or extend the existing one; return the result.
 
         Raises:
             ValueError: If it would change the existing manifest.
         """
-        if self.manifest_path.exists():
-            before = self.manifest()
-            manifest = before.extended(manifest)
-            if manifest == before:
-                return manifest
-        self.path.mkdir(parents=True, exist_ok=True)
-        manifest.save(self.manifest_path)
+        manifest = self.extended(manifest)
+        if not self.manifest_path.exists() or manifest != self.manifest():
+            self.path.mkdir(parents=True, exist_ok=True)
+            manifest.save(self.manifest_path)
         return manifest
 
     # --- a run ----------------------------------------------------------------------
@@ -339,9 +346,9 @@ class StudyFolder:
 
     # --- progress -------------------------------------------------------------
 
-    def status(self, manifest: Manifest) -> list[RunStatus]:
-        """Return the status of each run, in the manifest's order."""
-        return [self._status(run) for run in manifest.runs]
+    def status(self, runs: Iterable[PlannedRun]) -> list[RunStatus]:
+        """Return the status of each of some runs."""
+        return [self._status(run) for run in runs]
 
     def _status(self, run: PlannedRun) -> RunStatus:
         if self.is_finished(run.name):

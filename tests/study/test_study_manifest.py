@@ -85,6 +85,17 @@ def test_every_cell_is_run_with_a_seed_before_any_with_the_next(resolved):
 # --- cells --------------------------------------------------------------------------
 
 
+def test_runs_are_chosen_by_patterns_in_the_order_of_the_study():
+    manifest = changed()
+    names = [run.name for run in manifest.runs]
+    assert [r.name for r in manifest.matching(["blind-*", "*-seed0"])] == [
+        name for name in names if name != "field-proximity-1m-seed1"
+    ]
+    assert manifest.matching(["*"]) == manifest.runs
+    with pytest.raises(ValueError, match="no run 'blind-sed1', did you mean 'blind-s"):
+        manifest.matching(["*", "blind-sed1"])
+
+
 def test_a_cell_is_named_by_what_differs():
     manifest = changed(
         cells=(

@@ -62,7 +62,7 @@ def on(cluster: Any) -> tuple[str, ...]:
 
 def claimed_runs(folder: StudyFolder) -> list[str]:
     """Return the names of the runs that a process has claimed."""
-    status = folder.status(folder.manifest())
+    status = folder.status(folder.manifest().runs)
     return [s.run.name for s in status if s.state == "running"]
 
 
@@ -73,7 +73,7 @@ def kept(folder: StudyFolder) -> dict[str, int]:
     """
     assert not jobs(folder)
     stopped = {}
-    for status in folder.status(folder.manifest()):
+    for status in folder.status(folder.manifest().runs):
         path = folder.run_path(status.run.name)
         assert status.state in ("missing", "stopped", "done")
         assert not is_locked(path / "lock")

@@ -117,7 +117,7 @@ def test_a_run_that_was_trained_is_only_judged(folder: StudyFolder):
     expected = table(folder)
     shutil.rmtree(folder.result_path(NAME))
     before = files(folder.run_path(NAME))
-    assert folder.status(folder.manifest())[0].state == "stopped"
+    assert folder.status(folder.manifest().runs)[0].state == "stopped"
     assert work(folder, NAME, Never()) == 0
     assert files(folder.run_path(NAME)) == before
     assert table(folder) == expected
@@ -143,7 +143,7 @@ def test_a_stop_leaves_a_checkpoint_and_no_result(tmp_path: Path, capsys):
     assert work(folder, NAME, Never(requested=True), cores=2) == STOPPED
     assert (folder.run_path(NAME) / "checkpoint.safetensors").is_file()
     assert not folder.is_finished(NAME)
-    status = folder.status(folder.manifest())
+    status = folder.status(folder.manifest().runs)
     assert [s.state for s in status] == ["stopped"]
     assert str(Progress.of(status)).startswith("1 stopped; ")
     print_status(folder, folder.manifest(), status)
@@ -154,7 +154,7 @@ def test_a_run_that_somebody_works_on_is_left_alone(folder: StudyFolder):
     shutil.rmtree(folder.result_path(NAME))
     with claimed(folder.claims, NAME) as mine:
         assert mine
-        assert [s.state for s in folder.status(folder.manifest())] == ["running"]
+        assert [s.state for s in folder.status(folder.manifest().runs)] == ["running"]
         assert work(folder, NAME, Never()) == CLAIMED
     assert not folder.is_finished(NAME)
 
@@ -178,7 +178,7 @@ def test_a_run_whose_claim_is_lost_has_not_failed(
 def test_a_run_that_ppo_trains_is_left_to_it(folder: StudyFolder):
     shutil.rmtree(folder.result_path(NAME))
     with Run.open(folder.run_path(NAME)).locked():
-        assert [s.state for s in folder.status(folder.manifest())] == ["running"]
+        assert [s.state for s in folder.status(folder.manifest().runs)] == ["running"]
         assert work(folder, NAME, Never()) == CLAIMED
     assert work(folder, NAME, Never()) == 0
 
@@ -340,7 +340,7 @@ def test_status_tells_failures_and_what_is_left(folder: StudyFolder):
     for tries in (1, 2):
         failure = folder.note_failure("blind-seed1", folder.last_words("blind-seed1"))
         assert failure == Failure(tries=tries, error="KeyError: 'x'")
-    status = folder.status(manifest)
+    status = folder.status(manifest.runs)
     assert [s.state for s in status] == ["done", "failed", "missing"]
     assert status[1].failure == failure
     progress = Progress.of(status)
@@ -352,7 +352,7 @@ def test_status_tells_failures_and_what_is_left(folder: StudyFolder):
     assert Progress.of([*status[:2], running]).left_s == pytest.approx(3)
     assert Progress.of([*status[:2], running], tries=2).left_s == pytest.approx(1)
     folder.forget_failures()
-    assert folder.status(manifest)[1].state == "missing"
+    assert folder.status(manifest.runs)[1].state == "missing"
 
 
 def test_the_last_words_of_a_worker_have_its_reason(folder: StudyFolder):
@@ -381,10 +381,10 @@ def test_status_says_where_a_run_is_running(folder: StudyFolder, capsys):
     shutil.rmtree(folder.result_path(NAME))
     manifest = folder.manifest()
     with claimed(folder.claims, NAME):
-        print_status(folder, manifest, folder.status(manifest))
+        print_status(folder, manifest, folder.status(manifest.runs))
     where = f"{NAME}: running on {socket.gethostname()}, process {os.getpid()}\n"
     assert where in capsys.readouterr().out
-    print_status(folder, manifest, folder.status(manifest))
+    print_status(folder, manifest, folder.status(manifest.runs))
     assert "running on" not in capsys.readouterr().out
 
 
@@ -469,6 +469,16 @@ def test_cores_that_do_not_divide_the_agents_are_refused_before_a_run_starts(
     text = "--cores-per-run 3 must divide num_envs of every cell; that of blind is 16"
     with pytest.raises(ValueError, match=text):
         LocalRunner(folder, cores_per_run=3)
+
+
+def test_only_the_chosen_runs_are_executed(folder: StudyFolder):
+    manifest = folder.plan(resolve(dataclasses.replace(SHORT, seeds=(0, 1, 2))))
+    # The run with seed 0 is finished; the others are not begun.
+    runs = manifest.matching(["*-seed0"])
+    (status,) = Asked(folder, runs=runs).run()
+    assert (status.run.name, status.state) == (NAME, "done")
+    with pytest.raises(InterruptedError, match="blind-seed2"):
+        Asked(folder, runs=manifest.matching(["*-seed[02]"])).run()
 
 
 class Waiting(Asked):
@@ -573,7 +583,7 @@ def undisturbed(tiny: Manifest, tmp_path_factory) -> list[dict[str, str]]:
 
 def in_the_middle(folder: StudyFolder) -> list[str]:
     """Return the runs that are between a quarter and the end of their frames."""
-    status = folder.status(folder.manifest())
+    status = folder.status(folder.manifest().runs)
     return [s.run.name for s in status if 3 * BATCH < s.frames < s.run.end]
 
 
@@ -609,7 +619,7 @@ def test_a_runner_that_is_killed_ends_its_runs_and_is_started_again(
     runner.end()
     # Orphaned jobs notice it and stop with a checkpoint.
     wait_for(lambda: not jobs(study))
-    before = study.status(study.manifest())
+    before = study.status(study.manifest().runs)
     assert any(s.state == "stopped" and s.frames for s in before)
     again = start(study.path)
     assert again.end() == 0, again.text()
@@ -656,7 +666,7 @@ def test_ctrl_c_ends_all_runs_with_checkpoints(study, start, undisturbed):
     assert runner.end() == 130
     assert not jobs(study)
     assert "Traceback" not in runner.text()
-    for status in study.status(study.manifest()):
+    for status in study.status(study.manifest().runs):
         if status.state == "stopped" and status.frames:
             _, header = Run.open(study.run_path(status.run.name)).load_checkpoint()
             assert header["frames"] == status.frames
@@ -695,6 +705,9 @@ def test_the_command_plans_tells_and_reports(finished: Path, tmp_path: Path):
     planned = succeed("study", "plan", mine, *args)
     assert "2 runs, 0.0 M frames" in planned
     assert "not the default: num_envs = 16" in planned
+    assert succeed("study", "plan", *args) == planned
+    ended = succeed("study", "run", "--dir", folder, "--only", "*-seed0")
+    assert "1 done, 1 missing" in ended
     status = succeed("study", "status", folder)
     assert status.splitlines()[1].split()[:2] == ["blind", "done"]
     succeed("study", "report", folder)
@@ -708,7 +721,12 @@ def test_the_command_plans_tells_and_reports(finished: Path, tmp_path: Path):
     ("args", "text"),
     [
         (("plan", "papr"), "no study 'papr' (valid: paper"),
+        (("plan",), "a study or the --dir of an existing one is required"),
         (("run", "smoke", "--dir", "{0}/no/where"), "there is no folder {0}/no"),
+        (
+            ("run", "smoke", "--dir", "{0}/new", "--only", "blind-seed9"),
+            "no run 'blind",
+        ),
         (("plan", "smoke", "--dir", "{0}/no/where"), "there is no folder {0}/no"),
         (("status", "{0}"), "is not a study folder"),
         (("run", "--dir", "{0}"), "is not a study folder"),
