@@ -46,7 +46,8 @@ class SearchConfig:
     samples: Annotated[int, Interval(ge=4)] = 128
     """Plans per throw and iteration."""
     iterations: Annotated[int, COUNT] = 20
-    """Iterations of the search."""
+    """Maximum number of iterations; the search ends when all balls are avoided and the
+    robot still stands."""
     stand_s: Annotated[float, POSITIVE] = 1.25
     """Time simulated from the start of a plan [s]: longer than the ball takes to pass;
     the robot must not fall."""
@@ -199,6 +200,8 @@ def find_upper_bound(
         spread.clamp_(min=_LEAST_SPREAD)
         if on_iteration is not None:
             on_iteration(iteration, best)
+        if best.stood.all():
+            break
     thrower = _task(env).thrower
     zero = torch.zeros_like(start.throw)
     height, _ = thrower.at_standing_robot(

@@ -134,6 +134,21 @@ def test_the_step_of_a_hit_is_not_survived(policy: Policy):
     assert not _play(env, policy, start, empty, steps + 1)[0][row]
 
 
+def test_a_search_ends_when_nothing_is_left_to_improve(policy: Policy):
+    iterations = []
+    bound = find_upper_bound(
+        policy,
+        task(policy),
+        # After a control step no ball has arrived yet.
+        SearchConfig(samples=4, iterations=3, stand_s=1 / 60),
+        throw_set=0,
+        throws=2,
+        reach=2.0,
+        on_iteration=lambda iteration, best: iterations.append(iteration),
+    )
+    assert (iterations, bound.best.stood.tolist()) == ([1], [True, True])
+
+
 @pytest.mark.slow
 def test_an_age_limit_is_no_fall(policy: Policy, bound: UpperBound):
     # Every plan crosses it: the balls come into reach after about 0.35 to 1 s.
