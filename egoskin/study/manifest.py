@@ -229,14 +229,13 @@ class Manifest:
             ValueError: If a pattern matches no run; the text names the closest.
         """
         names = [run.name for run in self.runs]
+        chosen = set()
         for pattern in patterns:
-            if not fnmatch.filter(names, pattern):
+            found = fnmatch.filter(names, pattern)
+            if not found:
                 raise ValueError(f"no run {pattern!r}{did_you_mean(pattern, names)}")
-        return tuple(
-            run
-            for run in self.runs
-            if any(fnmatch.fnmatchcase(run.name, pattern) for pattern in patterns)
-        )
+            chosen.update(found)
+        return tuple(run for run in self.runs if run.name in chosen)
 
     def overrides(self, cell: Cell) -> dict[str, Any]:
         """Return the values in which a cell differs from the base, by field."""
