@@ -171,6 +171,12 @@ def uniform(
     return (bits >> 8).to(torch.float32) * 2.0**-24
 
 
+def between(bounds: tuple[float, float], u: Tensor) -> Tensor:
+    """Return numbers in an interval from uniform numbers in [0, 1)."""
+    low, high = bounds
+    return low + (high - low) * u
+
+
 def halfwords(words: Tensor) -> Tensor:
     """Return random words as twice as many 16-bit numbers.
 

@@ -1,4 +1,4 @@
-"""Functions with identical rounding on any machine, compiled or not."""
+"""Functions with identical rounding on any machine, compiled or not, for any rows."""
 
 from __future__ import annotations
 
@@ -6,6 +6,23 @@ import math
 
 import torch
 from torch import Tensor
+
+
+def pad_rows(rows: Tensor) -> Tensor:
+    """Return row indices padded to a multiple of 32 by repeating the first.
+
+    Vectorised functions (``atan2``) round differently in the scalar tail of an array
+    than in its body, which is processed two vectors at a time: 32 float32 numbers with
+    AVX-512. Padding makes a row's result independent of the rows computed with it.
+
+    Args:
+        rows: Indices, ``[n]`` int64, n >= 1.
+
+    Returns:
+        Indices, ``[ceil(n / 32) * 32]``.
+    """
+    extra = -rows.shape[0] % 32
+    return torch.cat((rows, rows[:1].expand(extra)))
 
 
 def exact_sqrt(x: Tensor) -> Tensor:

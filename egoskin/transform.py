@@ -16,7 +16,7 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 from torchrl.envs import Transform
 
-from egoskin.robots.kinematics import pad_rows
+from egoskin.rounding import pad_rows
 
 
 class _KeyedTransform(Transform):

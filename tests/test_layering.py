@@ -30,7 +30,7 @@ TOOLS = [
 ROOMS = {
     "storage": set(),
     "robots": {"storage"},
-    "transform": {"robots"},
+    "transform": set(),
     "envs": {"robots", "transform"},
     "sensors": {"storage", "robots", "transform"},
     "agents": set(),

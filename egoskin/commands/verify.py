@@ -11,8 +11,6 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-import hashlib
-import json
 import os
 import tempfile
 from collections.abc import Iterator
@@ -21,7 +19,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-import torch
 import tyro
 
 from egoskin.agents.ppo import PPOConfig
@@ -31,6 +28,7 @@ from egoskin.runs.config import TrainConfig, parse_config
 from egoskin.runs.run import Run
 from egoskin.runs.trainer import open_trainer, train
 from egoskin.sensors.kernels.compilation import SETTING, can_compile
+from egoskin.storage.formats import content_hash
 from egoskin.storage.tensor_file import load_tensors
 
 
@@ -133,22 +131,16 @@ def run_hash(run: Run) -> str:
     Configuration, times and the order of fields do not affect it, so that hashes of
     different versions can be compared.
     """
-    digest = hashlib.sha256()
     tensors, header = load_tensors(run.checkpoint_path)
-    numbers = {key: header[key] for key in ("frames", "learning_rate")}
-    digest.update(json.dumps(numbers).encode())
-    for name in sorted(tensors):
-        # The log is hashed below.
-        if name.startswith("log/"):
-            continue
-        value = tensors[name].contiguous()
-        digest.update(f"{name} {value.dtype} {list(value.shape)}".encode())
-        digest.update(value.reshape(-1).view(torch.uint8).numpy().tobytes())
+    # The log is a copy of the metrics.
+    tensors = {k: v for k, v in tensors.items() if not k.startswith("log/")}
     with open(run.path / "metrics.csv", newline="") as file:
-        for row in csv.DictReader(file):
-            kept = sorted((k, v) for k, v in row.items() if not k.startswith("time/"))
-            digest.update(json.dumps(kept).encode())
-    return digest.hexdigest()
+        metrics = [
+            {k: v for k, v in row.items() if not k.startswith("time/")}
+            for row in csv.DictReader(file)
+        ]
+    numbers = {key: header[key] for key in ("frames", "learning_rate")}
+    return content_hash({**numbers, "metrics": metrics}, tensors)
 
 
 def whole(config: TrainConfig, machine: Machine) -> str:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from egoskin.envs.physics.contract import Physics, PhysicsState
 from egoskin.envs.throws import Thrower
-from egoskin.robots.kinematics import pad_rows
+from egoskin.rounding import pad_rows
 from egoskin.shapes import Shape
 
 PASSED_DISTANCE = 1.0

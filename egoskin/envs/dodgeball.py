@@ -29,7 +29,8 @@ from egoskin.envs.state import STATE, state_spec, state_table
 from egoskin.envs.throws import ThrowConfig, Thrower
 from egoskin.rng import Stream, uniform
 from egoskin.robots.config import RobotConfig
-from egoskin.robots.kinematics import axis_vectors, pad_rows, rotate_inverse
+from egoskin.robots.kinematics import axis_vectors, rotate_inverse
+from egoskin.rounding import pad_rows
 from egoskin.shapes import Shape
 
 

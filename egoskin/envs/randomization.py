@@ -16,7 +16,7 @@ from torch import Tensor
 
 from egoskin.bounds import Interval, check_bounds, check_ranges
 from egoskin.envs.physics.contract import Physics, Variation
-from egoskin.rng import Stream, uniform
+from egoskin.rng import Stream, between, uniform
 
 _Factor = Annotated[tuple[float, float], Interval(ge=0.01, le=100)]
 _NONE = (1.0, 1.0)
@@ -106,10 +106,10 @@ class Randomization:
         u = uniform(seed, Stream.ROBOT, ids, episode, torch.zeros_like(ids), sum(sizes))
         mass, friction, gains, limit = u.split(sizes, -1)
         return Variation(
-            link_mass=_between(config.link_mass, mass),
-            friction=_between(config.friction, friction[:, 0]),
-            gains=_between(config.gains, gains),
-            torque_limit=_between(config.torque_limit, limit),
+            link_mass=between(config.link_mass, mass),
+            friction=between(config.friction, friction[:, 0]),
+            gains=between(config.gains, gains),
+            torque_limit=between(config.torque_limit, limit),
         )
 
     def start(
@@ -139,7 +139,7 @@ class Randomization:
         """Draw the time of the next push."""
         count = self.state["push"][rows]
         wait = uniform(seed, Stream.PUSH, ids, episode, count, 3)[:, 0]
-        steps = (_between(self.config.push_interval, wait) * self._hz).round().long()
+        steps = (between(self.config.push_interval, wait) * self._hz).round().long()
         self.state["next_push_step"][rows] += steps.clamp(min=1)
 
     def due(self, step: Tensor) -> Tensor:
@@ -154,7 +154,7 @@ class Randomization:
         """Push the robots of some rows; arguments as in `start`."""
         count = self.state["push"][rows]
         u = uniform(seed, Stream.PUSH, ids, episode, count, 3)
-        speed, n = _between(self.config.push_speed, u[:, 2]), len(rows)
+        speed, n = between(self.config.push_speed, u[:, 2]), len(rows)
         # Padded to a multiple of 32: a cosine may round differently in an array's tail.
         angle = torch.nn.functional.pad(2 * math.pi * u[:, 1], (0, -n % 32))
         way = torch.stack((angle.cos(), angle.sin()), -1)[:n]
@@ -171,8 +171,3 @@ class Randomization:
         self.state["late_actions"].copy_(all_actions[:, :-1])
         rows = torch.arange(len(action), device=action.device)
         return all_actions[rows, self.state["delay"]]
-
-
-def _between(bounds: tuple[float, float], u: Tensor) -> Tensor:
-    low, high = bounds
-    return low + (high - low) * u

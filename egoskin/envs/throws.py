@@ -18,7 +18,7 @@ from torch import Tensor
 
 from egoskin.bounds import Interval, check_bounds, check_ranges
 from egoskin.envs.physics.contract import GRAVITY
-from egoskin.rng import Stream, uniform
+from egoskin.rng import Stream, between, uniform
 from egoskin.robots.config import RobotConfig
 from egoskin.robots.kinematics import LinkKinematics, axis_vectors, rotate
 from egoskin.robots.surface import sample_surface
@@ -208,16 +208,28 @@ class Thrower:
             Height of the target points [m] and speed of the ball there [m/s],
             ``[n]`` each.
         """
-        n = len(draw.speed)
-        base_pose, joint_pos = (x.expand(n, -1) for x in self._standing)
+        base_pose, joint_pos = self._standing(len(draw.speed))
         side = torch.stack((draw.azimuth.cos(), draw.azimuth.sin()), -1)
         target = self._target(draw, base_pose, joint_pos, side)
-        release = self.release(draw, base_pose, torch.zeros(n, 3), joint_pos)
+        release = self.release_at_standing_robot(draw)
         velocity = release.velocity
         if self.config.flight == "ballistic":
             way = (target - release.position)[:, :2].norm(dim=-1)
             velocity[:, 2] -= GRAVITY * way / draw.speed
         return target[:, 2], velocity.norm(dim=-1)
+
+    def release_at_standing_robot(self, draw: Draw) -> Release:
+        """Return balls thrown at the robot standing in its default pose.
+
+        Args:
+            draw: Draws of ``n`` throws.
+
+        Returns:
+            The balls at release.
+        """
+        n = len(draw.speed)
+        base_pose, joint_pos = self._standing(n)
+        return self.release(draw, base_pose, torch.zeros(n, 3), joint_pos)
 
     def first_delay(self, seed: int, row: Tensor, episode: Tensor) -> Tensor:
         """Return the time from the start of some episodes to their first throw [s].
@@ -230,9 +242,8 @@ class Thrower:
         Returns:
             Delays, a pure function of the arguments, ``[n]``.
         """
-        low, high = self.config.first_delay
         u = uniform(seed, Stream.FIRST_DELAY, row, episode, torch.zeros_like(row), 1)
-        return low + (high - low) * u[:, 0]
+        return between(self.config.first_delay, u[:, 0])
 
     def draw(self, seed: int, row: Tensor, episode: Tensor, throw: Tensor) -> Draw:
         """Return the random part of the n-th throws of some episodes.
@@ -248,17 +259,12 @@ class Thrower:
         """
         u = uniform(seed, Stream.THROW, row, episode, throw, 7)
         config = self.config
-
-        def scale(column: int, bounds: tuple[float, float]) -> Tensor:
-            low, high = bounds
-            return low + (high - low) * u[:, column]
-
         return Draw(
-            azimuth=torch.deg2rad(scale(0, config.azimuth_deg)),
-            distance=scale(1, config.distance),
-            height=self._size * scale(2, config.height),
-            speed=scale(3, config.speed),
-            interval=scale(4, config.interval),
+            azimuth=torch.deg2rad(between(config.azimuth_deg, u[:, 0])),
+            distance=between(config.distance, u[:, 1]),
+            height=self._size * between(config.height, u[:, 2]),
+            speed=between(config.speed, u[:, 3]),
+            interval=between(config.interval, u[:, 4]),
             target=u[:, 5:7],
         )
 
@@ -268,7 +274,7 @@ class Thrower:
         """Return position and velocity of balls thrown at robots in a given state.
 
         A row's result does not depend on the other rows if their total number is a
-        multiple of 32 (`egoskin.robots.kinematics.pad_rows`).
+        multiple of 32 (`egoskin.rounding.pad_rows`).
 
         Args:
             draw: Draws of ``n`` throws.
@@ -310,12 +316,13 @@ class Thrower:
             velocity[:, 2] += 0.5 * GRAVITY * (time + self._timestep)
         return Release(position=start, velocity=velocity)
 
-    @cached_property
-    def _standing(self) -> tuple[Tensor, Tensor]:
-        """Base pose ``[1, 7]`` and joint positions ``[1, J]`` of the standing robot."""
-        height = self._robot.default_base_height
+    def _standing(self, n: int) -> tuple[Tensor, Tensor]:
+        """Base pose ``[n, 7]`` and joint positions ``[n, J]`` of the standing robot."""
+        base_pose = torch.tensor(
+            [0.0, 0.0, self._robot.default_base_height, 1.0, 0.0, 0.0, 0.0]
+        )
         joint_pos = torch.from_numpy(self._robot.default_joint_pos).float()
-        return torch.tensor([[0.0, 0, height, 1, 0, 0, 0]]), joint_pos[None]
+        return base_pose.expand(n, -1), joint_pos.expand(n, -1)
 
     def _point_index(self, draw: Draw) -> Tensor:
         index = (draw.target[:, 0] * NUM_AIM_POINTS).long()
@@ -331,8 +338,7 @@ class Thrower:
         if self.config.aim == "box":
             offset = (2 * draw.target[:, :1] - 1) * self.config.box_half_width
             across = torch.stack((-side[:, 1], side[:, 0]), -1)
-            low, high = self.config.box_height
-            z = low + (high - low) * draw.target[:, 1:]
+            z = between(self.config.box_height, draw.target[:, 1:])
             return torch.cat((base_pose[:, :2] + offset * across, z), -1)
         return self.points_w(self._point_index(draw), base_pose, joint_pos)
 

@@ -338,12 +338,7 @@ def throw_paths(
     thrower = Thrower(config, body.config, dt)
     row, zero = torch.arange(num_throws), torch.zeros(num_throws, dtype=torch.int64)
     draw = thrower.draw(seed, row, zero, zero)
-    release = thrower.release(
-        draw,
-        body.base_pose.expand(num_throws, -1),
-        torch.zeros(num_throws, 3),
-        body.joint_pos.expand(num_throws, -1),
-    )
+    release = thrower.release_at_standing_robot(draw)
     # Until the slowest ball is past the body.
     way = draw.distance + body.reach + config.radius
     longest = (way / release.velocity[:, :2].norm(dim=-1)).max()

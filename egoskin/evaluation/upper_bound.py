@@ -233,19 +233,17 @@ def _until_in_reach(
     waiting = torch.ones(throws, dtype=torch.bool)
     started = ~waiting
     for _ in range(config.task.max_first_throw_step + config.task.episode_steps):
-        now = _task(env).simulation_state()
-        last = now["throw"] == ball
-        if (now["next_throw_step"][last] < _NEVER).any():
-            # No ball is thrown after it.
-            now["next_throw_step"][last] = _NEVER
-            _task(env).load_simulation_state(now)
+        state = _task(env).balls.state
+        last = state["throw"] == ball
+        # No ball is thrown after it.
+        state["next_throw_step"][last] = _NEVER
         seen = root.clone(recurse=False)
         seen["object_active"] = root["object_active"] & mine
         sensed = sense(seen)["signal"].any(-1) & last
         begin = waiting & sensed
         if begin.any():
             kept[begin] = root[begin]
-            for key, value in now.items():
+            for key, value in _task(env).simulation_state().items():
                 simulation[key][begin] = value[begin]
         started |= begin
         waiting &= ~sensed

@@ -24,23 +24,6 @@ from torch import Tensor
 from egoskin.rounding import sincos
 
 
-def pad_rows(rows: Tensor) -> Tensor:
-    """Return row indices padded to a multiple of 32 by repeating the first.
-
-    Vectorised functions (``atan2``) round differently in the scalar tail of an array
-    than in its body, which is processed two vectors at a time: 32 float32 numbers with
-    AVX-512. Padding makes a row's result independent of the rows computed with it.
-
-    Args:
-        rows: Indices, ``[n]`` int64, n >= 1.
-
-    Returns:
-        Indices, ``[ceil(n / 32) * 32]``.
-    """
-    extra = -rows.shape[0] % 32
-    return torch.cat((rows, rows[:1].expand(extra)))
-
-
 class Steps(NamedTuple):
     """Steps from frame to frame: each is a fixed offset, then a joint.
 

@@ -25,7 +25,6 @@ import errno
 import fcntl
 import io
 import itertools
-import json
 import os
 import sys
 from collections.abc import Iterator, Mapping
@@ -109,7 +108,7 @@ class Run:
                 or there is too little memory.
         """
         skin = config.env.skin.build(config.env.robot_config)
-        hashes = {SKIN_HASH: content_hash(_as_stored(skin))}
+        hashes = {SKIN_HASH: content_hash(skin.to_dict())}
         initial = None
         if config.init_from is not None:
             initial = load_networks(config.init_from)
@@ -426,11 +425,6 @@ class Run:
             self._events.close()
         if self._wandb is not None:
             self._wandb.close()
-
-
-def _as_stored(skin: Skin) -> Any:
-    """Return a skin as JSON values, as its file holds them."""
-    return json.loads(json.dumps(skin.to_dict(), default=str))
 
 
 def _checked_type(kind: type[T], value: Any, name: str, what: str) -> T:

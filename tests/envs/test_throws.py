@@ -14,8 +14,9 @@ from egoskin.envs.physics import DEFAULT_ENGINE, PhysicsConfig, Scene
 from egoskin.envs.throws import Release, ThrowConfig, Thrower
 from egoskin.rng import Stream, uniform
 from egoskin.robots.builtin import H1_2
-from egoskin.robots.kinematics import LinkKinematics, pad_rows, rotate
+from egoskin.robots.kinematics import LinkKinematics, rotate
 from egoskin.robots.surface import distance_to, sample_surface
+from egoskin.rounding import pad_rows
 
 N = 64
 # The default physics step; one in each control step, to look at every state.

@@ -16,12 +16,11 @@ from hypothesis import strategies as st
 from egoskin.robots.builtin import H1_2
 from egoskin.robots.kinematics import (
     LinkKinematics,
-    pad_rows,
     quat_to_matrix,
     rotate,
     rotate_inverse,
 )
-from egoskin.rounding import sincos
+from egoskin.rounding import pad_rows, sincos
 
 DTYPES = [torch.float32, torch.float64]
 # pytorch-kinematics stores the robot's constants in float32 for any joint dtype.

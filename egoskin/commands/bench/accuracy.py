@@ -155,14 +155,7 @@ def _throws(config: AccuracyBench, robot: RobotConfig) -> Release:
     thrower = Thrower(ThrowConfig(), robot, config.physics.timestep)
     rows = torch.arange(config.throws)
     draw = thrower.draw(config.seed, rows, rows * 0, rows * 0)
-    pose = torch.tensor([0, 0, robot.default_base_height, 1, 0, 0, 0])
-    joints = torch.from_numpy(robot.default_joint_pos).float()
-    return thrower.release(
-        draw,
-        pose.expand(config.throws, 7),
-        torch.zeros(config.throws, 3),
-        joints.expand(config.throws, -1),
-    )
+    return thrower.release_at_standing_robot(draw)
 
 
 def accuracy_rows(config: AccuracyBench) -> list[Row]:

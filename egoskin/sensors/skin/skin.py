@@ -364,7 +364,8 @@ class Skin:
             "format": _FORMAT,
             "robot": self.robot,
             "conventions": _CONVENTIONS,
-            "provenance": dict(self.provenance),
+            # It may hold a path, for example.
+            "provenance": json.loads(json.dumps(dict(self.provenance), default=str)),
             **({"types": named} if named else {}),
             "sensors": sensors,
         }
@@ -419,8 +420,7 @@ class Skin:
         """Write the skin to a JSON file, one sensor per line."""
         content = self.to_dict()
         sensors = content.pop("sensors")
-        # default=str because the provenance may hold a path.
-        head = json.dumps(content, indent=2, default=str)[:-2]
+        head = json.dumps(content, indent=2)[:-2]
         lines = ",\n".join(f"    {json.dumps(sensor)}" for sensor in sensors)
         Path(path).write_text(f'{head},\n  "sensors": [\n{lines}\n  ]\n}}\n')
 
