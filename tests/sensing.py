@@ -12,7 +12,7 @@ import torch
 from hypothesis import strategies as st
 
 from egoskin.robots.builtin import H1_2
-from egoskin.sensors import Field, Ray, Skin
+from egoskin.sensors import Field, Ray, RaySensor, Skin
 from egoskin.sensors.kernels.binding import Kernels
 from egoskin.shapes import Box, Capsule, Ellipsoid, Sphere
 
@@ -28,6 +28,14 @@ KEYS = ("base_pose", "joint_pos", "object_pose", "object_active")
 """What a sensor reads, in the order of its `compute`."""
 BALLS = (Sphere(radius=0.15), Sphere(radius=0.4), Sphere(radius=0.02))
 SEED = st.integers(0, 2**32 - 1)
+
+
+class DenseRaySensor(RaySensor):
+    """A ray sensor that computes all pairs of sensor and object."""
+
+    def _margin(self, view, shape, skin):
+        # 1, or NaN where the object's place is unknown.
+        return 1.0 + 0.0 * (view.centre[:, self._link] - skin["offset"]).sum(0)
 
 
 def along_axes(angle: float) -> float:
@@ -88,10 +96,10 @@ def draw_coverages(skin: Skin, coverages, rng) -> Skin:
     )
 
 
-def draw_balls(random_state, rng, dtype):
+def draw_balls(random_state, rng):
     """(balls, state): one to three balls, near and far, some in play, some NaN."""
     count, rows = rng.integers(1, 4), rng.integers(1, 50)
-    state = random_state(rows, int(rng.integers(1000)), dtype, objects=count)
+    state = random_state(rows, int(rng.integers(1000)), objects=count)
     state["object_pose"][::3, :, :3] *= 3
     for key in ("base_pose", "joint_pos", "object_pose"):
         if rng.random() < 0.3:

@@ -48,8 +48,8 @@ class FieldSensor(ProximitySensor):
             to its closest point is free. Empty: no occlusion.
         per_object: Write one distance per object, ``distance [*B, S, O]``.
         compile: Use kernels if all objects are balls and there is no occlusion: in C++
-            if it can be compiled and, for float32 on CUDA, in Warp if it is installed;
-            results are the same (float64: to the last bit or two).
+            if it can be compiled, on CUDA in Warp if it is installed; only for float32
+            without gradients. The results are the same.
         in_keys: Keys of the four inputs, in the order above.
         out_keys: Keys of the two outputs, in the order above.
 

@@ -3,9 +3,8 @@
 Computations use a structure of arrays with the batch last (``[S, B]``), sensors in the
 order of the skin, and only +, -, x, /, `sincos` and `exact_sqrt` (`egoskin.rounding`).
 The result of a row is therefore bitwise the same whatever other rows are in the batch.
-For balls without occlusion it is also the same in C++
-(``egoskin/sensors/kernels/kernels.cpp``); a float64 number may differ there in its last
-bit or two, because PyTorch's float64 root is not exact.
+For balls without occlusion, float32 numbers are also the same in C++
+(``egoskin/sensors/kernels/kernels.cpp``).
 
 Contract: a reading of infinity means that nothing is in range; NaN in the input gives
 a reading of NaN, never of infinity.

@@ -57,10 +57,9 @@ class RaySensor(ProximitySensor):
         reduce: "min" writes only the minimum over each sensor's beams.
         body: The robot's shapes, for occlusion; empty: no occlusion.
         per_object: Write one distance per object, in a last dimension ``O``.
-        cull: Skip pairs that cannot hit; results are the same.
         compile: Use kernels if all objects are balls and there is no occlusion: in C++
-            if it can be compiled and, for float32 on CUDA, in Warp if it is installed;
-            results are the same (float64: to the last bit or two).
+            if it can be compiled, on CUDA in Warp if it is installed; only for float32
+            without gradients. The results are the same.
         in_keys: Keys of the four inputs, in the order above.
         out_keys: Keys of the two outputs, in the order above.
 
@@ -87,7 +86,6 @@ class RaySensor(ProximitySensor):
         reduce: Literal["none", "min"] = "none",
         body: Sequence[Primitive] = (),
         per_object: bool = False,
-        cull: bool = True,
         compile: bool = False,
         in_keys: Sequence[NestedKey] = STATE_KEYS,
         out_keys: Sequence[NestedKey] = ("distance", "object_detected"),
@@ -103,7 +101,7 @@ class RaySensor(ProximitySensor):
                 f"grids {', '.join(str(kind.grid) for kind in kinds)}"
             )
         self._num_beams = len(directions[0])
-        self.reduce, self._cull = reduce, cull
+        self.reduce = reduce
         # [3, U, K] for U different coverages, and the index of each sensor's coverage.
         beams = torch.stack(directions).movedim(-1, 0)
         beam_of = torch.tensor([kinds.index(r) for r in rays])
@@ -136,7 +134,6 @@ class RaySensor(ProximitySensor):
             self._use_kernels(
                 "ray",
                 beams=self._num_beams,
-                cull=cull,
                 reduce=reduce == "min",
                 bound=np.array(bounds),
                 reach=self._reach.numpy(),
@@ -165,9 +162,6 @@ class RaySensor(ProximitySensor):
         """Margins of one object [m], ``[S, B]``."""
         away = view.centre[:, self._link] - skin["offset"]
         x, y, z = self._in_sensor(away, skin["axes"])
-        if not self._cull:
-            # No pair is culled: 1, or NaN.
-            return 1.0 + 0.0 * x
         # Outside the range, behind the sensor, or beyond a side of the pyramid:
         # R + r - |c|, r + z, r - (|x| cos h - z sin h).
         cos, sin = skin["pyramid"]

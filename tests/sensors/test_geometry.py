@@ -11,13 +11,13 @@ import torch
 from egoskin.robots.builtin import H1_2
 from egoskin.sensors import FieldSensor, Ray, RaySensor
 from egoskin.shapes import Sphere
-from sensing import KEYS, SHAPES, measure
+from sensing import KEYS, SHAPES, DenseRaySensor, measure
 
 RANGE = 1.5
 SMALL = partial(RaySensor, coverage=Ray(grid=(4, 4)))
 every_kind = pytest.mark.parametrize(
     "kind",
-    [FieldSensor, SMALL, partial(SMALL, cull=False)],
+    [FieldSensor, SMALL, partial(DenseRaySensor, coverage=Ray(grid=(4, 4)))],
     ids=["field", "ray", "dense ray"],
 )
 

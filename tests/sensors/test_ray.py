@@ -22,6 +22,7 @@ from sensing import (
     KINDS,
     SEED,
     SHAPES,
+    DenseRaySensor,
     along_axes,
     assert_same_bits,
     assert_same_bits_in_any_batch,
@@ -242,9 +243,8 @@ def test_depth_is_the_component_along_the_normal():
 
 def test_the_range_itself_counts_as_hit():
     for found, limit in (([1.5], 1.5), ([INF], 1.5 - 2**-20)):
-        for options in ({}, {"cull": False}):
-            sensor = one_sensor(limit, BALL, ONE, **options)
-            assert look(sensor, (0, 0, 1.75)) == (found, [found != [INF]])
+        sensor = one_sensor(limit, BALL, ONE)
+        assert look(sensor, (0, 0, 1.75)) == (found, [found != [INF]])
 
 
 def test_rows_look_along_y_and_columns_along_x():
@@ -312,8 +312,8 @@ def test_culled_is_dense(crowd, reduce, per_object, dtype):
     state = state.apply(lambda x: x.to(dtype) if x.is_floating_point() else x)
     options = {"reduce": reduce, "per_object": per_object}
     culled, dense = (
-        RaySensor(mixed, H1_2.chain, SHAPES, RANGE, cull=cull, **options)
-        for cull in (True, False)
+        kind(mixed, H1_2.chain, SHAPES, RANGE, **options)
+        for kind in (RaySensor, DenseRaySensor)
     )
     result = measure(culled, state)
     assert_same_bits(result, measure(dense, state))
@@ -328,8 +328,8 @@ def test_culled_is_dense_wherever_objects_are(skin, random_state, seed):
     objects = [shape_of(k, s) for k, s in zip(KINDS, sizes, strict=True)]
     state = turned(random_state(8, seed, objects=4), seed)
     culled, dense = (
-        measure(RaySensor(mixed, H1_2.chain, objects, RANGE, cull=cull), state)
-        for cull in (True, False)
+        measure(kind(mixed, H1_2.chain, objects, RANGE), state)
+        for kind in (RaySensor, DenseRaySensor)
     )
     assert_same_bits(culled, dense)
 
@@ -341,8 +341,8 @@ def test_a_range_only_cuts_off(skin, random_state, seed, max_range):
     state["object_pose"][..., :3] *= 3
     few, rays = skin.select(range(0, 64, 5)), Ray(grid=(4, 4), measure="depth")
     full, short = (
-        measure(RaySensor(few, H1_2.chain, SHAPES, r, rays, cull=r < INF), state)[0]
-        for r in (INF, max_range)
+        measure(kind(few, H1_2.chain, SHAPES, r, rays), state)[0]
+        for kind, r in ((DenseRaySensor, INF), (RaySensor, max_range))
     )
     limit = torch.tensor(max_range, dtype=torch.float32)
     assert torch.equal(short, full.masked_fill(full > limit, INF))

@@ -26,10 +26,9 @@ VECTOR = 16
 SOURCE = Path(__file__).with_name("kernels.cpp")
 """C++ source of the kernels."""
 
-_NAMES = {torch.float32: "float32", torch.float64: "float64"}
 _COUNTS = (
     *("joints", "steps", "links", "sensors", "objects"),
-    *("beams", "cull", "reduce", "apart"),
+    *("beams", "reduce", "apart"),
 )
 _ARRAYS = (
     *("joint", "parent", "frame", "link"),
@@ -61,8 +60,8 @@ class _Inputs(ctypes.Structure):
 class Kernels:
     """Compiled implementation of the sensors for balls and without occlusion.
 
-    It is in C++ for tensors on the CPU and in Warp for float32 on a CUDA device. `can`
-    returns False if the C++ code cannot be compiled or Warp is not installed.
+    It is in C++ for float32 tensors on the CPU and in Warp for those on a CUDA device.
+    `can` returns False if the C++ code cannot be compiled or Warp is not installed.
 
     Args:
         kind: Coverage of all sensors.
@@ -94,13 +93,13 @@ class Kernels:
             "squared": radius * radius,
             **constants,
         }
-        # The arrays must be kept alive: a table holds only their addresses.
-        self._tables: dict[torch.dtype, tuple[_Tables, list[np.ndarray]]] = {}
+        # The arrays must be kept alive: the tables hold only their addresses.
+        self._tables: tuple[_Tables, list[np.ndarray]] | None = None
         self._warp: dict[torch.device, WarpKernels] = {}
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state without what cannot be pickled."""
-        return {**vars(self), "_library": None, "_tables": {}, "_warp": {}}
+        return {**vars(self), "_library": None, "_tables": None, "_warp": {}}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore the state and load the library again."""
@@ -114,11 +113,11 @@ class Kernels:
             constants: As in the class.
         """
         self._constants.update(constants)
-        self._tables.clear()
+        self._tables = None
         self._warp.clear()
 
     def can(self, *inputs: Tensor) -> bool:
-        """Whether the kernels support these inputs, of one type and without gradients.
+        """Whether the kernels support these inputs: float32, without gradients.
 
         Always False under ``torch.compile``.
         """
@@ -126,10 +125,11 @@ class Kernels:
             return False
         if torch.is_grad_enabled() and any(x.requires_grad for x in inputs):
             return False
-        if all(x.is_cpu and x.dtype in _NAMES for x in inputs):
+        if any(x.dtype != torch.float32 for x in inputs):
+            return False
+        if all(x.is_cpu for x in inputs):
             return self._library is not None
-        singles = all(x.is_cuda and x.dtype == torch.float32 for x in inputs)
-        return singles and _has_warp()
+        return all(x.is_cuda for x in inputs) and _has_warp()
 
     def on(self, device: torch.device) -> WarpKernels:
         """Return the Warp kernels of a device."""
@@ -185,8 +185,7 @@ class Kernels:
             room = found
 
     def _call(self, name: str, inputs: Sequence[Tensor], *arguments: object) -> int:
-        """Call the kernel for the dtype of the joint positions."""
-        dtype = inputs[1].dtype
+        """Call a kernel."""
         # Rows must be contiguous.
         rows = [x.flatten(1) for x in inputs]
         rows = [x if x.stride(-1) == 1 else x.contiguous() for x in rows]
@@ -195,26 +194,26 @@ class Kernels:
             (ctypes.c_void_p * 4)(*(x.data_ptr() for x in rows)),
             (ctypes.c_int64 * 4)(*(x.stride(0) for x in rows)),
         )
-        function = getattr(self._library, f"{name}_{_NAMES[dtype]}")
+        if self._tables is None:
+            self._tables = _tables(self._constants)
+        function = getattr(self._library, f"egoskin_{name}")
         function.restype = ctypes.c_int64
-        tables = ctypes.byref(self._of_type(dtype))
+        tables = ctypes.byref(self._tables[0])
         return function(tables, ctypes.byref(given), *arguments)
 
-    def _of_type(self, dtype: torch.dtype) -> _Tables:
-        """Return the constants in a floating-point type."""
-        if dtype not in self._tables:
-            arrays = []
-            tables = _Tables()
-            for name, value in self._constants.items():
-                if value is not None and name in _ARRAYS:
-                    value = np.ascontiguousarray(value)
-                    if value.dtype == np.float64:
-                        value = value.astype(_NAMES[dtype])
-                    arrays.append(value)
-                    value = value.ctypes.data
-                setattr(tables, name, value)
-            self._tables[dtype] = tables, arrays
-        return self._tables[dtype][0]
+
+def _tables(constants: Mapping[str, Any]) -> tuple[_Tables, list[np.ndarray]]:
+    """Return the constants for the kernels, and the arrays that they point to."""
+    tables, arrays = _Tables(), []
+    for name, value in constants.items():
+        if value is not None and name in _ARRAYS:
+            value = np.ascontiguousarray(value)
+            if value.dtype == np.float64:
+                value = value.astype(np.float32)
+            arrays.append(value)
+            value = value.ctypes.data
+        setattr(tables, name, value)
+    return tables, arrays
 
 
 @functools.cache

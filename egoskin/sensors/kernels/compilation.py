@@ -72,7 +72,7 @@ def _loaded(source: Path) -> ctypes.CDLL | None:
         folder = _cache()
         found = _find(folder, name)
         if found is None and is_parent:
-            _log.warning("compiling %s: half a minute, once per machine", source.name)
+            _log.warning("compiling %s: some seconds, once per machine", source.name)
             found = _keep(folder, name, _compile(command, source))
     # Path.home() raises RuntimeError.
     except (OSError, RuntimeError) as error:

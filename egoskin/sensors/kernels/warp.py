@@ -45,7 +45,6 @@ class Tables:
     links: wp.int32
     objects: wp.int32
     beams: wp.int32
-    cull: wp.int32
     reduce: wp.int32
     apart: wp.int32
     joint: _Ints
@@ -265,7 +264,7 @@ def _read_ray(
         if active[row, o]:
             v = centre[row, o, t.link[sensor]] - t.offset[sensor]
             c = t.axes[sensor] * v
-            if t.cull == 0 or _sees(t, o, sensor, c):
+            if _sees(t, o, sensor, c):
                 plane = o * t.apart
                 grid = t.grid[sensor]
                 nearest = float(wp.inf)

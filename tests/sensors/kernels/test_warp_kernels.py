@@ -61,23 +61,22 @@ def pair(kind, *args, **options):
 def test_fields_have_the_same_bits(skin, random_state, seed, per_object):
     rng = np.random.default_rng(seed)
     coverages = draw_fields(rng)
-    balls, state = draw_balls(random_state, rng, torch.float32)
+    balls, state = draw_balls(random_state, rng)
     some = draw_coverages(skin, coverages, rng)
     plain, fast = pair(FieldSensor, some, H1_2.chain, balls, 1.0, per_object=per_object)
     assert_same_bits(measure(fast, state), measure(plain, state))
 
 
-@given(SEED, st.sampled_from(["none", "min"]), st.booleans(), st.booleans())
-def test_rays_have_the_same_bits(skin, random_state, seed, reduce, per_object, cull):
+@given(SEED, st.sampled_from(["none", "min"]), st.booleans())
+def test_rays_have_the_same_bits(skin, random_state, seed, reduce, per_object):
     rng = np.random.default_rng(seed)
     coverages = draw_rays(rng)
-    balls, state = draw_balls(random_state, rng, torch.float32)
+    balls, state = draw_balls(random_state, rng)
     plain, fast = pair(
         RaySensor,
         *(draw_coverages(skin, coverages, rng), H1_2.chain, balls, 1.0),
         reduce=reduce,
         per_object=per_object,
-        cull=cull,
     )
     assert_same_bits(measure(fast, state), measure(plain, state))
     if reduce == "none" and not per_object:
