@@ -43,6 +43,10 @@ ROOMS = {
         *("storage", "robots", "envs", "sensors", "make", "policies", "evaluation")
     },
     "gym": {"storage", "make", "viewer"},
+    "study": {
+        *("storage", "robots", "envs", "sensors", "agents", "make", "policies"),
+        *("evaluation", "runs"),
+    },
 }
 # All but the public face: nothing imports what the command line does.
 TOP = "commands"

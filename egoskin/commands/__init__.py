@@ -6,14 +6,13 @@ shown at once: nothing heavy is imported before the arguments are checked for it
 
 from __future__ import annotations
 
-import difflib
 import resource
 import sys
-from collections.abc import Iterable, Mapping
 from importlib import import_module
 
 from egoskin import __version__
 from egoskin.commands import pages
+from egoskin.hints import unknown_command
 from egoskin.interrupts import end_quietly, unread_output
 from egoskin.viewer import draw_without_display
 
@@ -61,7 +60,8 @@ def main() -> None:
         sys.argv = [f"egoskin {name}", *args]
         run(name)
     else:
-        print(f"error: {unknown(name, COMMANDS, _OTHER_NAMES)}", file=sys.stderr)
+        text = unknown_command(name, COMMANDS, _OTHER_NAMES)
+        print(f"error: {text}", file=sys.stderr)
         raise SystemExit(2)
 
 
@@ -133,16 +133,3 @@ def _page() -> str:
             "  egoskin train --sensor.signal binary --sensor.range 1 --seed 1",
         ]
     )
-
-
-def unknown(name: str, known: Iterable[str], other: Mapping[str, str] = {}) -> str:
-    """Return the error text for an unknown name, with the nearest known one.
-
-    Args:
-        name: The unknown name.
-        known: The known names.
-        other: Other names that may have been meant, and the known name of each.
-    """
-    near = difflib.get_close_matches(name, [*known, *other], n=1)
-    hint = f", did you mean {other.get(near[0], near[0])!r}?" if near else ""
-    return f"there is no command {name!r}{hint} (commands: {', '.join(known)})"

@@ -18,7 +18,7 @@ from tyro.constructors import (
     PrimitiveTypeInfo,
 )
 
-from egoskin.commands import unknown
+from egoskin.hints import unknown_command
 from egoskin.interrupts import (
     ENDING,
     end_next_time,
@@ -160,7 +160,7 @@ def parse_subcommand(
         ValueError: If there is no such subcommand; the text names the nearest.
     """
     if args and not args[0].startswith("-") and args[0] not in kinds:
-        raise ValueError(unknown(args[0], kinds))
+        raise ValueError(unknown_command(args[0], kinds))
     return tyro.extras.subcommand_cli_from_dict(
         dict(kinds), args=args, description=description
     )

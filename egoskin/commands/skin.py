@@ -27,8 +27,8 @@ from egoskin.commands.errors import parse_subcommand
 from egoskin.progress import counted
 from egoskin.robots.builtin import ROBOTS
 from egoskin.robots.config import Primitive, RobotConfig
-from egoskin.robots.kinematics import LinkKinematics
 from egoskin.robots.own import find_robot
+from egoskin.robots.surface import default_frames
 from egoskin.sensors import Skin
 from egoskin.sensors.skin.coverage import Coverage
 from egoskin.sensors.skin.gentact import load_gentact, save_gentact
@@ -286,10 +286,9 @@ def views(robot: RobotConfig, skin: Skin) -> np.ndarray:
             "object_active": torch.zeros(0, dtype=torch.bool),
         }
     )
-    position, rotation = LinkKinematics(robot.chain, skin.links).poses_b(
-        joint_pos[None]
-    )
-    turn, shift = rotation[0].numpy(), base + position[0].numpy()
+    position, rotation = default_frames(robot)
+    link = [robot.links.index(name) for name in skin.links]
+    turn, shift = rotation[link], base + position[link]
     starts = shift + (turn @ skin.position[:, :, None])[..., 0]
     ends = starts + _NORMAL_LENGTH * (turn @ skin.normal[:, :, None])[..., 0]
     images = []

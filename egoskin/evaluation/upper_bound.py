@@ -19,7 +19,8 @@ from torchrl.envs import Compose, TransformedEnv
 from egoskin.bounds import COUNT, POSITIVE, Interval, check_bounds
 from egoskin.envs.dodgeball import DodgeballEnv
 from egoskin.evaluation.throw_set import throw_seed
-from egoskin.make import EnvConfig, default_num_workers, make_worker_env
+from egoskin.make import EnvConfig, make_worker_env
+from egoskin.parallel import default_num_workers
 from egoskin.policies.policy import Policy
 from egoskin.sensors import Skin
 from egoskin.sensors.config import SensorConfig

@@ -21,7 +21,8 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from egoskin.agents.networks import Agent, NetworkConfig
-from egoskin.make import Engine, EnvConfig
+from egoskin.envs.physics import Engine
+from egoskin.make import EnvConfig
 from egoskin.sensors import Skin
 from egoskin.sparse import SparseSource
 from egoskin.storage.serialization import from_plain, to_plain

@@ -12,7 +12,8 @@ from multiprocessing import get_context
 from pathlib import Path
 
 from egoskin.progress import counted
-from egoskin.runs.run import Run, TrainConfig
+from egoskin.runs.config import TrainConfig
+from egoskin.runs.run import Run
 from egoskin.runs.trainer import open_trainer
 from egoskin.study.manifest import Manifest, PlannedRun
 

@@ -224,7 +224,7 @@ class StudyFolder:
         return _last_row(path / "metrics.csv").get("frames") == planned.end
 
     def is_trained_elsewhere(self, name: str) -> bool:
-        """Return whether another process trains a run, for example ppo.py."""
+        """Return whether another process trains a run, for example egoskin train."""
         return is_locked(self.run_path(name) / "lock")
 
     def is_running(self, name: str) -> bool:
@@ -245,10 +245,6 @@ class StudyFolder:
         source, end = self.run_path(planned.name), planned.end
         run, folder = Run.open(source), self.result_path(planned.name)
         policy, made = run.policy_path(end), record(run, end)
-        if made.command.startswith("python scripts/job.py"):
-            # The run was started by a study; its folder's location is irrelevant.
-            command = f"python -m egoskin.study.job FOLDER {planned.name}"
-            made = dataclasses.replace(made, command=command)
         (folder / "policies").mkdir(parents=True, exist_ok=True)
         every = max(planned.end // _LINES, 1)
         contents = {

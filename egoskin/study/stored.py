@@ -21,8 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from egoskin.runs.config import load_config
-from egoskin.runs.run import Run, TrainConfig
+from egoskin.runs.config import TrainConfig, load_config
+from egoskin.runs.run import Run
 from egoskin.storage.formats import read_sealed
 from egoskin.storage.serialization import from_plain, read_json
 
@@ -110,8 +110,6 @@ def record(run: Run, frames: int) -> Record:
     lines = csv.DictReader(io.StringIO(run.metrics()))
     rows = [row for row in lines if int(row["frames"]) <= frames]
     script, *args = starts[0]["command"]
-    # The location of the run folder is irrelevant elsewhere.
-    args = _without(args, "--run-dir")
     commits = [
         "unknown"
         if start["git"] is None
@@ -123,10 +121,16 @@ def record(run: Run, frames: int) -> Record:
         f"torch {start['packages']['torch']}, mujoco {start['packages']['mujoco']}"
         for start in starts
     ]
-    # Either a script's path or "egoskin train".
-    called = f"python scripts/{Path(script).name}" if script.endswith(".py") else script
+    # The location of the folder is irrelevant elsewhere. The script is a study's job,
+    # another script, or "egoskin train".
+    if script.endswith("study/job.py"):
+        command = f"python -m egoskin.study.job FOLDER {run.path.name}"
+    else:
+        if script.endswith(".py"):
+            script = f"python scripts/{Path(script).name}"
+        command = " ".join([script, *_without(args, "--run-dir")])
     return Record(
-        command=" ".join([called, *args]),
+        command=command,
         commit=", ".join(dict.fromkeys(commits)),
         seed=run.config.seed,
         frames=frames,

@@ -1,1 +1,1 @@
-"""The sensors' C++ kernels: source, compilation and Python binding."""
+"""The sensors' kernels: C++ with its compilation, Warp, and the Python binding."""

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import get_args, get_type_hints
 
 import numpy as np
 import viser
 from viser import uplot
 
+from egoskin.sensors.config import SensorConfig
 from egoskin.viewer.web.scene import colour_of
 from egoskin.viewer.web.session import HEIGHTS, SPEEDS, Session
 
@@ -23,8 +25,9 @@ _KINDS = {
     "ray, closest beam": {"coverage": "ray", "reduce": "min"},
     "ray, all beams": {"coverage": "ray", "reduce": "none"},
 }
-_SIGNALS = ("proximity", "closeness", "binary", "localization")
-_CORRUPTIONS = ("none", "time_of_flight", "capacitive", "acoustic")
+_OPTIONS = get_type_hints(SensorConfig)
+_SIGNALS = get_args(_OPTIONS["signal"])
+_CORRUPTIONS = get_args(_OPTIONS["corruption"])
 _COLOURS = ("#e8590c", "#1c7ed6")
 MEMORY = 5.0
 """Length of the recording that is plotted, replayed and saved [s]."""

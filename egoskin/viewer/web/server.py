@@ -83,6 +83,6 @@ class ServedPage:
         """Call a function; an exception is shown on the page and does not end it."""
         try:
             wish()
-        # A policy may be arbitrary code and raise anything.
+        # A policy, a file or a robot that does not fit may raise anything.
         except Exception as error:
             self.show_error(f"{type(error).__name__}: {error}")
