@@ -147,7 +147,7 @@ class Plan:
             source = f"measured on {run.cell.name}; full ray grids take longer"
         total = cost(manifest, per_s)
         print(
-            f"{total.runs} runs, {total.frames / 1e6:,.1f} M frames, "
+            f"{counted(total.runs, 'run')}, {total.frames / 1e6:,.1f} M frames, "
             f"{total.core_s / 3600:,.1f} core-hours ({per_s:,.0f} steps/s per core, "
             f"{source}):\n"
             f"  {duration(total.wall_s(cores))} on the {counted(cores, 'core')} here, "
@@ -169,9 +169,10 @@ def describe(manifest: Manifest) -> None:
     print(f"study {manifest.study}: {manifest.purpose}")
     for setting in settings(manifest.not_default()):
         print(f"  not the default: {setting}")
+    width = max(len(cell.name) for cell in manifest.cells)
     for cell in manifest.cells:
         text = ", ".join(settings(manifest.overrides(cell)))
-        print(f"  {cell.name:<32} {text or 'no other changes'}")
+        print(f"  {cell.name:<{width}} {text or 'no other changes'}")
     seeds = ", ".join(map(str, manifest.seeds))
     print(
         f"  seeds {seeds}; evaluated on standard {manifest.evaluation.standard}, throw "
@@ -243,7 +244,7 @@ class Run:
     tries: Annotated[int, COUNT] = 3
     """Maximum number of attempts for each run."""
     again: bool = False
-    """Whether to retry the runs that have used up their attempts."""
+    """Whether to retry those of the runs that have used up their attempts."""
     nice: int = 5
     """Niceness of the runs."""
 
@@ -257,10 +258,10 @@ class Run:
         """Execute the runs that are left."""
         manifest, folder = requested(self.name, self.dir), StudyFolder(self.dir)
         runs = manifest.matching(self.only or ("*",))
+        kind = self._where()
         folder.plan(manifest)
         if self.again:
-            folder.forget_failures()
-        kind = self._where()
+            folder.forget_failures(runs)
         status = kind(
             folder,
             runs=runs,

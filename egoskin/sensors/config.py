@@ -123,6 +123,11 @@ class SensorConfig:
                 f"corruption={self.corruption} needs a measured signal: perfect "
                 "localization has no noise"
             )
+        if self.reduce != "none" and self.signal == "localization":
+            raise ValueError(
+                "reduce has no effect with signal=localization, the position of the "
+                "nearest ball that any beam detects"
+            )
         if self.keep_last and self.signal != "localization":
             raise ValueError(f"keep_last needs signal=localization, not {self.signal}")
 

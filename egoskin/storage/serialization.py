@@ -7,16 +7,26 @@ import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from types import UnionType
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import dacite
 
 from egoskin.bounds import BoundsError, path_to
+from egoskin.hints import did_you_mean
 from egoskin.storage.files import read_regular
 
 T = TypeVar("T")
 # Deeper than anything that egoskin writes, and safe for recursive functions.
 _DEEPEST = 100
+_NAMES = {
+    int: "an integer",
+    float: "a number",
+    str: "a string",
+    Path: "a path",
+    bool: "true or false",
+    type(None): "null",
+}
 
 
 def read_json(path: Path) -> Any:
@@ -84,9 +94,36 @@ def from_plain(kind: type[T], content: Any, what: str) -> T:
         return dacite.from_dict(kind, _with_tuples(content), config)
     except BoundsError as error:
         raise ValueError(f"{what}: {path_to(error.owner, kind)}{error}") from error
+    except dacite.UnexpectedDataError as error:
+        key, *_ = sorted(error.keys)
+        hint = did_you_mean(key, kind.__annotations__)
+        raise ValueError(f"{what}: there is no field {key!r}{hint}") from error
+    except dacite.MissingValueError as error:
+        raise ValueError(f"{what}: {error.field_path} is missing") from error
+    except dacite.WrongTypeError as error:
+        text = f"{what}: {error.field_path} must be {_described(error.field_type)}"
+        # dacite changes a string that is given for a list.
+        if not (isinstance(error.value, str) and "list" in text):
+            text += f", got {json.dumps(to_plain(error.value), default=str)}"
+        raise ValueError(text) from error
     # ValueError is raised by the checks of the configuration itself.
     except (dacite.DaciteError, ValueError) as error:
         raise ValueError(f"{what}: {error}") from error
+
+
+def _described(kind: Any) -> str:
+    """Return a type in words, as its values are written in JSON."""
+    if get_origin(kind) is Literal:
+        return "one of " + ", ".join(json.dumps(value) for value in get_args(kind))
+    if get_origin(kind) in (tuple, list):
+        items = [x for x in get_args(kind) if x is not ...]
+        words = dict.fromkeys(_described(x) for x in items)
+        return f"a list, each item {' or '.join(words)}"
+    if get_origin(kind) in (Union, UnionType):
+        return " or ".join(_described(x) for x in get_args(kind))
+    if get_origin(kind) is Annotated:
+        return _described(get_args(kind)[0])
+    return _NAMES.get(kind, "an object")
 
 
 def _with_tuples(content: Any) -> Any:

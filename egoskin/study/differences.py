@@ -38,7 +38,8 @@ def differences(cells: Sequence[str], table: Table) -> list[Difference]:
         table: Values of a metric.
     """
     first, *others = cells
-    effects = {c: contrast({c: 1.0, first: -1.0}, table) for c in others}
+    weights = {cell: {cell: 1.0, first: -1.0} for cell in others}
+    effects = {cell: contrast(own, table) for cell, own in weights.items()}
     known = {cell: effect for cell, effect in effects.items() if effect is not None}
     # Two-sided: Bonferroni over the two directions.
     p_values = holm(
@@ -46,7 +47,7 @@ def differences(cells: Sequence[str], table: Table) -> list[Difference]:
     )
     result = []
     for (cell, effect), p in zip(known.items(), p_values, strict=True):
-        distance = abs(effect.mean) / assumed_sd(effect, (1.0, -1.0), table)
+        distance = abs(effect.mean) / assumed_sd(effect, weights[cell], table)
         needed = seeds_needed([distance], ALPHA / 2 / len(known))
         result.append(
             Difference(cell=cell, effect=effect, p_value=p, seeds_needed=needed)

@@ -28,6 +28,8 @@ _STYLES = {
 }
 _OTHERS = ("#E69F00", "#56B4E9", "#CC79A7", "#0072B2", "#D55E00", "#009E73")
 _BLIND, _ORACLE = "#555555", "#000000"
+# Factor between the ranges at which two signals of the same range are drawn.
+_SHIFT = 1.04
 _VERDICTS = {"confirmed": "#0072B2", "refuted": "#D55E00", "undecided": "#888888"}
 _GEOMETRIES = {
     ("field", "none"): "field",
@@ -103,8 +105,9 @@ def success_by_range(
 ) -> Figure | None:
     """Draw the paper's figure, success against range; return None without its cells.
 
-    One line per signal and one panel per geometry: interquartile mean and range over
-    seeds, and each seed as a small dot. Below it: the warning time.
+    One line per signal and one panel per geometry: interquartile mean (hollow: one
+    seed), interquartile range as a bar, and each seed as a dot. Signals are shifted by
+    a few per cent of the range, to be told apart. Below it: the warning time.
 
     Args:
         manifest: The study.
@@ -136,18 +139,14 @@ def success_by_range(
     )
     for axes, name in zip(panels, names, strict=True):
         cells = _geometry(name, grid)
-        for signal, (colour, mark) in _STYLES.items():
-            ranges = sorted(r for s, r in cells if s == signal)
-            if not ranges:
-                continue
-            rows = [list(table[cells[signal, r]].values()) for r in ranges]
-            all_seeds = [spread(row) for row in rows]
-            x, mean = np.array(ranges), [s.iqm for s in all_seeds]
-            axes.plot(x, mean, marker=mark, color=colour, label=signal, linewidth=2)
-            low, high = ([getattr(s, k) for s in all_seeds] for k in ("low", "high"))
-            axes.fill_between(x, low, high, color=colour, alpha=0.18, linewidth=0)
-            for reach, row in zip(ranges, rows, strict=True):
-                axes.plot([reach] * len(row), row, ".", color=colour, markersize=4)
+        for number, (signal, style) in enumerate(_STYLES.items()):
+            by_range = {
+                r: list(table[cells[s, r]].values())
+                for s, r in sorted(cells)
+                if s == signal
+            }
+            if by_range:
+                _draw_signal(axes, by_range, style, _SHIFT ** (number - 1), signal)
         for coverage, colour in (("none", _BLIND), ("oracle", _ORACLE)):
             cell = _unskinned(manifest, coverage)
             if cell is not None and table.get(cell.name):
@@ -159,7 +158,7 @@ def success_by_range(
         axes.set_xscale("log")
         axes.set_xticks(ticks, [f"{t:g}" for t in ticks], minor=False)
         axes.xaxis.minorticks_off()
-        axes.set(title=name, ylim=(0, 100))
+        axes.set(title=name, ylim=(0, 100), xlim=(ticks[0] / 1.15, ticks[-1] * 1.15))
         _plain(axes)
     panels[0].set_ylabel("success: untouched for 3 s [%]")
     for row in lower:
@@ -170,6 +169,27 @@ def success_by_range(
         axes.set_xlabel("detection range [m]")
     _legend_above(figure, panels)
     return figure
+
+
+def _draw_signal(
+    axes: Axes,
+    by_range: Mapping[float, Sequence[float]],
+    style: tuple[str, str],
+    shift: float,
+    label: str,
+) -> None:
+    """Draw the success of a signal against range, from the values of its seeds."""
+    colour, mark = style
+    x = [reach * shift for reach in by_range]
+    all_seeds = [spread(values) for values in by_range.values()]
+    mean = [s.iqm for s in all_seeds]
+    axes.plot(x, mean, marker=mark, color=colour, label=label, linewidth=2)
+    for at, own, values in zip(x, all_seeds, by_range.values(), strict=True):
+        if own.seeds == 1:
+            axes.plot(at, own.iqm, mark, color=colour, markerfacecolor="white")
+        else:
+            axes.vlines(at, own.low, own.high, color=colour, linewidth=6, alpha=0.4)
+            axes.plot([at] * own.seeds, values, ".", color="black", markersize=3)
 
 
 def _warnings(
@@ -328,7 +348,15 @@ def forest(judged: Sequence[Judged]) -> Figure:
         colour = _VERDICTS[each.verdict]
         mark = " (stand-in)" * bool(each.finding.stand_in)
         title = f"{each.finding.label}  {each.finding.text}{mark}: {each.verdict}"
-        axes.text(-99, y, title, fontsize=8.5, weight="bold", color=colour, va="center")
+        axes.text(
+            *(-99, y, title),
+            fontsize=8.5,
+            weight="bold",
+            color=colour,
+            va="center",
+            # Above the line at 0.
+            bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0},
+        )
         y += 1
         for claim in each.claims:
             low, high = np.clip(
@@ -336,7 +364,8 @@ def forest(judged: Sequence[Judged]) -> Figure:
             )
             axes.barh(y, high - low, left=low, height=0.9, color="#E9E3B4", linewidth=0)
             if claim.effect is None:
-                axes.text(0, y, " no runs", fontsize=7, color="#888888", va="center")
+                text = " a cell has no run"
+                axes.text(0, y, text, fontsize=7, color="#888888", va="center")
             else:
                 _draw_effect(axes, y, claim.effect, colour)
             ticks.append(y)

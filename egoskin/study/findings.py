@@ -96,6 +96,8 @@ class Judged:
     """P-value of the verdict (or of the likelier one), after Holm's correction."""
     seeds_needed: int | None
     """Seeds per cell needed to decide it; None if unknown or if no number is enough."""
+    deciding: tuple[Tested, ...]
+    """The claims that these seeds are about: all to confirm it, one to refute it."""
 
 
 def cell(coverage: str, signal: str, reach: float, *, reduced: bool = False) -> str:
@@ -258,13 +260,15 @@ def judge_findings(tables: Mapping[str, Table]) -> list[Judged]:
         verdict: Verdict = "undecided"
         if p <= ALPHA:
             verdict = "confirmed" if up else "refuted"
+        needed, deciding = _needed(claims, tables[finding.metric])
         result.append(
             Judged(
                 finding=finding,
                 claims=tuple(claims),
                 verdict=verdict,
                 p_value=p,
-                seeds_needed=_needed(claims, tables[finding.metric]),
+                seeds_needed=needed,
+                deciding=tuple(deciding),
             )
         )
     return result
@@ -286,25 +290,33 @@ def _test(finding: Finding, table: Table) -> list[Tested]:
     return result
 
 
-def _needed(claims: Sequence[Tested], table: Table) -> int | None:
-    """Return the number of seeds that decides a finding in its present direction."""
+def _needed(
+    claims: Sequence[Tested], table: Table
+) -> tuple[int | None, Sequence[Tested]]:
+    """Return the seeds that decide a finding in its present direction, and by what.
+
+    Returns:
+        Seeds per cell, and the claims whose cells need them.
+    """
     # Bonferroni, as if all findings were to be decided at once.
     alpha = ALPHA / len(FINDINGS)
     confirm: list[float] = []
-    refute: list[int | None] = []
+    refute: list[tuple[float, float, Tested]] = []
     for tested in claims:
         effect, region = tested.effect, tested.claim.region
         if effect is None:
             confirm.append(math.nan)
             continue
-        sd = assumed_sd(effect, tested.claim.weights.values(), table)
-        distances = [abs(effect.mean - bound) / sd for bound in region.bounds]
-        confirm += distances
+        sd = assumed_sd(effect, tested.claim.weights, table)
+        gaps = [abs(effect.mean - bound) for bound in region.bounds]
+        confirm += [gap / sd for gap in gaps]
         if effect.mean not in region:
             # Only the end beyond which it lies; Bonferroni over all ends of all claims.
-            level = alpha / len(distances) / len(claims)
-            refute.append(seeds_needed([min(distances)], level))
+            level = alpha / len(gaps) / len(claims)
+            needed = seeds_needed([min(gaps) / sd], level)
+            refute.append((needed or math.inf, -min(gaps), tested))
     if refute:
-        # A single refuted claim is enough.
-        return min((n for n in refute if n is not None), default=None)
-    return seeds_needed(confirm, alpha)
+        # A single refuted claim is enough: the first, or the farthest from its region.
+        needed, _, tested = min(refute, key=lambda each: each[:2])
+        return (int(needed) if math.isfinite(needed) else None), [tested]
+    return seeds_needed(confirm, alpha), claims

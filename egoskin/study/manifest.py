@@ -273,9 +273,7 @@ class Manifest:
                     + ", ".join(names)
                 )
         seeds = dict.fromkeys((*self.seeds, *other.seeds))
-        return dataclasses.replace(
-            self, cells=tuple(own.values()), seeds=tuple(seeds), purpose=other.purpose
-        )
+        return dataclasses.replace(self, cells=tuple(own.values()), seeds=tuple(seeds))
 
     def save(self, path: Path) -> None:
         """Write the manifest."""

@@ -102,8 +102,9 @@ def _pictures(
     drawn = {
         "success-by-range": (
             success_by_range(manifest, success, seen),
-            "Success against range: interquartile mean and range over seeds; each dot "
-            f"is a seed. {warnings if seen else ''}Infinite ranges are left out.",
+            "Success against range: interquartile mean (hollow: one seed) and range "
+            f"(bars) over seeds; each dot is a seed. {warnings if seen else ''}"
+            "Infinite ranges are left out.",
         ),
         "findings": (
             forest(judged) if judged else None,
@@ -143,7 +144,8 @@ def _blocks(
     """Yield the parts of the report, in Markdown."""
     plan, total = manifest.evaluation, len(manifest.runs)
     yield f"# Study {manifest.study}"
-    purpose = manifest.purpose and f"{manifest.purpose}. "
+    end = "" if manifest.purpose.endswith((".", "!", "?")) else "."
+    purpose = manifest.purpose and f"{manifest.purpose}{end} "
     yield (
         f"{purpose[:1].upper()}{purpose[1:]}{len(results)} of "
         f"{total} runs are done. Evaluated on standard {plan.standard}, throw set "
@@ -152,6 +154,7 @@ def _blocks(
     )
     if not results:
         yield "There are no results yet."
+        yield from _missing_runs(folder, manifest)
         return
     if judged:
         yield _answer(judged)
@@ -163,27 +166,36 @@ def _blocks(
             "The tests were fixed in code before the runs. A finding is confirmed if "
             "each of its claims lies in its region, and refuted if one lies outside; "
             "p-values are corrected for the number of findings (Holm). The table shows "
-            "the deciding claim. *Seeds* is the number it is based on and, if it is "
+            "the deciding claim; an undecided finding has the p-value of the verdict "
+            "it is nearer to. *Seeds* is the number it is based on and, if it is "
             "undecided, the total that would decide it with a power of 80 % if effect "
-            "and spread stay as observed. Findings about another budget are tested by "
-            "a stand-in."
+            "and spread stay as observed. (The spread of cells with one seed is taken "
+            "to be the largest of any cell.) Findings about another budget are tested "
+            "by a stand-in."
         )
         yield _finding_rows(judged, results)
         yield shown["findings"]
+    first = manifest.cells[0].name
+    if not judged and len(manifest.cells) > 1 and not values["success_3s"].get(first):
+        yield "## Differences to the first cell"
+        yield f"Unknown: {first} has no finished run."
     if found:
         yield "## Differences to the first cell"
         yield (
-            f"Success at 3 s of each cell minus that of {manifest.cells[0].name}, "
+            f"Success at 3 s of each cell minus that of {first}, "
             "compared seed by seed if they share two or more seeds. Two-sided "
             "p-values, corrected for the number of cells (Holm). *Seeds* is the number "
             "it is based on and, if p is above 0.05, the total that would decide it "
-            "with a power of 80 % if effect and spread stay as observed."
+            "with a power of 80 % if effect and spread stay as observed. (The spread "
+            "of cells with one seed is taken to be the largest of any cell.)"
         )
         yield _difference_rows(found)
     yield "## The cells"
     yield (
         "Interquartile mean and range over seeds; in brackets the mean with its 95 % "
-        "t interval, which needs two seeds or more; n: if only some seeds have a value."
+        "t interval, which needs two seeds or more and, assuming that they are "
+        "normally distributed, may leave 0 to 100 %; n: if only some seeds have a "
+        "value."
     )
     yield _cell_rows(manifest, values)
     for name in ("equivalence", "learning-curves", "sample-efficiency"):
@@ -192,7 +204,8 @@ def _blocks(
     yield "## How well each metric separates the cells"
     yield (
         "Standard deviation between cells divided by that between the seeds of a cell: "
-        "at 1, two cells differ about as much as two seeds of one cell."
+        "at 1, two cells differ about as much as two seeds of one cell. Only cells "
+        "with two seeds tell the spread, and those near 0 or 100 % have hardly any."
     )
     ratios = [(separation(values[m.name]), m) for m in _SHOWN]
     known = sorted((r for r in ratios if r[0] >= 0), key=lambda r: -r[0])
@@ -206,9 +219,7 @@ def _blocks(
     if seen:
         yield "## What the skins see, without training"
         yield _seen_rows(seen)
-    yield "## Missing runs"
-    missing = [s for s in folder.status(manifest.runs) if s.state != "done"]
-    yield ", ".join(map(_missing, missing)) or "None: all runs are done."
+    yield from _missing_runs(folder, manifest)
     yield "## The runs"
     yield (
         "Settings that differ from the default, in all runs: "
@@ -230,6 +241,12 @@ def _blocks(
     )
 
 
+def _missing_runs(folder: StudyFolder, manifest: Manifest) -> Iterator[str]:
+    yield "## Missing runs"
+    missing = [s for s in folder.status(manifest.runs) if s.state != "done"]
+    yield ", ".join(map(_missing, missing)) or "None: all runs are done."
+
+
 def _missing(status: RunStatus) -> str:
     name, state = status.run.name, status.state
     return name if state == "missing" else f"{name} ({state})"
@@ -249,7 +266,8 @@ def _deciding(judged: Judged) -> Tested:
     """Return the claim that decides a verdict: the least certain or the refuted one."""
     if judged.verdict == "refuted":
         return min(judged.claims, key=lambda c: c.p_refute)
-    known = [c for c in judged.claims if c.effect is not None]
+    claims = judged.claims if judged.verdict == "confirmed" else judged.deciding
+    known = [c for c in claims if c.effect is not None]
     return max(known, key=lambda c: c.p_confirm)
 
 
@@ -270,7 +288,7 @@ def _finding_rows(judged: Sequence[Judged], results: Sequence[Result]) -> str:
         known = sum(c.effect is not None for c in j.claims)
         more = cost = ""
         if j.verdict == "undecided":
-            cells = {name for c in j.claims for name in c.claim.weights}
+            cells = {name for c in j.deciding for name in c.claim.weights}
             more = _more(j.seeds_needed)
             if j.seeds_needed is not None and hours:
                 runs = sum(max(j.seeds_needed - have[c], 0) for c in cells)

@@ -9,7 +9,7 @@ Contract: nothing is decided if the spread is zero, or unknown as there is one s
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -183,20 +183,25 @@ def contrast(weights: Mapping[str, float], table: Table) -> Effect | None:
     )
 
 
-def assumed_sd(effect: Effect, weights: Collection[float], table: Table) -> float:
+def assumed_sd(effect: Effect, weights: Mapping[str, float], table: Table) -> float:
     """Return the standard deviation of a contrast of one seed per cell.
 
-    If it is unknown or zero, the pooled spread of all cells and unpaired seeds are
-    assumed; NaN if that is unknown too.
+    If it is unknown or zero, unpaired seeds are assumed whose spread is that of the
+    contrast's own cells or, if unknown too, the largest of any cell: cells near 0 or
+    100 % hardly vary. NaN if no cell has two seeds that differ.
 
     Args:
         effect: The contrast.
-        weights: Weights of its cells.
+        weights: Weight of each of its cells.
         table: Values of the metric.
     """
     if effect.sd > 0:
         return effect.sd
-    return seed_sd(table) * math.sqrt(sum(w**2 for w in weights)) or math.nan
+    sd = seed_sd({name: table.get(name, {}) for name in weights})
+    if not sd > 0:
+        each = [seed_sd({name: values}) for name, values in table.items()]
+        sd = max((x for x in each if x > 0), default=math.nan)
+    return sd * math.sqrt(sum(w**2 for w in weights.values()))
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
@@ -221,22 +226,30 @@ def seeds_needed(distances: Sequence[float], alpha: float = ALPHA) -> int | None
     Returns:
         Total number of seeds; None if a distance is unknown or no number is enough.
     """
+    if any(math.isnan(d) for d in distances):
+        return None
 
     def power(n: int) -> float:
         critical = float(stats.t.ppf(1 - alpha, n - 1))
+        missed = _noncentral_t(critical, n - 1, np.array(distances) * math.sqrt(n))
         # For several tests, a lower bound.
-        missed = sum(
-            float(stats.nct.cdf(critical, n - 1, d * math.sqrt(n))) for d in distances
-        )
-        return 1 - missed
+        return 1 - float(missed.sum())
 
-    if not power(_MOST_SEEDS) >= POWER:
+    if power(_MOST_SEEDS) < POWER:
         return None
     low, high = 1, _MOST_SEEDS
     while high - low > 1:
         middle = (low + high) // 2
         low, high = (low, middle) if power(middle) >= POWER else (middle, high)
     return high
+
+
+def _noncentral_t(t: float, df: int, noncentrality: np.ndarray) -> np.ndarray:
+    """Return the distribution function of the noncentral t distribution."""
+    exact = stats.nct.cdf(t, df, noncentrality)
+    # SciPy 1.17 gives NaN near a noncentrality of 39. Abramowitz and Stegun, 26.7.10:
+    z = (t * (1 - 1 / (4 * df)) - noncentrality) / math.sqrt(1 + t**2 / (2 * df))
+    return np.where(np.isnan(exact), stats.norm.cdf(z), exact)
 
 
 def separation(table: Table) -> float:

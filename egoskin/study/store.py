@@ -318,11 +318,10 @@ class StudyFolder:
         write_file(path, (json.dumps(dataclasses.asdict(failure)) + "\n").encode())
         return failure
 
-    def forget_failures(self) -> None:
-        """Delete all failures, so that runs that failed too often are tried again."""
-        for path in (self.path / "failed").glob("*.json"):
-            # A run that finishes meanwhile deletes its own.
-            path.unlink(missing_ok=True)
+    def forget_failures(self, runs: Iterable[PlannedRun]) -> None:
+        """Delete the failures of runs, so that they are tried again."""
+        for run in runs:
+            self._failure_path(run.name).unlink(missing_ok=True)
 
     def last_words(self, name: str) -> str:
         """Return the last error of a run's latest process, or else its last line.
@@ -403,11 +402,13 @@ def _check_files(planned: PlannedRun, run: Run) -> None:
     """Raise ValueError unless a run has the skin and initial networks of its cell."""
     cell = planned.cell
     if content_hash(read_json(run.skin_path)) != cell.skin_sha256:
-        raise ValueError(
-            f"{run.skin_path} is not the skin of the study's cell {cell.name}: the "
-            "skin file or the placement of sensors in this version of egoskin has "
-            "changed"
+        path = cell.config.env.skin.path
+        what = (
+            f"{path} has changed: it"
+            if path is not None
+            else "the placement of sensors in this version of egoskin has changed: it"
         )
+        raise ValueError(f"{what} is not the skin of the study's cell {cell.name}")
     _, hashes = read_config(run.path / "config.json")
     if cell.init_sha256 not in (None, hashes.get(INIT_HASH)):
         raise ValueError(

@@ -9,6 +9,7 @@ import pytest
 
 from egoskin.runs.config import TrainConfig
 from egoskin.storage.serialization import from_plain, read_json, to_plain
+from egoskin.study.manifest import Study
 
 
 def test_a_configuration_comes_back(tmp_path):
@@ -41,6 +42,25 @@ def test_a_range_that_is_none_is_named(value: Any):
     plain["env"]["task"]["throws"]["interval"] = value
     with pytest.raises(ValueError, match=r"my\.json: .*env\.task\.throws\.interval"):
         from_plain(TrainConfig, plain, "my.json")
+
+
+@pytest.mark.parametrize(
+    ("content", "text"),
+    [
+        ({"standard": 2}, r'standard must be one of "2", "1", "paper", got 2'),
+        ({"seeds": ["0"]}, r'seeds must be a list, each item an integer, got \["0"\]'),
+        ({"seeds": "all"}, r"seeds must be a list, each item an integer$"),
+        ({"purpose": 3}, "purpose must be a string, got 3"),
+        ({"frame": 1}, "there is no field 'frame', did you mean 'frames'?"),
+        ({}, "name is missing"),
+    ],
+)
+def test_the_types_of_a_study_file_are_told_in_words(content, text):
+    if content:
+        content = {"name": "a", "cells": [{}], "seeds": [0], "frames": 1, **content}
+        content = {"purpose": "", **content}
+    with pytest.raises(ValueError, match=text):
+        from_plain(Study, content, "my.json")
 
 
 def test_a_range_of_whole_numbers_is_one_of_numbers():

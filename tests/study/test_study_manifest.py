@@ -246,6 +246,16 @@ def test_a_study_begun_before_options_changed_goes_on_as_it_was(tmp_path: Path):
     assert "compile_kernels" not in folder.manifest_path.read_text()
 
 
+def test_seeds_are_added_without_a_change_of_the_purpose():
+    more = dataclasses.replace(
+        STUDY, purpose="one more", seeds=(7,), cells=STUDY.cells[:1]
+    )
+    manifest = resolve(STUDY).extended(resolve(more))
+    assert manifest.purpose == "to test"
+    assert manifest.seeds == (*STUDY.seeds, 7)
+    assert len(manifest.cells) == len(STUDY.cells)
+
+
 def test_a_default_that_changes_changes_no_study_that_has_begun(tmp_path: Path):
     folder = StudyFolder(tmp_path)
     folder.plan(resolve(STUDY))

@@ -351,7 +351,9 @@ def test_status_tells_failures_and_what_is_left(folder: StudyFolder):
     running = RunStatus(run=planned, state="running", frames=half, per_s=float(half))
     assert Progress.of([*status[:2], running]).left_s == pytest.approx(3)
     assert Progress.of([*status[:2], running], tries=2).left_s == pytest.approx(1)
-    folder.forget_failures()
+    folder.forget_failures(manifest.runs[:1])
+    assert folder.status(manifest.runs)[1].state == "failed"
+    folder.forget_failures(manifest.runs)
     assert folder.status(manifest.runs)[1].state == "missing"
 
 
@@ -388,16 +390,13 @@ def test_status_says_where_a_run_is_running(folder: StudyFolder, capsys):
     assert "running on" not in capsys.readouterr().out
 
 
-def test_a_failure_that_is_forgotten_meanwhile_is_none(
-    folder: StudyFolder, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_failure_that_is_forgotten_meanwhile_is_none(folder: StudyFolder):
     # Another runner's job finishes the run while this one reads.
     folder.note_failure(NAME, "error")
     (path,) = folder.path.glob("failed/*.json")
     path.unlink()
     assert folder.failure(NAME) is None
-    monkeypatch.setattr(Path, "glob", lambda folder, pattern: [path])
-    folder.forget_failures()
+    folder.forget_failures(folder.manifest().runs)
 
 
 def test_a_study_costs_whole_runs_on_whole_cores(tiny: Manifest):

@@ -12,6 +12,7 @@ from egoskin.study.findings import ABOVE, FINDINGS, SAME, judge_findings
 from egoskin.study.statistics import (
     Effect,
     Region,
+    assumed_sd,
     contrast,
     holm,
     interquartile_mean,
@@ -158,6 +159,30 @@ def test_the_seeds_needed_have_the_power_that_is_asked():
     # No number decides an effect on its bound, or one whose spread is unknown.
     assert seeds_needed([0.0]) is None
     assert seeds_needed([1.0, math.nan]) is None
+
+
+@pytest.mark.parametrize("alpha", [0.05, 0.025, 0.05 / 9, 0.05 / 180])
+def test_a_larger_effect_never_needs_more_seeds(alpha):
+    needed = [seeds_needed([d], alpha) for d in np.arange(0.3, 9, 0.1)]
+    assert None not in needed
+    assert needed == sorted(needed, reverse=True)
+    assert seeds_needed([40.0], alpha) in (2, 3)
+
+
+def test_the_spread_of_cells_without_repeated_seeds_is_the_largest_of_any_cell():
+    table = {"a": {0: 10.0}, "b": {0: 30.0}, "floor": {0: 0.0, 1: 0.1}}
+    table["wide"] = {0: 50.0, 1: 54.0}
+    weights = {"a": -1.0, "b": 1.0}
+    wide = math.sqrt(2) * stats.tstd([50.0, 54.0])
+    effect = contrast(weights, table)
+    assert effect is not None
+    assert assumed_sd(effect, weights, table) == pytest.approx(wide)
+    # A spread of its own counts alone.
+    weights = {"a": -1.0, "floor": 1.0}
+    effect = contrast(weights, table)
+    assert effect is not None
+    own = math.sqrt(2) * stats.tstd([0.0, 0.1])
+    assert assumed_sd(effect, weights, table) == pytest.approx(own)
 
 
 def test_a_metric_that_sets_cells_apart_is_told_from_one_that_does_not():
@@ -309,7 +334,7 @@ def test_the_family_errs_in_five_percent_at_most():
     # its bound. "The same" and "not worse" are true there, and cannot err.
     # In a fixed order: each draws in turn.
     names = sorted({n for f in FINDINGS for c in f.claims for n in c.weights})
-    draw, trials, wrong = np.random.default_rng(2), 400, 0
+    draw, trials, wrong = np.random.default_rng(2), 2000, 0
     true = {"2", "5"}
     for _ in range(trials):
         table = {n: dict(enumerate(draw.normal(0.0, 2.0, 3))) for n in names}
