@@ -40,7 +40,6 @@ from egoskin.progress import StatusLine, counted
 from egoskin.rng import check_seed
 from egoskin.sensors import MASK_ALL
 from egoskin.storage.files import check_output
-from egoskin.viewer.film import check_path
 
 PICTURE_SUFFIXES = (".png", ".svg", ".pdf")
 
@@ -88,8 +87,8 @@ class EvaluateConfig:
         check_bounds(self)
         check_num_workers(self.episodes, self.num_workers, "episodes")
         check_output(self.json, "--json")
+        check_output(self.map, "--map", PICTURE_SUFFIXES)
         if self.map is not None:
-            check_path(self.map, PICTURE_SUFFIXES)
             check_packages("--map", "plot", "matplotlib")
         engine_of(self.engine)
         if self.engine == "mujoco" and device_of(self.device).type != "cpu":

@@ -17,8 +17,7 @@ from egoskin.commands.errors import check_packages
 from egoskin.policies.export import export_onnx, observation_parts
 from egoskin.policies.policy import load_policy
 from egoskin.runs.starts import git_state
-from egoskin.storage.files import check_output
-from egoskin.storage.tensor_file import write_file
+from egoskin.storage.files import check_output, write_file
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,13 +28,13 @@ class ExportConfig:
     """Run folder (its latest checkpoint), checkpoint, policy file, or the name of a
     policy that comes with the package."""
     out: Path
-    """File to write."""
+    """File to write, ``.onnx``."""
     to: Literal["onnx"] = "onnx"
     """Format: ONNX, opset 13, with all that a robot needs as JSON metadata."""
 
     def __post_init__(self) -> None:
         """Raise ValueError if the file cannot be written or a package is missing."""
-        check_output(self.out, "--out")
+        check_output(self.out, "--out", (".onnx",))
         check_packages("export", "export", "onnx", "onnxruntime")
 
 

@@ -35,9 +35,9 @@ from egoskin.make import EnvConfig
 from egoskin.policies.policy import load_policy
 from egoskin.progress import StatusLine, counted
 from egoskin.rng import check_seed
+from egoskin.storage.files import check_output
 from egoskin.viewer.film import (
     FILM_SUFFIXES,
-    check_path,
     contact_sheet,
     save_film,
     save_picture,
@@ -83,8 +83,8 @@ class RenderConfig:
 
     def __post_init__(self) -> None:
         """Raise ValueError for invalid values or files that cannot be written."""
-        check_path(self.out, FILM_SUFFIXES)
-        check_path(self.sheet_path, (".png",))
+        check_output(self.out, "--out", FILM_SUFFIXES)
+        check_output(self.sheet_path, "--sheet", (".png",))
         check_seed(self.throw_set, "throw_set")
         check_bounds(self)
         if self.policy is not None and self.env != EnvConfig():

@@ -27,7 +27,8 @@ from egoskin.robots.builtin import ROBOTS
 from egoskin.robots.config import RobotConfig
 from egoskin.robots.own import find_robot, portable
 from egoskin.sensors.config import SkinConfig
-from egoskin.viewer.film import check_path, save_picture
+from egoskin.storage.files import check_output
+from egoskin.viewer.film import save_picture
 
 # Duration of the standing test with zero action [s].
 _STAND_S = 2.0
@@ -62,8 +63,7 @@ class Check:
         Raises:
             ValueError: If the robot cannot be trained.
         """
-        if self.out is not None:
-            check_path(self.out, (".png",))
+        check_output(self.out, "--out", (".png",))
         robot = find_robot(self.robot)
         if ROBOTS.get(robot.name) is not robot:
             robot = portable(robot)

@@ -34,7 +34,8 @@ from egoskin.sensors.skin.coverage import Coverage
 from egoskin.sensors.skin.gentact import load_gentact, save_gentact
 from egoskin.sensors.skin.mesh_surface import Meshes, meshes_in_folder, meshes_of_mjcf
 from egoskin.sensors.skin.placement import place_sensors
-from egoskin.viewer.film import check_path, save_picture
+from egoskin.storage.files import check_output
+from egoskin.viewer.film import save_picture
 from egoskin.viewer.offscreen import CameraConfig, Painter
 
 # Placing this many sensors takes long enough for a message.
@@ -95,7 +96,7 @@ class Place:
 
     def run(self) -> None:
         """Write the skin."""
-        check_path(self.out, (".json",))
+        check_output(self.out, "--out", (".json",))
         density = {}
         for link, weight in _pairs(self.density, "--density").items():
             try:
@@ -144,7 +145,7 @@ class Import:
 
     def run(self) -> None:
         """Write the skin."""
-        check_path(self.out, (".json",))
+        check_output(self.out, "--out", (".json",))
         robot = find_robot(self.robot)
         skin = load_gentact(
             self.files,
@@ -194,7 +195,7 @@ class Export:
 
     def run(self) -> None:
         """Write the CSV."""
-        check_path(self.out, (".csv",))
+        check_output(self.out, "--out", (".csv",))
         skin = Skin.load(self.skin)
         lost = save_gentact(skin, self.out)
         note = f"; GenTact's format does not hold {', '.join(lost)}" if lost else ""
@@ -215,8 +216,7 @@ class Show:
 
     def run(self) -> None:
         """Print the summary; write the picture."""
-        if self.picture is not None:
-            check_path(self.picture, (".png",))
+        check_output(self.picture, "--picture", (".png",))
         skin = Skin.load(self.skin)
         robot = ROBOTS.get(skin.robot)
         if self.robot is not None:

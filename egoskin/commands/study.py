@@ -27,8 +27,8 @@ from egoskin.commands.errors import check_packages, parse_subcommand
 from egoskin.evaluation.visibility import alike, analyse, warning_texts
 from egoskin.parallel import available_cores
 from egoskin.progress import counted, duration
+from egoskin.storage.files import write_file
 from egoskin.storage.serialization import to_plain
-from egoskin.storage.tensor_file import write_file
 from egoskin.study.claims import owner
 from egoskin.study.cost import Speed, cost, measure_all
 from egoskin.study.fields import settings

@@ -44,8 +44,8 @@ from egoskin.progress import counted
 from egoskin.robots.own import find_robot
 from egoskin.sensors import Field, Ray
 from egoskin.sensors.config import SensorConfig, SkinConfig
+from egoskin.storage.files import check_output
 from egoskin.storage.serialization import to_plain
-from egoskin.viewer.film import check_path
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".svg", ".pdf")
 BLIND, NOWHERE = "#c1272d", "#e6e6e6"
@@ -218,8 +218,8 @@ def main(args: list[str]) -> None:
     """Run the command."""
     config = tyro.cli(VisibilityConfig, args=args, description=__doc__)
     # Check before the analysis, which takes minutes.
-    check_path(config.out, PICTURE_SUFFIXES)
-    check_path(config.json, (".json",))
+    check_output(config.out, "--out", PICTURE_SUFFIXES)
+    check_output(config.json, "--json", (".json",))
     robot = find_robot(config.robot)
     skin = config.skin.build(robot)
     physics = PhysicsConfig()

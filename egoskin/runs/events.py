@@ -16,6 +16,8 @@ from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.summary.writer.record_writer import RecordWriter
 
+from egoskin.storage.files import named
+
 _PREFIX = "events.out.tfevents."
 
 
@@ -60,8 +62,7 @@ class EventFile:
         try:
             self._writer.write(event.SerializeToString())
         except OSError as error:
-            # The system's error text for a full disk does not name the file.
-            raise OSError(error.errno, error.strerror, str(self._path)) from error
+            raise named(error, self._path) from error
 
     def close(self) -> None:
         """Close the file."""

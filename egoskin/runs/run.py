@@ -52,21 +52,14 @@ from egoskin.runs.events import EventFile
 from egoskin.runs.starts import describe_start
 from egoskin.runs.wandb_log import WandbLog
 from egoskin.sensors import Skin
-from egoskin.storage.files import read_regular
+from egoskin.storage.files import PARTIAL, append, read_regular, write_file
 from egoskin.storage.formats import content_hash, sealed_json, unseal
 from egoskin.storage.serialization import (
     changed_fields,
     read_json,
     to_plain,
 )
-from egoskin.storage.tensor_file import (
-    PARTIAL,
-    append,
-    load_tensors,
-    named,
-    save_tensors,
-    write_file,
-)
+from egoskin.storage.tensor_file import load_tensors, save_tensors
 
 T = TypeVar("T")
 
@@ -128,10 +121,7 @@ class Run:
             )
         (path / "policies").mkdir(parents=True)
         run = cls(path, config)
-        try:
-            skin.save(run.skin_path)
-        except OSError as error:
-            raise named(error, run.skin_path) from error
+        skin.save(run.skin_path)
         run._hashes = hashes
         run._initial = None if initial is None else initial[0]
         # Written last, because a folder with a configuration can be resumed.

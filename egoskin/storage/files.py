@@ -1,4 +1,4 @@
-"""Read external files: only regular files, up to a maximum size.
+"""Read external files, up to a maximum size, and write files atomically.
 
 Contract: no function here waits for a named pipe, opens a device or fills memory.
 """
@@ -7,10 +7,15 @@ from __future__ import annotations
 
 import os
 import stat
+from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 TEXT_LIMIT = 64 * 2**20
 """Maximum size of a text file: a skin, a robot, a configuration [bytes]."""
+
+PARTIAL = ".*.partial"
+"""Pattern of the incomplete files of processes that were killed while writing."""
 
 _KINDS = {
     stat.S_IFDIR: "a folder",
@@ -58,15 +63,18 @@ def read_regular(path: Path | str, limit: int = TEXT_LIMIT) -> bytes:
         return file.read(status.st_size)
 
 
-def check_output(path: Path | None, option: str) -> None:
+def check_output(path: Path | None, option: str, suffixes: Sequence[str] = ()) -> None:
     """Raise ValueError if a file cannot be written; call this before the work starts.
 
     Args:
         path: The file; None: there is no file to write.
         option: The option that named it, for the error text.
+        suffixes: Its allowed suffixes; empty: any.
     """
     if path is None:
         return
+    if suffixes and path.suffix.lower() not in suffixes:
+        raise ValueError(f"{option}: {path} must end in {' or '.join(suffixes)}")
     if not path.parent.is_dir():
         raise ValueError(f"{option}: there is no folder {path.parent}")
     if os.path.isdir(path):
@@ -86,6 +94,63 @@ def check_output(path: Path | None, option: str) -> None:
         raise ValueError(text) from None
     if pipe:
         raise ValueError(f"{option}: {path} is a named pipe, not a file")
+
+
+def write_file(path: Path, content: bytes) -> None:
+    """Write a file atomically: it is complete and on disk, or unchanged.
+
+    A process that is killed while writing leaves a file that `PARTIAL` matches. An
+    existing link is replaced, never followed.
+
+    Raises:
+        OSError: If it cannot be written; the text names the file.
+    """
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        # A leftover file, or a link placed there for us to follow.
+        partial.unlink(missing_ok=True)
+        with open(partial, "xb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(partial, path)
+        _sync_folder(path.parent)
+    except OSError as error:
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)
+        raise named(error, path) from error
+
+
+def append(path: Path, content: bytes) -> None:
+    """Append to an existing file that is not a link.
+
+    Raises:
+        OSError: If it does not exist or cannot be written; the text names it.
+    """
+    try:
+        with open(path, "ab", opener=_open_to_append) as file:
+            file.write(content)
+    except OSError as error:
+        raise named(error, path) from error
+
+
+def _open_to_append(path: str, flags: int) -> int:
+    kept = flags & ~os.O_CREAT
+    return os.open(path, kept | os.O_NOFOLLOW | os.O_NONBLOCK)
+
+
+def named(error: OSError, path: Path) -> OSError:
+    """Return an error that names a file; the system's error of a full disk does not."""
+    return OSError(error.errno, error.strerror, str(path))
+
+
+def _sync_folder(path: Path) -> None:
+    """Wait until the entries of a folder are on disk."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def _open_without_waiting(path: str, flags: int) -> int:

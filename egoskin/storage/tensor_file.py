@@ -7,9 +7,7 @@ sealed together, see `egoskin.storage.formats`: a damaged file does not load.
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +15,10 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
+from egoskin.storage.files import write_file
 from egoskin.storage.formats import present_header, seal, unseal
 
 _HEADER = "egoskin"
-# Pattern of the incomplete files of processes that were killed while writing.
-PARTIAL = ".*.partial"
 
 
 def save_tensors(
@@ -40,63 +37,6 @@ def save_tensors(
     own = {key: value.detach().cpu().contiguous() for key, value in tensors.items()}
     content = save(own, metadata={_HEADER: json.dumps(seal(header, own))})
     write_file(path, content)
-
-
-def write_file(path: Path, content: bytes) -> None:
-    """Write a file atomically: it is complete and on disk, or unchanged.
-
-    A process that is killed while writing leaves a file that `PARTIAL` matches. An
-    existing link is replaced, never followed.
-
-    Raises:
-        OSError: If it cannot be written; the text names the file.
-    """
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        # A leftover file, or a link placed there for us to follow.
-        partial.unlink(missing_ok=True)
-        with open(partial, "xb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, path)
-        _sync_folder(path.parent)
-    except OSError as error:
-        with suppress(OSError):
-            partial.unlink(missing_ok=True)
-        raise named(error, path) from error
-
-
-def append(path: Path, content: bytes) -> None:
-    """Append to an existing file that is not a link.
-
-    Raises:
-        OSError: If it does not exist or cannot be written; the text names it.
-    """
-    try:
-        with open(path, "ab", opener=_open_to_append) as file:
-            file.write(content)
-    except OSError as error:
-        raise named(error, path) from error
-
-
-def _open_to_append(path: str, flags: int) -> int:
-    kept = flags & ~os.O_CREAT
-    return os.open(path, kept | os.O_NOFOLLOW | os.O_NONBLOCK)
-
-
-def named(error: OSError, path: Path) -> OSError:
-    """Return an error that names a file; the system's error of a full disk does not."""
-    return OSError(error.errno, error.strerror, str(path))
-
-
-def _sync_folder(path: Path) -> None:
-    """Wait until the entries of a folder are on disk."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def load_tensors(

@@ -35,6 +35,7 @@ from egoskin.runs.config import (
     TrainConfig,
 )
 from egoskin.sensors import Skin
+from egoskin.storage.files import write_file
 from egoskin.storage.formats import (
     content_hash,
     present_config,
@@ -47,7 +48,6 @@ from egoskin.storage.serialization import (
     read_json,
     to_plain,
 )
-from egoskin.storage.tensor_file import write_file
 from egoskin.study.fields import (
     FILES,
     Overrides,

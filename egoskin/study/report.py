@@ -15,8 +15,8 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from egoskin.evaluation.visibility import warning_texts
+from egoskin.storage.files import write_file
 from egoskin.storage.serialization import read_json
-from egoskin.storage.tensor_file import write_file
 from egoskin.study.differences import Difference, differences
 from egoskin.study.fields import settings
 from egoskin.study.figures import (

@@ -29,9 +29,10 @@ from typing import Any, Literal
 
 from egoskin.runs.config import INIT_HASH, read_config
 from egoskin.runs.run import Run
+from egoskin.storage.files import write_file
 from egoskin.storage.formats import content_hash, read_sealed, sealed_json
 from egoskin.storage.serialization import read_json
-from egoskin.storage.tensor_file import load_tensors, write_file
+from egoskin.storage.tensor_file import load_tensors
 from egoskin.study.claims import is_claimed, is_locked
 from egoskin.study.manifest import Manifest, PlannedRun
 from egoskin.study.stored import StoredRun, load_run, record, thin, to_json

@@ -14,8 +14,7 @@ import imageio_ffmpeg
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
-from egoskin.storage.files import check_output
-from egoskin.storage.tensor_file import write_file
+from egoskin.storage.files import check_output, write_file
 
 # Time for which the last picture is held [s].
 _LAST_PICTURE = 1.0
@@ -145,13 +144,6 @@ def contact_sheet(
     return np.concatenate([np.concatenate(line, axis=1) for line in lines])
 
 
-def check_path(path: Path, suffixes: Sequence[str]) -> None:
-    """Raise ValueError for a wrong suffix or a path that cannot be written."""
-    if path.suffix.lower() not in suffixes:
-        raise ValueError(f"{path} must end in {' or '.join(suffixes)}")
-    check_output(path, str(path))
-
-
 def save_film(path: Path, frames: Sequence[Frame], fps: float) -> None:
     """Write annotated frames to an MP4 (H.264) or GIF file; the last one is held.
 
@@ -165,7 +157,7 @@ def save_film(path: Path, frames: Sequence[Frame], fps: float) -> None:
     Raises:
         ValueError: If the suffix is wrong, or the folder does not exist.
     """
-    check_path(path, FILM_SUFFIXES)
+    check_output(path, "path", FILM_SUFFIXES)
     if path.suffix.lower() == ".gif":
         options = {
             "codec": "gif",
@@ -204,7 +196,7 @@ def save_picture(path: Path, image: np.ndarray) -> None:
     Raises:
         ValueError: If the suffix is wrong, or the folder does not exist.
     """
-    check_path(path, (".png",))
+    check_output(path, "path", (".png",))
     file = io.BytesIO()
     Image.fromarray(image).save(file, "png")
     write_file(path, file.getvalue())

@@ -35,8 +35,9 @@ from egoskin.runs.starts import git_state
 from egoskin.runs.survival import SurvivalCurve
 from egoskin.runs.trainer import METRIC_KEYS, Trainer, open_trainer, train
 from egoskin.sensors.config import SensorConfig
+from egoskin.storage.files import PARTIAL
 from egoskin.storage.formats import read_sealed, sealed_json
-from egoskin.storage.tensor_file import PARTIAL, load_tensors, save_tensors
+from egoskin.storage.tensor_file import load_tensors, save_tensors
 from making import blind_run
 
 

@@ -22,6 +22,8 @@ from pathlib import Path
 
 import torch
 
+from egoskin.storage.files import write_file
+
 SETTING = "EGOSKIN_COMPILE"
 """Environment variable: 0 disables the C++ kernels, for tests and measurements."""
 
@@ -149,17 +151,7 @@ def _compile(command: list[str], source: Path) -> bytes:
 def _keep(folder: Path, name: str, content: bytes) -> ctypes.CDLL:
     """Write a library to the cache atomically, and return it."""
     path = folder / _file_name(name, content)
-    descriptor, partial = tempfile.mkstemp(dir=folder)
-    try:
-        with open(descriptor, "wb") as file:
-            file.write(content)
-        os.replace(partial, path)
-    except BaseException as error:
-        os.unlink(partial)
-        if isinstance(error, OSError):
-            # The system's error for a full disk does not name the file.
-            raise OSError(error.errno, error.strerror, str(path)) from error
-        raise
+    write_file(path, content)
     try:
         return ctypes.CDLL(str(path))
     except OSError:

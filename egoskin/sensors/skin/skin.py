@@ -19,7 +19,7 @@ import numpy as np
 from egoskin.bounds import is_number
 from egoskin.hints import did_you_mean
 from egoskin.sensors.skin.coverage import KINDS, Coverage, Ray
-from egoskin.storage.files import read_regular
+from egoskin.storage.files import read_regular, write_file
 
 _FORMAT = "egoskin-skin-1"
 _CONVENTIONS = {
@@ -417,12 +417,17 @@ class Skin:
         )
 
     def save(self, path: Path) -> None:
-        """Write the skin to a JSON file, one sensor per line."""
+        """Write the skin to a JSON file, one sensor per line.
+
+        Raises:
+            OSError: If it cannot be written; the text names the file.
+        """
         content = self.to_dict()
         sensors = content.pop("sensors")
         head = json.dumps(content, indent=2)[:-2]
         lines = ",\n".join(f"    {json.dumps(sensor)}" for sensor in sensors)
-        Path(path).write_text(f'{head},\n  "sensors": [\n{lines}\n  ]\n}}\n')
+        text = f'{head},\n  "sensors": [\n{lines}\n  ]\n}}\n'
+        write_file(Path(path), text.encode())
 
     @classmethod
     def load(cls, path: Path) -> Skin:
