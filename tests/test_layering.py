@@ -35,7 +35,7 @@ ROOMS = {
     "sensors": {"storage", "robots", "transform"},
     "agents": set(),
     "make": {"storage", "robots", "transform", "envs", "sensors"},
-    "policies": {"storage", "sensors", "agents", "make"},
+    "policies": {"storage", "envs", "sensors", "agents", "make"},
     "evaluation": {"robots", "transform", "envs", "sensors", "policies", "make"},
     "runs": {"storage", "envs", "sensors", "agents", "make", "policies"},
     "deploy": set(),
