@@ -228,8 +228,7 @@ class Capsule:
         # lower speed, the pace. For a line along the axis the pace is 0; it is kept
         # positive, and the line is then always or never inside the disc.
         pace = exact_sqrt((dx * dx + dy * dy).clamp(min=_TINY))
-        disc = _ball_interval(self.radius, (px, py), (dx / pace, dy / pace))
-        side = (disc[0] / pace, disc[1] / pace)
+        side = _ball_interval(self.radius, (px, py), (dx / pace, dy / pace), pace)
         # The solid is convex: the line is inside from its first entry to its last exit.
         enter, leave = _overlap(side, _slab_interval(self.half_length, pz, dz))
         for height in (pz - self.half_length, pz + self.half_length):
@@ -351,12 +350,12 @@ class Ellipsoid:
         kx, ky, kz = (1.0 / a for a in self.semi_axes)
         dx, dy, dz = kx * dx, ky * dy, kz * dz
         stretch = exact_sqrt(dx * dx + dy * dy + dz * dz)
-        enter, leave = _ball_interval(
+        return _ball_interval(
             1.0,
             (kx * px, ky * py, kz * pz),
             (dx / stretch, dy / stretch, dz / stretch),
+            stretch,
         )
-        return enter / stretch, leave / stretch
 
 
 Shape = Sphere | Box | Capsule | Ellipsoid
@@ -401,7 +400,10 @@ def _check_lengths(name: str, lengths: Sequence[float], count: int) -> None:
 
 
 def _ball_interval(
-    radius: float, p: tuple[Tensor, ...], d: tuple[Tensor, ...]
+    radius: float,
+    p: tuple[Tensor, ...],
+    d: tuple[Tensor, ...],
+    pace: Tensor | None = None,
 ) -> Interval:
     """Return where lines enter and leave a ball (3D) or disc (2D) around the origin.
 
@@ -412,6 +414,7 @@ def _ball_interval(
         radius: Radius [m].
         p: Coordinates of a point of each line [m], ``[*B]`` each.
         d: Coordinates of its unit direction, ``[*B]`` each.
+        pace: Divisor of the results, positive, ``[*B]``; None for 1.
 
     Returns:
         (enter, leave) [m], ``[*B]`` each; (inf, -inf) for a miss.
@@ -420,12 +423,15 @@ def _ball_interval(
     t = -_dot(p, d)
     q = tuple(pi + t * di for pi, di in zip(p, d, strict=True))
     squared = radius * radius - _dot(q, q)
-    half = exact_sqrt(squared)
-    # For a miss, half is NaN and is not used.
     misses = squared < 0
+    # Not used for a miss, but finite: the gradient of NaN or infinity would be NaN.
+    half = exact_sqrt(squared.masked_fill(misses, 1.0))
+    enter, leave = t - half, t + half
+    if pace is not None:
+        enter, leave = enter / pace, leave / pace
     return (
-        torch.where(misses, torch.inf, t - half),
-        torch.where(misses, -torch.inf, t + half),
+        torch.where(misses, torch.inf, enter),
+        torch.where(misses, -torch.inf, leave),
     )
 
 
@@ -443,9 +449,14 @@ def _slab_interval(half: float, p: Tensor, d: Tensor) -> Interval:
     """
     # For a line within a face, 0 * inf = NaN is avoided by a summand that is rounded
     # away in all other cases. It also makes the face belong to the slab.
-    inverse = 1.0 / d
-    first = (-half - p - _TINY) * inverse
-    second = (half - p + _TINY) * inverse
+    low, high, inverse = -half - p - _TINY, half - p + _TINY, 1.0 / d
+    first, second = low * inverse, high * inverse
+    if first.requires_grad:
+        # The infinite ends of a parallel line are constant, not of gradient 0 * inf.
+        parallel = d == 0
+        inverse = 1.0 / d.masked_fill(parallel, 1.0)
+        first = torch.where(parallel, first.detach(), low * inverse)
+        second = torch.where(parallel, second.detach(), high * inverse)
     return first.minimum(second), first.maximum(second)
 
 

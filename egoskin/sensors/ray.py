@@ -46,6 +46,8 @@ class RaySensor(ProximitySensor):
     Only pairs of sensor and object for which the object's bounding sphere reaches into
     the field of view are computed (a few per cent); the result is the same.
 
+    Finite readings are differentiable with respect to poses and joint positions.
+
     Args:
         skin: The sensors. A coverage or range set in the skin takes precedence; all
             sensors must have the same number of beams.

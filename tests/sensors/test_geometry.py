@@ -11,7 +11,7 @@ import torch
 from egoskin.robots.builtin import H1_2
 from egoskin.sensors import FieldSensor, Ray, RaySensor
 from egoskin.shapes import Sphere
-from sensing import KEYS, SHAPES, DenseRaySensor, measure
+from sensing import KEYS, SHAPES, DenseRaySensor, measure, turned
 
 RANGE = 1.5
 SMALL = partial(RaySensor, coverage=Ray(grid=(4, 4)))
@@ -81,6 +81,25 @@ def test_poses_of_inactive_objects_are_not_looked_at(skin, random_state, kind):
     sensor = kind(skin, H1_2.chain, SHAPES[:2], RANGE)
     for a, b in zip(measure(sensor, parked), measure(sensor, state), strict=True):
         assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@every_kind
+def test_gradients_are_those_of_finite_differences(skin, random_state, kind, shape):
+    state = random_state(6, seed=1, dtype=torch.float64, objects=1)
+    state["object_active"][:] = True
+    sensor = kind(skin.select(range(0, 64, 4)), H1_2.chain, shape, 0.6)
+
+    def read(*poses):
+        distance, _ = sensor.compute(*poses, state["object_active"])
+        return torch.where(distance.isinf(), 0.0, distance)
+
+    poses = [turned(state, seed=2)[key].requires_grad_() for key in KEYS[:3]]
+    assert 0 < (read(*poses) > 0).sum() < read(*poses).numel()
+    assert torch.autograd.gradcheck(read, poses, fast_mode=True)
+    # Readings that are kept have gradients, whatever else detects nothing.
+    read(*poses).sum().backward()
+    assert all(x.grad is not None and x.grad.isfinite().all() for x in poses)
 
 
 @pytest.mark.parametrize(
