@@ -16,6 +16,9 @@ methods:
 - ``half_height``: extent of the solid above and below the origin, along z [m].
 - ``add_geom(body, **attributes)``: adds the shape to a MuJoCo specification.
 
+Sensors need only the first four (`Solid`), so an object may also be of a class of your
+own.
+
 Coordinates are in the object frame [m] and directions have length 1. All are tensors of
 one floating type (float32 or float64) that broadcast together to ``[*B]``.
 
@@ -29,6 +32,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import mujoco
 import torch
@@ -47,6 +51,30 @@ _BISECTIONS, _NEWTON_STEPS = 6, 5
 
 Point = tuple[Tensor, Tensor, Tensor]
 Interval = tuple[Tensor, Tensor]
+
+
+@runtime_checkable
+class Solid(Protocol):
+    """What sensors need of an object; the module docstring defines the methods."""
+
+    @property
+    def bounding_radius(self) -> float:
+        """Radius of the sphere around the origin that contains the solid [m]."""
+        ...
+
+    def signed_distance(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
+        """Return the signed distance to the surface [m], ``[*B]``."""
+        ...
+
+    def closest_point(self, x: Tensor, y: Tensor, z: Tensor) -> Point:
+        """Return the closest point of the solid [m], three ``[*B]``."""
+        ...
+
+    def ray_interval(
+        self, px: Tensor, py: Tensor, pz: Tensor, dx: Tensor, dy: Tensor, dz: Tensor
+    ) -> Interval:
+        """Return where lines enter and leave [m], two ``[*B]``."""
+        ...
 
 
 def first_hit(enter: Tensor, leave: Tensor) -> Tensor:
