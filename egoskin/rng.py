@@ -104,7 +104,8 @@ def stream_key(seed: int, stream: Stream) -> tuple[int, int]:
         ValueError: If the seed is neither of them.
     """
     own = seed & ~_HELD_OUT
-    check_seed(own)
+    if not 0 <= own <= _MASK:
+        check_seed(seed)
     return own, int(stream) | (_HELD_OUT_KEY if seed & _HELD_OUT else 0)
 
 

@@ -16,6 +16,9 @@ methods:
 - ``half_height``: extent of the solid above and below the origin, along z [m].
 - ``add_geom(body, **attributes)``: adds the shape to a MuJoCo specification.
 
+Sensors need only the first four (`Solid`), so an object may also be of a class of your
+own.
+
 Coordinates are in the object frame [m] and directions have length 1. All are tensors of
 one floating type (float32 or float64) that broadcast together to ``[*B]``.
 
@@ -29,6 +32,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import mujoco
 import torch
@@ -47,6 +51,30 @@ _BISECTIONS, _NEWTON_STEPS = 6, 5
 
 Point = tuple[Tensor, Tensor, Tensor]
 Interval = tuple[Tensor, Tensor]
+
+
+@runtime_checkable
+class Solid(Protocol):
+    """What sensors need of an object; the module docstring defines the methods."""
+
+    @property
+    def bounding_radius(self) -> float:
+        """Radius of the sphere around the origin that contains the solid [m]."""
+        ...
+
+    def signed_distance(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
+        """Return the signed distance to the surface [m], ``[*B]``."""
+        ...
+
+    def closest_point(self, x: Tensor, y: Tensor, z: Tensor) -> Point:
+        """Return the closest point of the solid [m], three ``[*B]``."""
+        ...
+
+    def ray_interval(
+        self, px: Tensor, py: Tensor, pz: Tensor, dx: Tensor, dy: Tensor, dz: Tensor
+    ) -> Interval:
+        """Return where lines enter and leave [m], two ``[*B]``."""
+        ...
 
 
 def first_hit(enter: Tensor, leave: Tensor) -> Tensor:
@@ -228,8 +256,7 @@ class Capsule:
         # lower speed, the pace. For a line along the axis the pace is 0; it is kept
         # positive, and the line is then always or never inside the disc.
         pace = exact_sqrt((dx * dx + dy * dy).clamp(min=_TINY))
-        disc = _ball_interval(self.radius, (px, py), (dx / pace, dy / pace))
-        side = (disc[0] / pace, disc[1] / pace)
+        side = _ball_interval(self.radius, (px, py), (dx / pace, dy / pace), pace)
         # The solid is convex: the line is inside from its first entry to its last exit.
         enter, leave = _overlap(side, _slab_interval(self.half_length, pz, dz))
         for height in (pz - self.half_length, pz + self.half_length):
@@ -351,12 +378,12 @@ class Ellipsoid:
         kx, ky, kz = (1.0 / a for a in self.semi_axes)
         dx, dy, dz = kx * dx, ky * dy, kz * dz
         stretch = exact_sqrt(dx * dx + dy * dy + dz * dz)
-        enter, leave = _ball_interval(
+        return _ball_interval(
             1.0,
             (kx * px, ky * py, kz * pz),
             (dx / stretch, dy / stretch, dz / stretch),
+            stretch,
         )
-        return enter / stretch, leave / stretch
 
 
 Shape = Sphere | Box | Capsule | Ellipsoid
@@ -401,7 +428,10 @@ def _check_lengths(name: str, lengths: Sequence[float], count: int) -> None:
 
 
 def _ball_interval(
-    radius: float, p: tuple[Tensor, ...], d: tuple[Tensor, ...]
+    radius: float,
+    p: tuple[Tensor, ...],
+    d: tuple[Tensor, ...],
+    pace: Tensor | None = None,
 ) -> Interval:
     """Return where lines enter and leave a ball (3D) or disc (2D) around the origin.
 
@@ -412,6 +442,7 @@ def _ball_interval(
         radius: Radius [m].
         p: Coordinates of a point of each line [m], ``[*B]`` each.
         d: Coordinates of its unit direction, ``[*B]`` each.
+        pace: Divisor of the results, positive, ``[*B]``; None for 1.
 
     Returns:
         (enter, leave) [m], ``[*B]`` each; (inf, -inf) for a miss.
@@ -420,12 +451,15 @@ def _ball_interval(
     t = -_dot(p, d)
     q = tuple(pi + t * di for pi, di in zip(p, d, strict=True))
     squared = radius * radius - _dot(q, q)
-    half = exact_sqrt(squared)
-    # For a miss, half is NaN and is not used.
     misses = squared < 0
+    # Not used for a miss, but finite: the gradient of NaN or infinity would be NaN.
+    half = exact_sqrt(squared.masked_fill(misses, 1.0))
+    enter, leave = t - half, t + half
+    if pace is not None:
+        enter, leave = enter / pace, leave / pace
     return (
-        torch.where(misses, torch.inf, t - half),
-        torch.where(misses, -torch.inf, t + half),
+        torch.where(misses, torch.inf, enter),
+        torch.where(misses, -torch.inf, leave),
     )
 
 
@@ -443,9 +477,14 @@ def _slab_interval(half: float, p: Tensor, d: Tensor) -> Interval:
     """
     # For a line within a face, 0 * inf = NaN is avoided by a summand that is rounded
     # away in all other cases. It also makes the face belong to the slab.
-    inverse = 1.0 / d
-    first = (-half - p - _TINY) * inverse
-    second = (half - p + _TINY) * inverse
+    low, high, inverse = -half - p - _TINY, half - p + _TINY, 1.0 / d
+    first, second = low * inverse, high * inverse
+    if first.requires_grad:
+        # The infinite ends of a parallel line are constant, not of gradient 0 * inf.
+        parallel = d == 0
+        inverse = 1.0 / d.masked_fill(parallel, 1.0)
+        first = torch.where(parallel, first.detach(), low * inverse)
+        second = torch.where(parallel, second.detach(), high * inverse)
     return first.minimum(second), first.maximum(second)
 
 

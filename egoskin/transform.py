@@ -25,6 +25,9 @@ class _KeyedTransform(Transform):
     def __init__(
         self, in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey]
     ) -> None:
+        for name, keys in (("in_keys", in_keys), ("out_keys", out_keys)):
+            if isinstance(keys, str):
+                raise ValueError(f"{name} must be a list of keys, got {keys!r}")
         super().__init__(in_keys=list(in_keys), out_keys=list(out_keys))
 
     @abstractmethod
@@ -61,7 +64,8 @@ class _KeyedTransform(Transform):
         values = [tensordict[key] for key in keys]
         if len(batch) == 1:
             return values
-        return [x.reshape(-1, *x.shape[len(batch) :]) for x in values]
+        # Not -1, which is ambiguous for an entry without numbers.
+        return [x.reshape(batch.numel(), *x.shape[len(batch) :]) for x in values]
 
     def _write(self, tensordict: TensorDictBase, values: Sequence[Tensor]) -> None:
         """Write the values, ``[B, ...]`` each, to the out keys."""
@@ -119,11 +123,16 @@ class RowTransform(_KeyedTransform):
     """A TorchRL transform that maps each row of its inputs to a row of its outputs.
 
     It works inside a worker, around a ParallelEnv, and when called on a TensorDict with
-    any leading dimensions (for example, a stored batch with time).
+    any leading dimensions (for example, a stored batch with time). Keys may be nested,
+    but the batch is that of the whole TensorDict: further batch dimensions of a nested
+    one (several agents, say) are not supported.
 
     Args:
         in_keys: Keys read; written only if they are also out keys.
         out_keys: Keys written.
+
+    Raises:
+        ValueError: If the keys are a single string.
     """
 
     @abstractmethod
@@ -305,7 +314,7 @@ class StatefulTransform(_KeyedTransform):
                 "batch dimension is time, got one without a batch"
             )
         inputs = [
-            x.reshape(-1, batch[-1], *x.shape[1:])
+            x.reshape(batch[:-1].numel(), batch[-1], *x.shape[1:])
             for x in self._read(tensordict, self.in_keys)
         ]
         starts = _starts(tensordict)

@@ -157,7 +157,8 @@ def test_numbers_of_neighbours_are_uncorrelated():
 
 @pytest.mark.parametrize("seed", [-1, 2**33, 2**33 + 5, 3 * 2**32])
 def test_seed_outside_32_bits_is_refused(seed):
-    with pytest.raises(ValueError, match=r"seed must be in \[0, 2\*\*32\), got"):
+    text = rf"seed must be in \[0, 2\*\*32\), got {seed}"
+    with pytest.raises(ValueError, match=text):
         draw([0], seed=seed)
 
 

@@ -337,6 +337,18 @@ def test_first_hit_is_zero_inside_and_infinite_for_a_miss_or_behind():
 
 
 @every_shape
+def test_beams_along_faces_and_beside_the_solid_have_gradients(shape):
+    # From -x: along an axis, obliquely, past the solid, and behind the origin.
+    p = torch.tensor([[-1.0, 0.01, 0.02]], dtype=torch.float64).requires_grad_()
+    d = columns([[1.0, 0, 0], [0.999, 0.03, 0.03], [0, 1, 0], [-1, 0, 0]])
+    hit = first_hit(*shape.ray_interval(*p.unbind(-1), *d))
+    assert hit.isfinite().tolist() == [True, True, False, False]
+    (gradient,) = torch.autograd.grad(hit[:2].sum(), p)
+    assert gradient.isfinite().all()
+    assert (gradient[:, 0] < -1).all()
+
+
+@every_shape
 def test_origins_broadcast_against_directions(shape):
     rng = np.random.default_rng(7)
     p = columns(rng.uniform(-1, 1, (5, 1, 3)))

@@ -13,7 +13,6 @@ import math
 import textwrap
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Literal
@@ -26,7 +25,7 @@ from tensordict import TensorDict
 from egoskin.commands.errors import parse_subcommand
 from egoskin.progress import counted
 from egoskin.robots.builtin import ROBOTS
-from egoskin.robots.config import Primitive, RobotConfig
+from egoskin.robots.config import RobotConfig
 from egoskin.robots.own import find_robot
 from egoskin.robots.surface import default_frames
 from egoskin.sensors import Skin
@@ -151,7 +150,7 @@ class Import:
             self.files,
             robot_name=robot.name,
             links=robot.links,
-            primitives=_known_shapes(robot),
+            primitives=robot.known_primitives,
             scale=self.scale,
             link_map=_pairs(self.link_map, "--link-map"),
             parent=self.parent,
@@ -172,16 +171,6 @@ class Import:
                 "--scale and --link-map, and look at the picture of: egoskin skin "
                 f"show {self.out} --picture skin.png"
             )
-
-
-def _known_shapes(robot: RobotConfig) -> list[Primitive]:
-    """Return the shapes of those links whose shapes are all primitives."""
-    shapes: list[Primitive] = []
-    for link in robot.links:
-        # If one shape of a link is unknown, the others do not define its surface.
-        with suppress(ValueError):
-            shapes += robot.primitives_on([link])
-    return shapes
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -131,7 +131,8 @@ def build_chain(
         base: Root of the chain: the body with the free joint or, for a fixed-base
             robot, a body welded to the world or ``"world"`` itself. Its own pose and
             joints are not part of the chain.
-        dtype: Precision of the chain's constants.
+        dtype: Type of the chain's constants. With float32 poses are accurate to about
+            4e-7 m, also those computed in float64.
 
     Returns:
         A chain whose joints are those below the base and whose links are the base and

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import fnmatch
 from collections.abc import Collection, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -130,7 +131,9 @@ class RobotConfig:
     """Links that throws at the whole body (standard 1) are not aimed at."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError unless exactly one model is given."""
+        """Raise ValueError unless exactly one model is given; accept a path as text."""
+        if isinstance(self.model_path, str):
+            object.__setattr__(self, "model_path", Path(self.model_path))
         if (self.model_path is None) == (self.model_xml is None):
             raise ValueError(
                 f"robot {self.name!r} must have exactly one of model_path and model_xml"
@@ -355,16 +358,31 @@ class RobotConfig:
         return tuple(shapes)
 
     @cached_property
+    def known_primitives(self) -> tuple[Primitive, ...]:
+        """The collision shapes of those links whose shapes are all primitives."""
+        shapes: list[Primitive] = []
+        for link in self.links:
+            # If one shape of a link is unknown, the others do not define its surface.
+            with suppress(ValueError):
+                shapes += self.primitives_on([link])
+        return tuple(shapes)
+
+    @cached_property
     def chain(self) -> pk.Chain:
-        """Kinematic chain from the base, for pytorch-kinematics."""
+        """Kinematic chain from the base, for pytorch-kinematics.
+
+        Its constants are float32, so poses are accurate to about 4e-7 m, also those
+        computed in float64; `build_chain` makes chains of other types.
+        """
         return build_chain(self.model, self.base)
 
 
 def read_robot(path: Path | str) -> RobotConfig:
     """Return the robot of an MJCF or URDF file, to place or import sensors on.
 
-    The base is the only body attached to the world, or the world itself if there are
-    several; all links may carry skin. The name is the model's, or else the file's.
+    The base is the only body attached to the world if it has a free joint or none, else
+    (with several such bodies, or a hinge between them) the world itself. All links may
+    carry skin. The name is the model's, or else the file's.
 
     Raises:
         ValueError: If MuJoCo cannot read the file as MJCF or URDF.
@@ -378,7 +396,9 @@ def read_robot(path: Path | str) -> RobotConfig:
     whole = RobotConfig(name=path.stem, model_path=path, base="world", skin_links=())
     model, name = whole.model, whole.spec().modelname
     in_world = np.flatnonzero(model.body_parentid[1:] == 0) + 1
-    one = len(in_world) == 1
+    of_base = model.jnt_type[model.jnt_bodyid == in_world[0]] if len(in_world) else []
+    # Joints of the base are not part of its chain.
+    one = len(in_world) == 1 and all(t == mujoco.mjtJoint.mjJNT_FREE for t in of_base)
     return replace(
         whole,
         # MuJoCo's default name of a model.
@@ -401,8 +421,9 @@ def _primitive_kind(model: mujoco.MjModel, geom: int) -> str:
         name = model.geom(geom).name or geom
         raise ValueError(
             f"link {link!r} has a collision shape, geom {name!r}, of kind {kind}; it "
-            "must be a sphere, capsule or box: replace it, or place sensors on the "
-            f"link's meshes with meshes={{{link!r}: [...]}}"
+            "must be a sphere, capsule or box: replace it (egoskin.robots.own.portable "
+            "does so for cylinders), or place sensors on the link's meshes with "
+            f"meshes={{{link!r}: [...]}} (--meshes)"
         )
     return kind
 

@@ -142,7 +142,12 @@ class Surface:
         self.robot = robot
         self._patches = [patch for patch in patches if patch.link in links]
         if not self._patches:
-            raise ValueError(f"the links {', '.join(links)} have no collision shape")
+            hint = ""
+            if robot.is_urdf:
+                hint = ": meshes of a URDF are left out; give them as meshes (--meshes)"
+            raise ValueError(
+                f"the links {', '.join(links)} have no collision shape{hint}"
+            )
         self._link_index = [robot.links.index(patch.link) for patch in self._patches]
         self._shift, self._turn = default_frames(robot)
         self._side = side

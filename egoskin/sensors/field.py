@@ -22,7 +22,7 @@ from egoskin.sensors.geometry import (
 )
 from egoskin.sensors.skin.coverage import Field
 from egoskin.sensors.skin.skin import Skin
-from egoskin.shapes import Shape, Sphere
+from egoskin.shapes import Solid, Sphere
 
 
 class FieldSensor(ProximitySensor):
@@ -36,6 +36,8 @@ class FieldSensor(ProximitySensor):
 
     A sensor with a half angle below 180 degrees sees an object if the object's
     closest point lies within that angle of the normal.
+
+    Finite readings are differentiable with respect to poses and joint positions.
 
     Args:
         skin: The sensors. A coverage or range set in the skin takes precedence.
@@ -55,7 +57,8 @@ class FieldSensor(ProximitySensor):
 
     Raises:
         ValueError: If the range is not positive, the skin does not fit the chain or
-            contains a sensor that is not a field sensor.
+            contains a sensor that is not a field sensor, or another argument is of a
+            wrong kind or number.
     """
 
     _cos_half: Tensor | None
@@ -64,7 +67,7 @@ class FieldSensor(ProximitySensor):
         self,
         skin: Skin,
         chain: pk.Chain,
-        objects: Shape | Sequence[Shape],
+        objects: Solid | Sequence[Solid],
         max_range: float | None = None,
         coverage: Field | None = None,
         *,
@@ -114,7 +117,7 @@ class FieldSensor(ProximitySensor):
             readings.append(reading.t().contiguous())
         return torch.stack(readings)
 
-    def _distance(self, view: View, shape: Shape, skin: dict[str, Tensor]) -> Tensor:
+    def _distance(self, view: View, shape: Solid, skin: dict[str, Tensor]) -> Tensor:
         """Readings of one object [m], ``[S, B]``."""
         # From each sensor to the object's centre, in the sensor's link.
         x, y, z = v = view.centre[:, self._link] - skin["offset"]
@@ -144,7 +147,7 @@ class FieldSensor(ProximitySensor):
         turn = view.turn[:, :, self._link]
         return [-(row[0] * x + row[1] * y + row[2] * z) for row in turn]
 
-    def _to_closest(self, view: View, shape: Shape, centre: Tensor) -> Sequence[Tensor]:
+    def _to_closest(self, view: View, shape: Solid, centre: Tensor) -> Sequence[Tensor]:
         """Vector from each sensor to the object's closest point, in its link [m].
 
         For a sphere this is the vector to its centre: only the direction is correct.
@@ -167,7 +170,7 @@ class FieldSensor(ProximitySensor):
         return readings.amin(-1)
 
     def _without_hidden(
-        self, reading: Tensor, view: View, shape: Shape, scene: Scene
+        self, reading: Tensor, view: View, shape: Solid, scene: Scene
     ) -> Tensor:
         """Readings ``[S, B]``, infinite where the path to the object is blocked."""
         sensor, row = (reading < torch.inf).nonzero().unbind(1)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterable, Sequence
+from numbers import Real
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -29,8 +30,8 @@ from egoskin.robots.kinematics import LinkKinematics, quat_to_entries
 from egoskin.sensors.kernels.binding import Kernels
 from egoskin.sensors.occlusion import Occluder
 from egoskin.sensors.skin.coverage import Coverage
-from egoskin.sensors.skin.skin import Skin
-from egoskin.shapes import Shape, Sphere
+from egoskin.sensors.skin.skin import Indices, Skin, indices
+from egoskin.shapes import Solid, Sphere
 from egoskin.transform import RowTransform
 
 # Margin for rounding when rows are culled [m].
@@ -129,8 +130,8 @@ class ProximitySensor(RowTransform):
         out_keys: Keys of readings and detections.
 
     Raises:
-        ValueError: If the skin does not fit the chain, there is no object, or an object
-            is not a shape.
+        ValueError: If the skin does not fit the chain, there is no object, an object is
+            not a shape, or another argument is of a wrong kind or number.
     """
 
     _link: Tensor
@@ -143,7 +144,7 @@ class ProximitySensor(RowTransform):
         self,
         skin: Skin,
         chain: pk.Chain,
-        objects: Shape | Sequence[Shape],
+        objects: Solid | Sequence[Solid],
         num_readings: tuple[int, ...],
         body: Sequence[Primitive],
         per_object: bool,
@@ -151,6 +152,23 @@ class ProximitySensor(RowTransform):
         out_keys: Sequence[NestedKey],
     ) -> None:
         super().__init__(in_keys, out_keys)
+        if len(in_keys) != 4 or len(out_keys) != 2:
+            raise ValueError(
+                "a proximity sensor has four in_keys and two out_keys, got "
+                f"{list(in_keys)} and {list(out_keys)}"
+            )
+        if not isinstance(chain, pk.Chain):
+            raise ValueError(
+                "chain must be a pytorch_kinematics.Chain (RobotConfig.chain), got "
+                f"{type(chain).__name__}"
+            )
+        if not isinstance(body, Sequence) or not all(
+            isinstance(part, Primitive) for part in body
+        ):
+            raise ValueError(
+                "body must hold primitives (RobotConfig.primitives), got "
+                f"{type(body).__name__}"
+            )
         skin.check_links(chain.get_link_names())
         self.num_sensors = len(skin)
         several = isinstance(objects, Iterable)
@@ -158,7 +176,8 @@ class ProximitySensor(RowTransform):
         if not self.objects:
             raise ValueError("a proximity sensor needs at least one object to sense")
         for shape in self.objects:
-            if not isinstance(shape, Shape):
+            # A class has the methods too.
+            if isinstance(shape, type) or not isinstance(shape, Solid):
                 raise ValueError(
                     "objects must be shapes (egoskin.shapes: Sphere, Box, ..), got "
                     f"{shape!r}"
@@ -170,6 +189,7 @@ class ProximitySensor(RowTransform):
         links += dict.fromkeys(p.link for p in body if p.link not in links)
         self._occluder = Occluder(body, links) if body else None
         self._kinematics = LinkKinematics(chain, links)
+        self._joints = chain.get_joint_parameter_names()
 
         def constant(name: str, value: object, dtype: torch.dtype) -> None:
             # Copied, because `mask` changes the ranges of this sensor but not the skin.
@@ -218,15 +238,19 @@ class ProximitySensor(RowTransform):
         }
         self._kernels = Kernels(kind, self._kinematics, balls, {**own, **constants})
 
-    def mask(self, sensors: Sequence[int]) -> None:
+    def mask(self, sensors: Indices) -> None:
         """Mask some sensors: they detect nothing. Replaces the previous mask.
 
         Args:
-            sensors: Indices of the masked sensors.
+            sensors: Indices of the masked sensors, or ``[S]`` bool.
+
+        Raises:
+            ValueError: If there are flags, but not one for each sensor.
         """
+        sensors = indices(sensors, self.num_sensors)
         self._range.copy_(self._skin_range)
         # No distance is within a negative range.
-        self._range[list(sensors)] = -1.0
+        self._range[sensors] = -1.0
         if self._kernels is not None:
             self._kernels.set_constants(range=self._range.cpu().numpy())
 
@@ -411,7 +435,8 @@ class ProximitySensor(RowTransform):
                 raise ValueError(
                     f"{key!r} must be [*B, {', '.join(shape)}], got "
                     f"{list(tensor.shape[1:])} after the batch: was the tensordict "
-                    "made with its batch_size?"
+                    "made with its batch_size? (Batch dimensions of nested "
+                    "tensordicts are not supported.)"
                 )
             if len(tensor) != len(active):
                 raise ValueError(
@@ -438,7 +463,11 @@ class ProximitySensor(RowTransform):
                     f"{self.in_keys[i]!r} must hold 7 numbers per pose (position, "
                     f"quaternion w x y z), got {inputs[i].shape[-1]}"
                 )
-        self._kinematics.check(inputs[1])
+        if inputs[1].shape[-1] != len(self._joints):
+            raise ValueError(
+                f"{self.in_keys[1]!r} must hold {len(self._joints)} numbers "
+                f"({', '.join(self._joints)}), got {inputs[1].shape[-1]}"
+            )
 
     def _poison(
         self, base_pose: Tensor, joint_pos: Tensor, object_pose: Tensor
@@ -498,9 +527,14 @@ def checked(
         kind: Required kind of coverage.
 
     Raises:
-        ValueError: If the range is not positive, a sensor has no range, or its coverage
-            is of another kind.
+        ValueError: If the range is not a positive number, a sensor has no range, or its
+            coverage is of another kind.
     """
+    if max_range is not None and not isinstance(max_range, Real):
+        raise ValueError(
+            f"max_range must be one number, got {max_range!r}; a range for each sensor "
+            "belongs in Skin.range"
+        )
     if max_range is not None and not max_range > 0:
         raise ValueError(f"max_range must be positive, got {max_range}")
     if not skin.is_resolved:
@@ -512,6 +546,7 @@ def checked(
         if not isinstance(own, kind):
             raise ValueError(
                 f"sensor {index} is a {type(own).__name__}, not a {kind.__name__}; "
-                "pass only sensors of that kind (Skin.select)"
+                "pass only sensors of that kind (Skin.select), or let SensorPipeline "
+                "make one transform for each kind"
             )
     return skin, list(skin.coverage)

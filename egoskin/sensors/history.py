@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from numbers import Integral
 
 import torch
 from tensordict import NestedKey
@@ -24,7 +25,8 @@ class History(StatefulTransform):
         out_keys: Keys of their histories, in the same order.
 
     Raises:
-        ValueError: If the length is less than 1 or the keys do not pair up.
+        ValueError: If the length is not an integer or less than 1, or the keys do not
+            pair up.
     """
 
     def __init__(
@@ -33,8 +35,8 @@ class History(StatefulTransform):
         in_keys: Sequence[NestedKey] = ("signal",),
         out_keys: Sequence[NestedKey] = ("signal_history",),
     ) -> None:
-        if length < 1:
-            raise ValueError(f"length must be at least 1, got {length}")
+        if not isinstance(length, Integral) or length < 1:
+            raise ValueError(f"length must be an integer, at least 1, got {length}")
         if len(in_keys) != len(out_keys):
             raise ValueError(
                 f"need one out key per in key, got {list(in_keys)} and {list(out_keys)}"

@@ -65,6 +65,10 @@ class SensorGroup:
 class SensorPipeline:
     """The sensors of a robot's skin, their measurements and their signal.
 
+    For skins with several kinds of sensors also in a project of your own, where
+    ``Compose(*SensorPipeline(config, robot, skin).transforms(objects, dt=dt))`` takes
+    the place of a single sensor and its signal.
+
     Args:
         config: Measurements and signal.
         robot: The robot.
@@ -205,10 +209,18 @@ class SensorPipeline:
         The readings in the signal are in the order of the sensors in the skin, also if
         the skin has several kinds of sensors.
 
+        They read ``base_pose``, ``joint_pos``, ``object_pose`` and ``object_active``
+        (as `FieldSensor`) and, with corruption that depends on it, ``joint_vel``. They
+        write ``signal [*B, signal_size]`` and, each with the suffix ``_i`` of the i-th
+        kind if there are several, ``distance``, ``object_detected`` and, if configured,
+        ``reading`` (with its state, see `Corruption`) and ``least``; with several kinds
+        also ``signal_i``, and ``position`` with ``keep_last``.
+
         Args:
             objects: Shapes of the objects.
             dt: Duration of a control step [s].
-            seed: Seed of the sensor models (`SensorConfig.corruption`).
+            seed: Seed of the sensor models (`SensorConfig.corruption`), in [0, 2**32),
+                or the result of `egoskin.rng.held_out`.
             row_offset: Global index of the first row.
             out_key: Key of the signal.
         """

@@ -24,7 +24,7 @@ from egoskin.sensors.kernels.binding import VECTOR
 from egoskin.sensors.signals import Binary, Proximity
 from egoskin.sensors.skin.coverage import Ray
 from egoskin.sensors.skin.skin import Skin
-from egoskin.shapes import Shape, first_hit
+from egoskin.shapes import Solid, first_hit
 from egoskin.sparse import SparseRows
 
 # Margin for rounding when pairs of sensor and object are culled [m].
@@ -46,6 +46,8 @@ class RaySensor(ProximitySensor):
     Only pairs of sensor and object for which the object's bounding sphere reaches into
     the field of view are computed (a few per cent); the result is the same.
 
+    Finite readings are differentiable with respect to poses and joint positions.
+
     Args:
         skin: The sensors. A coverage or range set in the skin takes precedence; all
             sensors must have the same number of beams.
@@ -65,8 +67,8 @@ class RaySensor(ProximitySensor):
 
     Raises:
         ValueError: If the range is not positive, the skin does not fit the chain,
-            contains a sensor that is not a ray sensor, or sensors with different
-            numbers of beams.
+            contains a sensor that is not a ray sensor or sensors with different numbers
+            of beams, or another argument is of a wrong kind or number.
     """
 
     _beams: Tensor
@@ -79,7 +81,7 @@ class RaySensor(ProximitySensor):
         self,
         skin: Skin,
         chain: pk.Chain,
-        objects: Shape | Sequence[Shape],
+        objects: Solid | Sequence[Solid],
         max_range: float | None = None,
         coverage: Ray | None = None,
         *,
@@ -158,7 +160,7 @@ class RaySensor(ProximitySensor):
         ]
         return torch.stack(margins), views
 
-    def _margin(self, view: View, shape: Shape, skin: dict[str, Tensor]) -> Tensor:
+    def _margin(self, view: View, shape: Solid, skin: dict[str, Tensor]) -> Tensor:
         """Margins of one object [m], ``[S, B]``."""
         away = view.centre[:, self._link] - skin["offset"]
         x, y, z = self._in_sensor(away, skin["axes"])
@@ -183,7 +185,7 @@ class RaySensor(ProximitySensor):
         view: View,
         sensor: Tensor,
         row: Tensor,
-        shape: Shape,
+        shape: Solid,
     ) -> tuple[Tensor, Tensor]:
         """Return the readings of one object for some pairs of sensor and row.
 

@@ -35,7 +35,7 @@ class _Reading(RowTransform):
         out_keys: Key of the signal.
 
     Raises:
-        ValueError: If a range is not positive.
+        ValueError: If a range is not positive, or there is none.
     """
 
     _range: Tensor
@@ -50,7 +50,7 @@ class _Reading(RowTransform):
         if isinstance(max_range, ProximitySensor):
             max_range = max_range.ranges.tolist()
         limit = torch.as_tensor(max_range, dtype=torch.float64)
-        if not (limit > 0).all():
+        if not limit.numel() or not (limit > 0).all():
             raise ValueError(f"max_range must be positive, got {max_range}")
         self.register_buffer("_range", limit.reshape(-1))
 
@@ -236,6 +236,8 @@ class BeamMinimum(RowTransform):
 
 class Localization(RowTransform):
     """Position of the detected object nearest to the robot's base, in the base frame.
+
+    Position and distance are those of the object's centre.
 
     Reads ``base_pose [*B, 7]``, ``object_pose [*B, O, 7]``, ``joint_pos [*B, J]`` and
     any number of ``object_detected [*B, O]`` (a detection in any of them counts).

@@ -57,9 +57,9 @@ def _check_links(tactile: Tensor, links: Tensor, key: NestedKey) -> None:
 class Tactile(RowTransform):
     """Whether the contact force on each link is above a threshold.
 
-    Reads ``contact_force [*B, L, n]`` [N]; writes ``tactile [*B, L]`` bool. The last
-    three components are the force, so MuJoCo's ``cfrc_ext`` (torque, then force) can be
-    used directly. A force of NaN counts as contact.
+    Reads ``contact_force [*B, L, n]`` [N], n >= 3; writes ``tactile [*B, L]`` bool. The
+    last three components are the force, so MuJoCo's ``cfrc_ext`` (torque, then force)
+    can be used directly. A force of NaN counts as contact.
 
     Args:
         threshold: A link is in contact if its force is larger than this [N].
@@ -82,8 +82,17 @@ class Tactile(RowTransform):
         self.threshold = float(threshold)
 
     def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
-        """Return the contacts, ``[B, L]`` bool."""
+        """Return the contacts, ``[B, L]`` bool.
+
+        Raises:
+            ValueError: If the forces are not vectors.
+        """
         (force,) = inputs
+        if force.ndim < 3 or force.shape[-1] < 3:
+            raise ValueError(
+                f"{self.in_keys[0]!r} must be [*B, L, n], n >= 3, the last three "
+                f"components the force; got {list(force.shape[1:])} after the batch"
+            )
         # Not `>`, which is false for NaN: a diverged simulation must count as contact.
         return (~(force[..., -3:].norm(dim=-1) <= self.threshold),)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import gymnasium
@@ -162,6 +163,7 @@ def test_other_collision_shapes_are_refused_with_the_remedy(small_robot, kind):
     with pytest.raises(ValueError, match=text):
         _ = robot.default_base_height
     assert [shape.link for shape in robot.primitives_on(["base"])] == ["base"]
+    assert [shape.link for shape in robot.known_primitives] == ["base"]
 
 
 def test_names_may_look_like_patterns(small_robot):
@@ -206,6 +208,8 @@ def test_a_urdf_is_a_robot_with_all_its_links(tmp_path):
     position, _ = LinkKinematics(robot.chain, ["hook"]).poses_b(quarter)
     np.testing.assert_allclose(position[0, 0], [0, 0, 5], atol=1e-6)
     assert len(place_sensors(robot, 5, links=["boom"])) == 5
+    with pytest.raises(ValueError, match=r"meshes of a URDF are left out; .*--mesh"):
+        place_sensors(robot, 5, links=["hook"])
 
 
 def test_an_mjcf_is_a_robot_whatever_stands_in_its_world(tmp_path):
@@ -221,6 +225,33 @@ def test_an_mjcf_is_a_robot_whatever_stands_in_its_world(tmp_path):
         robot = read_robot(str(path))
         assert (robot.name, robot.base, robot.links) == ("two", base, links)
     assert read_robot(H1_2.model_path).links == H1_2.links
+
+
+@pytest.mark.parametrize(
+    ("joint", "base", "joints"),
+    [
+        ("", "a", ("elbow",)),
+        ("<freejoint/>", "a", ("elbow",)),
+        ("<joint name='waist' axis='0 0 1'/>", "world", ("waist", "elbow")),
+        ("<joint name='rail' type='slide'/>", "world", ("rail", "elbow")),
+    ],
+)
+def test_the_joints_of_the_first_body_are_the_robots(tmp_path, joint, base, joints):
+    path = tmp_path / "arm.xml"
+    path.write_text(
+        f"<mujoco><worldbody><body name='a'>{joint}<geom size='.1'/>"
+        "<body name='b'><joint name='elbow'/><geom size='.1'/></body></body>"
+        "</worldbody></mujoco>"
+    )
+    robot = read_robot(path)
+    assert (robot.base, robot.joints, robot.skin_links) == (base, joints, ("a", "b"))
+
+
+def test_the_path_of_a_model_may_be_text(make_arm):
+    arm = make_arm("stand")
+    same = replace(arm, model_path=str(arm.model_path))
+    assert same == arm
+    assert same.links == arm.links
 
 
 @pytest.mark.parametrize(

@@ -7,11 +7,13 @@ from functools import partial
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 from egoskin.robots.builtin import H1_2
-from egoskin.sensors import FieldSensor, Ray, RaySensor
+from egoskin.robots.kinematics import rotate
+from egoskin.sensors import FieldSensor, Ray, RaySensor, Skin
 from egoskin.shapes import Sphere
-from sensing import KEYS, SHAPES, DenseRaySensor, measure
+from sensing import KEYS, SHAPES, DenseRaySensor, measure, turned
 
 RANGE = 1.5
 SMALL = partial(RaySensor, coverage=Ray(grid=(4, 4)))
@@ -83,6 +85,25 @@ def test_poses_of_inactive_objects_are_not_looked_at(skin, random_state, kind):
         assert torch.equal(a, b)
 
 
+@pytest.mark.parametrize("shape", SHAPES)
+@every_kind
+def test_gradients_are_those_of_finite_differences(skin, random_state, kind, shape):
+    state = random_state(6, seed=1, dtype=torch.float64, objects=1)
+    state["object_active"][:] = True
+    sensor = kind(skin.select(range(0, 64, 4)), H1_2.chain, shape, 0.6)
+
+    def read(*poses):
+        distance, _ = sensor.compute(*poses, state["object_active"])
+        return torch.where(distance.isinf(), 0.0, distance)
+
+    poses = [turned(state, seed=2)[key].requires_grad_() for key in KEYS[:3]]
+    assert 0 < (read(*poses) > 0).sum() < read(*poses).numel()
+    assert torch.autograd.gradcheck(read, poses, fast_mode=True)
+    # Readings that are kept have gradients, whatever else detects nothing.
+    read(*poses).sum().backward()
+    assert all(x.grad is not None and x.grad.isfinite().all() for x in poses)
+
+
 @pytest.mark.parametrize(
     ("key", "change", "message"),
     [
@@ -94,6 +115,7 @@ def test_poses_of_inactive_objects_are_not_looked_at(skin, random_state, kind):
         ("object_pose", lambda x: x[..., :3], "'object_pose' must hold 7 num.*got 3"),
         ("base_pose", lambda x: x[:, :6], "'base_pose' must hold 7 numbers.*got 6"),
         ("base_pose", lambda x: x[:, None], r"must be \[\*B, 7\], got \[1, 7\] after"),
+        ("joint_pos", lambda x: x[:, :3], r"'joint_pos' must hold 21 .*\(left_.*got 3"),
     ],
 )
 @every_kind
@@ -108,3 +130,97 @@ def test_inputs_of_a_wrong_form_are_refused(
     if isinstance(sensor, RaySensor):
         with pytest.raises(ValueError, match=message):
             sensor.hits(*(state[key] for key in KEYS))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"chain": H1_2}, r"chain must be .*Chain \(RobotConfig.chain\), got RobotCon"),
+        ({"objects": Sphere}, "objects must be shapes"),
+        ({"max_range": [1.0] * 64}, "one number, got .* belongs in Skin.range"),
+        ({"max_range": "2"}, "max_range must be one number, got '2'"),
+        ({"body": H1_2}, r"body must hold primitives \(RobotConfig.prim.*got RobotCon"),
+        ({"in_keys": KEYS[:3]}, "four in_keys and two out_keys, got"),
+        ({"out_keys": ["distance"]}, "four in_keys and two out_keys, got"),
+        ({"out_keys": "ab"}, "out_keys must be a list of keys, got 'ab'"),
+    ],
+)
+@pytest.mark.parametrize("kind", [FieldSensor, RaySensor])
+def test_arguments_of_a_wrong_kind_are_refused(skin, kind, arguments, message):
+    valid = {"chain": H1_2.chain, "objects": SHAPES, "max_range": RANGE}
+    with pytest.raises(ValueError, match=message):
+        kind(skin, **{**valid, **arguments})
+
+
+class Pair:
+    """Two balls of one radius, as an object of a class of one's own."""
+
+    bounding_radius = 0.35
+
+    def __init__(self):
+        self._ball = Sphere(radius=0.15)
+
+    def _least(self, method, x, *rest):
+        return torch.minimum(*(method(x + shift, *rest) for shift in (-0.2, 0.2)))
+
+    def signed_distance(self, x, y, z):
+        return self._least(self._ball.signed_distance, x, y, z)
+
+    def closest_point(self, x, y, z):
+        a, b, c = self._ball.closest_point(x.abs() - 0.2, y, z)
+        return torch.where(x < 0, -1.0, 1.0) * (a + 0.2), b, c
+
+    def ray_interval(self, *line):
+        enter, leave = (
+            torch.stack(ends)
+            for ends in zip(
+                *(
+                    self._ball.ray_interval(line[0] + shift, *line[1:])
+                    for shift in (-0.2, 0.2)
+                ),
+                strict=True,
+            )
+        )
+        # Of the two, the first that is not behind.
+        first = torch.where(leave < 0, torch.inf, enter).argmin(0, keepdim=True)
+        return enter.gather(0, first)[0], leave.gather(0, first)[0]
+
+
+@pytest.mark.parametrize("kind", [FieldSensor, SMALL])
+def test_an_object_may_be_of_a_class_of_ones_own(skin, random_state, kind):
+    state = turned(random_state(32, seed=6, dtype=torch.float64, objects=1), seed=7)
+    pose = state["object_pose"]
+    shift = rotate(pose[..., 3:], pose.new_tensor([0.2, 0, 0]).expand(32, 1, 3))
+    places = [pose[..., :3] + shift, pose[..., :3] - shift]
+    both = torch.cat([torch.cat((p, pose[..., 3:]), -1) for p in places], 1)
+    apart = state.clone().set("object_pose", both)
+    apart["object_active"] = state["object_active"].expand(32, 2)
+    distance, _ = measure(kind(skin, H1_2.chain, Pair(), RANGE), state)
+    expected, _ = measure(
+        kind(skin, H1_2.chain, [Sphere(radius=0.15)] * 2, RANGE), apart
+    )
+    assert 0 < expected.isfinite().sum() < expected.numel()
+    torch.testing.assert_close(distance, expected, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
+@pytest.mark.parametrize("kind", [FieldSensor, SMALL])
+def test_a_robot_without_joints_has_any_batch(small_robot, kind, batch):
+    sensor = kind(
+        Skin(
+            robot="small", links=("base",), position=[[0, 0, 0.1]], normal=[[0, 0, 1]]
+        ),
+        small_robot("<geom size='.1'/>").chain,
+        Sphere(radius=0.2),
+        RANGE,
+    )
+    pose = torch.tensor([0.0, 0, 0, 1, 0, 0, 0])
+    state = TensorDict(
+        base_pose=pose.expand(*batch, 7),
+        joint_pos=torch.zeros(*batch, 0),
+        object_pose=(pose + torch.eye(7)[2]).expand(*batch, 1, 7),
+        object_active=torch.ones(*batch, 1, dtype=torch.bool),
+        batch_size=batch,
+    )
+    least = sensor(state)["distance"].reshape(*batch, -1).amin(-1)
+    torch.testing.assert_close(least, torch.full(batch, 0.7), rtol=0, atol=0.05)

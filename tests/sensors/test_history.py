@@ -97,7 +97,8 @@ def test_a_detected_zero_is_a_sight():
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        ((0,), "length must be at least 1, got 0"),
+        ((0,), "length must be an integer, at least 1, got 0"),
+        ((2.5,), "at least 1, got 2.5"),
         ((2, ["a", "b"], ["c"]), "need one out key per in key"),
     ],
 )

@@ -164,6 +164,21 @@ def test_a_copied_sensor_keeps_its_mask(random_state):
     assert_same_bits(measure(copy.deepcopy(sensor), state), measure(sensor, state))
 
 
+def test_a_mask_may_be_a_tensor_or_flags(random_state):
+    sensor = FieldSensor(SKIN, H1_2.chain, BALLS, 5.0)
+    sensor.mask([0, 2])
+    state = random_state(16)
+    expected = measure(sensor, state)
+    flags = torch.zeros(24, dtype=torch.bool)
+    flags[[0, 2]] = True
+    for mask in (torch.tensor([0, 2]), flags, flags.tolist(), flags.numpy()):
+        sensor.mask([])
+        sensor.mask(mask)
+        assert_same_bits(measure(sensor, state), expected)
+    with pytest.raises(ValueError, match=r"must be \(24,\), one for each, got \(2,\)"):
+        sensor.mask([True, False])
+
+
 def test_a_mask_does_not_change_the_ranges():
     sensor = FieldSensor(SKIN, H1_2.chain, BALLS, 5.0)
     sensor.mask([0])

@@ -38,7 +38,7 @@ def test_proximity_grows_with_distance_and_stays_in_bounds(a, b, max_range):
         assert 0 <= signal[0, 0] <= signal[0, 1] <= 1
 
 
-@pytest.mark.parametrize("max_range", [0.0, -2.0, math.nan])
+@pytest.mark.parametrize("max_range", [0.0, -2.0, math.nan, []])
 def test_proximity_refuses_a_range_that_is_not_positive(max_range):
     with pytest.raises(ValueError, match="max_range must be positive, got"):
         Proximity(max_range)

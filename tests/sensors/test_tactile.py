@@ -63,6 +63,13 @@ def test_a_force_that_is_no_number_is_a_contact():
     assert Tactile(1.0)(state)["tactile"].tolist() == [[True, False]]
 
 
+@pytest.mark.parametrize("shape", [(2, 4), (2, 4, 2)])
+def test_forces_that_are_no_vectors_are_refused(shape):
+    state = TensorDict(contact_force=torch.zeros(shape), batch_size=[2])
+    with pytest.raises(ValueError, match=r"must be \[\*B, L, n\], n >= 3.*; got \[4"):
+        Tactile(1.0)(state)
+
+
 def test_a_ball_at_rest_on_the_floor_is_touched_by_its_weight():
     # 2 kg: 19.62 N. The second ball hangs in the air.
     model = mujoco.MjModel.from_xml_string(

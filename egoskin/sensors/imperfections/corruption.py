@@ -23,6 +23,7 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 
 from egoskin.bounds import BoundsError, check_bounds
 from egoskin.rng import Stream, halfwords, random_words, stream_key
+from egoskin.sensors.skin.skin import Indices, indices
 from egoskin.transform import StatefulTransform
 
 State = dict[str, Tensor]
@@ -320,7 +321,8 @@ class Corruption(StatefulTransform):
     Args:
         models: Imperfections, in the order in which they apply.
         dt: Duration of a control step [s].
-        seed: Seed of all draws, in [0, 2**32).
+        seed: Seed of all draws, in [0, 2**32), or the result of
+            `egoskin.rng.held_out`.
         row_offset: Global index of the first row.
         redraw_traits: Whether sensor properties (offsets, gains, phases, dead sensors)
             are redrawn for each row and episode, to train for any robot. If False, all
@@ -329,8 +331,9 @@ class Corruption(StatefulTransform):
         out_keys: Key of the reading; the other keys are derived from it.
 
     Raises:
-        ValueError: If the control step is not positive, the seed is invalid, there are
-            too many models or the number of keys is wrong.
+        ValueError: If the control step is not positive, the seed is invalid, a model is
+            neither a `PointModel` nor a `FrameModel`, there are too many models or the
+            number of keys is wrong.
     """
 
     def __init__(
@@ -347,6 +350,13 @@ class Corruption(StatefulTransform):
         if not dt > 0:
             raise ValueError(f"dt must be positive, got {dt}")
         stream_key(seed, Stream.SENSOR)
+        if not isinstance(models, Sequence) or not all(
+            isinstance(model, PointModel | FrameModel) for model in models
+        ):
+            raise ValueError(
+                "models must be a list of PointModel or FrameModel instances, got "
+                f"{models!r}"
+            )
         if len(models) > _MAX_MODELS:
             raise ValueError(f"at most {_MAX_MODELS} models, got {len(models)}")
         needed = ["distance"]
@@ -376,7 +386,7 @@ class Corruption(StatefulTransform):
         """Start again at episode 0, from the next reset of all rows.
 
         Args:
-            seed: New seed of all draws, in [0, 2**32); None keeps the old one.
+            seed: New seed of all draws, as on construction; None keeps the old one.
 
         Raises:
             ValueError: If the seed is invalid.
@@ -386,15 +396,15 @@ class Corruption(StatefulTransform):
             self._settings["seed"] = seed
         self._last = None
 
-    def mask(self, sensors: Sequence[int]) -> None:
+    def mask(self, sensors: Indices) -> None:
         """Mask some sensors: they read nothing. Replaces the previous mask.
 
         Without it, sensors that measure nothing still have false positives.
 
         Args:
-            sensors: Indices of the masked sensors.
+            sensors: Indices of the masked sensors, or ``[S]`` bool.
         """
-        self._masked = list(sensors)
+        self._masked = indices(sensors)
 
     def _moment(self, rows: Tensor, clock: Tensor, joint_vel: list[Tensor]) -> Moment:
         """Return the moment of some rows, from their clocks ``[B, 2]``."""

@@ -9,12 +9,14 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from torch import Tensor
 
 from egoskin.bounds import is_number
 from egoskin.hints import did_you_mean
@@ -41,6 +43,30 @@ _DROPPED: dict[str, dict[str, Any]] = {
 _UNIT_TOLERANCE = 1e-3
 FARTHEST = 2.0
 """Largest distance of a sensor from its link's origin [m]; beyond, units are wrong."""
+
+
+Indices = Sequence[int] | Sequence[bool] | np.ndarray | Tensor
+"""Indices of sensors, or one flag for each sensor."""
+
+
+def indices(sensors: Indices, number: int | None = None) -> list[int]:
+    """Return the indices of some sensors, given as such or as flags ``[S]`` bool.
+
+    Args:
+        sensors: Indices, or one flag for each sensor.
+        number: Number of sensors ``S``, if known.
+
+    Raises:
+        ValueError: If there are flags, but not one for each sensor.
+    """
+    array = np.asarray(sensors)
+    if array.dtype == bool:
+        if array.ndim != 1 or number not in (None, len(array)):
+            raise ValueError(
+                f"flags of sensors must be ({number},), one for each, got {array.shape}"
+            )
+        array = np.flatnonzero(array)
+    return [operator.index(i) for i in array.tolist()]
 
 
 def _is_vector(value: object) -> bool:
@@ -151,7 +177,8 @@ class Skin:
 
     Raises:
         ValueError: If the arrays differ in length, positions, normals or rolls are not
-            finite, ranges or radii are not positive, or normals are not unit vectors.
+            finite, ranges or radii are not positive, normals are not unit vectors, or
+            a coverage is none.
     """
 
     robot: str
@@ -186,6 +213,13 @@ class Skin:
                 )
         if not np.isfinite(self.roll_deg).all():
             raise ValueError("roll_deg holds values that are not finite")
+        if isinstance(self.coverage, Coverage) or not all(
+            own is None or isinstance(own, Coverage) for own in self.coverage
+        ):
+            raise ValueError(
+                "coverage must hold a Field, a Ray or None for each sensor, got "
+                f"{self.coverage!r}"
+            )
         if not self.coverage:
             object.__setattr__(self, "coverage", (None,) * number)
         elif len(self.coverage) != number:
@@ -278,14 +312,23 @@ class Skin:
         roll = np.arctan2((x * plain[..., 1]).sum(-1), (x * plain[..., 0]).sum(-1))
         return replace(moved, roll_deg=np.degrees(roll))
 
-    def select(self, index: Sequence[int]) -> Skin:
-        """Return a skin with some of the sensors, in the order given."""
+    def select(self, index: Indices) -> Skin:
+        """Return a skin with some of the sensors, in the order given.
+
+        Args:
+            index: Indices of the sensors, or ``[S]`` bool.
+
+        Raises:
+            ValueError: If there are flags, but not one for each sensor, or none is
+                chosen.
+        """
+        index = indices(index, len(self))
         arrays = ("position", "normal", "range", "roll_deg", "radius")
         return replace(
             self,
             links=tuple(self.links[i] for i in index),
             coverage=tuple(self.coverage[i] for i in index),
-            **{name: getattr(self, name)[list(index)] for name in arrays},
+            **{name: getattr(self, name)[index] for name in arrays},
         )
 
     @property
@@ -351,14 +394,16 @@ class Skin:
             if coverage is not None:
                 if coverage not in types:
                     free = (f"type_{i}" for i in itertools.count(1))
-                    taken = {*types.values(), *names.values()}
+                    taken = {*types.values(), *self.types}
                     number = next(name for name in free if name not in taken)
                     types[coverage] = names.get(coverage, number)
                 entry["type"] = types[coverage]
             sensors.append(entry)
+        used = set(types.values())
+        unused = [(c, name) for name, c in self.types.items() if name not in used]
         named = {
             name: {"coverage": type(c).__name__.lower(), **asdict(c)}
-            for c, name in types.items()
+            for c, name in (*types.items(), *unused)
         }
         return {
             "format": _FORMAT,

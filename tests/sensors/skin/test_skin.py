@@ -141,6 +141,7 @@ def test_types_keep_their_names_and_new_ones_are_numbered():
     assert {name: type_["coverage"] for name, type_ in types.items()} == {
         "type_2": "field",
         "type_1": "field",
+        "palm": "ray",
     }
     assert Skin.from_dict(skin.to_dict()).coverage == skin.coverage
     assert [s["type"] for s in skin.to_dict()["sensors"]] == ["type_2", "type_1"]
@@ -292,6 +293,20 @@ def test_a_missing_file_is_refused_with_its_name():
 def test_arrays_of_the_wrong_shape_are_refused(name):
     with pytest.raises(ValueError, match=rf"{name} must be \(1, 3\), got \(2, 3\)"):
         replace(make_skin([0, 0, 1]), **{name: np.zeros((2, 3))})
+
+
+def test_sensors_are_selected_by_index_or_flag(skin):
+    for index in ([0, 2], np.array([0, 2]), np.isin(np.arange(64), [0, 2])):
+        assert skin.select(index).position.tolist() == skin.position[[0, 2]].tolist()
+    assert skin.select([2, 0]).links == (skin.links[2], skin.links[0])
+    with pytest.raises(ValueError, match=r"must be \(64,\), one for each, got \(2,\)"):
+        skin.select([True, False])
+
+
+@pytest.mark.parametrize("coverage", [Ray(), ("ray",)])
+def test_a_coverage_that_is_none_is_refused(coverage):
+    with pytest.raises(ValueError, match="a Ray or None for each sensor, got"):
+        replace(make_skin([0, 0, 1]), coverage=coverage)
 
 
 def test_lists_are_taken_for_arrays_and_a_name_for_links_is_refused():

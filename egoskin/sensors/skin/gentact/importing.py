@@ -63,8 +63,9 @@ def load_gentact(
             several files are concatenated.
         robot_name: Name of the robot, for the skin.
         links: Links of the robot.
-        primitives: The robot's shapes, for files without normals and for the distance
-            of the sensors from the surface in the provenance.
+        primitives: The robot's shapes, usually `RobotConfig.known_primitives`, for
+            files without normals and for the distance of the sensors from the surface
+            in the provenance.
         scale: Unit of the positions [m], and of the radii except in newer 3-D print
             exports, whose radii are in metres. None: the unit given in brackets in the
             header, or that of the dialect.
