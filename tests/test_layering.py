@@ -37,7 +37,7 @@ ROOMS = {
     "make": {"storage", "robots", "transform", "envs", "sensors"},
     "policies": {"storage", "envs", "sensors", "agents", "make"},
     "evaluation": {"robots", "transform", "envs", "sensors", "policies", "make"},
-    "runs": {"storage", "envs", "sensors", "agents", "make", "policies"},
+    "runs": {"storage", "robots", "envs", "sensors", "agents", "make", "policies"},
     "deploy": set(),
     "viewer": {
         *("storage", "robots", "envs", "sensors", "make", "policies", "evaluation")

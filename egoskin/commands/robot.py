@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -24,8 +24,10 @@ from egoskin.envs.physics import PhysicsConfig
 from egoskin.envs.throws import ThrowConfig
 from egoskin.progress import counted
 from egoskin.robots.builtin import ROBOTS
+from egoskin.robots.checks import Finding, check_model, names_of
 from egoskin.robots.config import RobotConfig
 from egoskin.robots.own import find_robot, portable
+from egoskin.robots.spec import links_with_meshes
 from egoskin.sensors.config import SkinConfig
 from egoskin.storage.files import check_output
 from egoskin.viewer.film import save_picture
@@ -34,16 +36,6 @@ from egoskin.viewer.film import save_picture
 _STAND_S = 2.0
 # A joint that an action of 1 moves by less than this is hardly usable [rad].
 _SMALL_REACH = 0.1
-
-
-@dataclass(frozen=True)
-class Finding:
-    """Result of one check."""
-
-    kind: Literal["ok", "note", "wrong"]
-    """Fine; worth knowing; or an error that prevents training."""
-    text: str
-    """Description of the result, and what to do."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +57,10 @@ class Check:
         """
         check_output(self.out, "--out", (".png",))
         robot = find_robot(self.robot)
+        without_meshes: list[str] = []
         if ROBOTS.get(robot.name) is not robot:
+            if robot.is_urdf and robot.model_path is not None:
+                without_meshes = links_with_meshes(robot.model_path)
             robot = portable(robot)
         mass = float(robot.model.body_mass.sum())
         print(
@@ -73,6 +68,11 @@ class Check:
             f"{counted(len(robot.links), 'link')}, {mass:.2f} kg"
         )
         wrong = 0
+        if without_meshes:
+            print(
+                f"  note   {', '.join(without_meshes)}: collision meshes of a URDF are "
+                "left out; balls pass through, so add primitives"
+            )
         for finding in findings(robot, self.skin):
             print(f"  {finding.kind:<5}  {finding.text}", flush=True)
             wrong += finding.kind == "wrong"
@@ -93,72 +93,13 @@ def findings(robot: RobotConfig, skin: SkinConfig) -> Iterator[Finding]:
         robot: The robot.
         skin: Placement of its sensors.
     """
-    static = [*_joints(robot), *_feet(robot), *_skin(robot, skin)]
+    static = [*check_model(robot), *_skin(robot, skin)]
     yield from static
     if any(finding.kind == "wrong" for finding in static):
         yield Finding("note", "whether it stands is tested once this is fixed")
         return
     yield from _actuation(robot)
     yield from _standing(robot)
-
-
-def _joints(robot: RobotConfig) -> Iterator[Finding]:
-    """Check base, joints, gains and limits."""
-    try:
-        robot.check_floating_base()
-        yield Finding("ok", f"the base {robot.base} floats, all joints are hinges")
-    except ValueError as error:
-        yield Finding("wrong", str(error))
-    try:
-        for gains in robot.gains or [None]:
-            robot.joint_gains(gains)
-        yield Finding("ok", f"gains: {', '.join(robot.gains)} (the first is used)")
-    except ValueError as error:
-        yield Finding("wrong", str(error))
-    without = _names(robot, robot.torque_limit <= 0)
-    if without:
-        yield Finding(
-            "wrong",
-            f"no torque limit: {without}; set actuatorfrcrange of the joint (URDF: "
-            "effort of its limit)",
-        )
-    low, high = robot.joint_range
-    if without := _names(robot, np.isinf(low)):
-        yield Finding(
-            "note", f"no range: {without}; only their collision shapes limit them"
-        )
-    pose = robot.default_joint_pos
-    outside = _names(robot, (pose < low) | (pose > high))
-    if outside:
-        yield Finding("wrong", f"the default pose is out of range: {outside}")
-
-
-def _names(robot: RobotConfig, which: np.ndarray) -> str:
-    """Return the names of the joints that a mask selects, ``[J]`` bool."""
-    return ", ".join(np.array(robot.joints)[which])
-
-
-def _feet(robot: RobotConfig) -> Iterator[Finding]:
-    """Check the feet and the links that touch the ground."""
-    if not robot.feet:
-        yield Finding("wrong", "no feet: any contact with the floor counts as a fall")
-    if missing := sorted({*robot.feet} - {*robot.links}):
-        yield Finding("wrong", f"feet that are not links: {', '.join(missing)}")
-    try:
-        if not robot.primitives:
-            yield Finding("wrong", "no collision shapes")
-            return
-        base, tall = robot.default_base_height, robot.standing_height
-    except ValueError as error:
-        yield Finding("wrong", str(error))
-        return
-    lowest = robot.lowest_link
-    kind = "ok" if lowest in robot.feet else "wrong"
-    yield Finding(
-        kind,
-        f"it stands on {lowest}{'' if kind == 'ok' else ', which is not a foot'}: "
-        f"{tall:.2f} m tall, its base {base:.2f} m up",
-    )
 
 
 def _skin(robot: RobotConfig, skin: SkinConfig) -> Iterator[Finding]:
@@ -190,7 +131,7 @@ def _actuation(robot: RobotConfig) -> Iterator[Finding]:
             f"gains {name}: an action of 1 moves a joint by {reach.min():.2f} to "
             f"{reach.max():.2f} rad (half of them by {np.median(reach):.2f} or more)",
         )
-        if small := _names(robot, reach < _SMALL_REACH):
+        if small := names_of(robot, reach < _SMALL_REACH):
             yield Finding(
                 "note",
                 f"... by less than {_SMALL_REACH:g} rad: {small}; too stiff for their "

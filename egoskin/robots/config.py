@@ -19,6 +19,7 @@ import mujoco
 import numpy as np
 import pytorch_kinematics as pk
 
+from egoskin.bounds import is_number
 from egoskin.robots.chains import (
     JOINT_TYPES,
     body_id,
@@ -42,6 +43,16 @@ class Gain:
     """Stiffness [N m/rad]."""
     kd: float
     """Damping [N m s/rad]."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError unless kp is positive and kd is not negative."""
+        if not (is_number(self.kp) and is_number(self.kd)) or not (
+            self.kp > 0 and self.kd >= 0
+        ):
+            raise ValueError(
+                f"a gain must have numbers kp > 0 and kd >= 0, got kp = {self.kp!r}, "
+                f"kd = {self.kd!r}"
+            )
 
 
 def resolve(
@@ -219,10 +230,16 @@ class RobotConfig:
                 f"{self.name}: its base {self.base!r} must be upright in the file "
                 "(turned about z at most); an episode starts so"
             )
-        hinges = kinds[self._joint_ids] == mujoco.mjtJoint.mjJNT_HINGE
-        if hinges.sum() != model.njnt - 1:
+        own = {*self._joint_ids}
+        others = [
+            joint_name(model, j)
+            for j in range(1, model.njnt)
+            if j not in own or kinds[j] != mujoco.mjtJoint.mjJNT_HINGE
+        ]
+        if others:
             raise ValueError(
-                f"{self.name}: all joints but the first must be hinges below its base"
+                f"{self.name}: all joints but the first must be hinges below its base; "
+                f"not so: {', '.join(others)}"
             )
 
     @cached_property
@@ -336,21 +353,24 @@ class RobotConfig:
     def primitives_on(self, links: Collection[str]) -> tuple[Primitive, ...]:
         """Return the collision shapes of some links, with their poses in their frames.
 
+        A cylinder is replaced as in `round_off`.
+
         Args:
             links: Names of the links; the shapes of other links are ignored.
 
         Raises:
-            ValueError: If a shape is not a sphere, capsule or box.
+            ValueError: If a shape is not a sphere, capsule, box or cylinder.
         """
         model, shapes = self.model, []
         for geom in self._collision_geoms(links):
             rotation = np.zeros(9)
             mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
+            kind, size = _primitive(model, geom)
             shapes.append(
                 Primitive(
                     link=body_name(model, int(model.geom_bodyid[geom])),
-                    kind=_primitive_kind(model, geom),
-                    size=model.geom_size[geom].copy(),
+                    kind=kind,
+                    size=size,
                     position=model.geom_pos[geom].copy(),
                     rotation=rotation.reshape(3, 3),
                 )
@@ -408,31 +428,45 @@ def read_robot(path: Path | str) -> RobotConfig:
     )
 
 
-def _primitive_kind(model: mujoco.MjModel, geom: int) -> str:
-    """Return "sphere", "capsule" or "box".
+def round_off(radius: float, half_length: float) -> tuple[str, list[float]]:
+    """Return the primitive that replaces a cylinder, and its size as in MuJoCo [m].
+
+    It is the capsule inside it, of the same length and radius, or, if it is not longer
+    than its diameter, the box around it.
+    """
+    if half_length > radius:
+        return "capsule", [radius, half_length - radius, 0.0]
+    return "box", [radius, radius, half_length]
+
+
+def _primitive(model: mujoco.MjModel, geom: int) -> tuple[str, np.ndarray]:
+    """Return "sphere", "capsule" or "box", and its size as in MuJoCo [m], ``[3]``.
 
     Raises:
-        ValueError: If the geom is of another kind.
+        ValueError: If the geom is of another kind and no cylinder.
     """
     kind = mujoco.mjtGeom(int(model.geom_type[geom])).name
     kind = kind.removeprefix("mjGEOM_").lower()
-    if kind not in ("sphere", "capsule", "box"):
+    size = model.geom_size[geom].copy()
+    if kind == "cylinder":
+        kind, rounded = round_off(*size[:2].tolist())
+        size = np.array(rounded)
+    elif kind not in ("sphere", "capsule", "box"):
         link = body_name(model, int(model.geom_bodyid[geom]))
         name = model.geom(geom).name or geom
         raise ValueError(
             f"link {link!r} has a collision shape, geom {name!r}, of kind {kind}; it "
-            "must be a sphere, capsule or box: replace it (egoskin.robots.own.portable "
-            "does so for cylinders), or place sensors on the link's meshes with "
-            f"meshes={{{link!r}: [...]}} (--meshes)"
+            "must be a sphere, capsule, box or cylinder: replace it, or place sensors "
+            f"on the link's meshes with meshes={{{link!r}: [...]}} (--meshes)"
         )
-    return kind
+    return kind, size
 
 
 def _extent(
     model: mujoco.MjModel, data: mujoco.MjData, geom: int
 ) -> tuple[float, float]:
     """Return the height of the lowest and highest point of a primitive geom [m]."""
-    size, kind = model.geom_size[geom], _primitive_kind(model, geom)
+    kind, size = _primitive(model, geom)
     z_row = data.geom_xmat[geom].reshape(3, 3)[2]
     if kind == "sphere":
         reach = size[0]

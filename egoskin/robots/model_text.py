@@ -12,7 +12,16 @@ from xml.etree import ElementTree
 _ELEMENTS = frozenset(
     (
         *("mujoco", "compiler", "option", "flag", "default", "asset", "material"),
-        *("worldbody", "body", "inertial", "joint", "freejoint", "geom", "site"),
+        *(
+            "worldbody",
+            "body",
+            "frame",
+            "inertial",
+            "joint",
+            "freejoint",
+            "geom",
+            "site",
+        ),
         *("contact", "exclude", "pair"),
     )
 )

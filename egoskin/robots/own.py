@@ -28,6 +28,7 @@ import sys
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
+from traceback import extract_tb
 from typing import Annotated, Any
 from xml.etree import ElementTree
 
@@ -38,7 +39,7 @@ from egoskin.bounds import is_number
 from egoskin.hints import did_you_mean
 from egoskin.robots.builtin import ROBOTS
 from egoskin.robots.chains import body_id, body_name
-from egoskin.robots.config import Gain, RobotConfig, read_robot
+from egoskin.robots.config import Gain, RobotConfig, read_robot, round_off
 from egoskin.robots.spec import set_inertia
 from egoskin.storage.files import read_regular
 
@@ -148,7 +149,17 @@ def _from_python(path: Path, variable: str) -> RobotConfig:
     """Run a Python file and return the robot in one of its variables."""
     if not path.is_file():
         raise ValueError(f"no file {path}: a robot is given as my_robot.py:ROBOT")
-    names = runpy.run_path(str(path))
+    try:
+        names = runpy.run_path(str(path))
+    # The file may raise anything.
+    except Exception as error:
+        lines = [
+            f.lineno for f in extract_tb(error.__traceback__) if f.filename == str(path)
+        ]
+        if isinstance(error, SyntaxError):
+            lines.append(error.lineno)
+        where = f":{lines[-1]}" if lines else ""
+        raise ValueError(f"{path}{where}: {type(error).__name__}: {error}") from error
     robot = names.get(variable)
     if not isinstance(robot, RobotConfig):
         robots = [n for n, value in names.items() if isinstance(value, RobotConfig)]
@@ -163,7 +174,7 @@ class _Toml:
     """A TOML file, with errors that give the line number."""
 
     def __init__(self, path: Path) -> None:
-        self.path, self.text = path, read_regular(path).decode(errors="replace")
+        self.path, self.text = path, read_regular(path).decode("utf-8-sig", "replace")
         try:
             self.content: dict[str, Any] = tomllib.loads(self.text)
         except tomllib.TOMLDecodeError as error:
@@ -338,9 +349,9 @@ def portable(robot: RobotConfig) -> RobotConfig:
     Visual meshes, actuators, sensors, key frames, their defaults, and everything that
     is not below the base are left out; masses are kept. A cylinder becomes the capsule
     inside it, of the same length and radius, or, if it is flat, a box. The base of a
-    URDF floats. If the file does not use this package's collision bits (see
-    ``egoskin/assets/h1_2.xml``), self-collision stays as in the file, and balls and
-    floor collide with all shapes.
+    URDF floats. Margins of contacts are zero. If the file does not use this package's
+    collision bits (see ``egoskin/assets/h1_2.xml``), self-collision stays as in the
+    file, and balls and floor collide with all shapes.
 
     Args:
         robot: A robot of the task; `RobotConfig.model_path` is read.
@@ -354,6 +365,15 @@ def portable(robot: RobotConfig) -> RobotConfig:
     spec, model = robot.spec(), robot.model
     keep = set(robot.links)
     _check_outermost(robot, model)
+    for kind, elements in {
+        "tendons": spec.tendons,
+        "equality constraints (in a URDF: mimic)": spec.equalities,
+    }.items():
+        if elements:
+            raise ValueError(
+                f"{robot.name}: {kind} are not supported: remove them, or fix the "
+                "joints that they move"
+            )
     _fix_inertia(spec, model)
     in_pairs = {pair.geomname1 for pair in spec.pairs}
     in_pairs |= {pair.geomname2 for pair in spec.pairs}
@@ -376,6 +396,9 @@ def portable(robot: RobotConfig) -> RobotConfig:
                 "data may have spheres, capsules, boxes and cylinders: replace it, or "
                 'make it visual only (contype="0" conaffinity="0")'
             )
+    for each in (*spec.geoms, *spec.pairs):
+        # A ball within the margin would count as a touch.
+        each.margin = each.gap = 0.0
     geoms, bodies = ({each.name for each in x} for x in (spec.geoms, spec.bodies))
     for pair in list(spec.pairs):
         if not {pair.geomname1, pair.geomname2} <= geoms:
@@ -451,13 +474,8 @@ def _fix_inertia(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
 
 def _round_off(geom: mujoco.MjsGeom) -> None:
     """Turn a cylinder into a capsule or, if it is flat, into a box."""
-    radius, half = float(geom.size[0]), float(geom.size[1])
-    if half > radius:
-        geom.type = mujoco.mjtGeom.mjGEOM_CAPSULE
-        geom.size = [radius, half - radius, 0]
-    else:
-        geom.type = mujoco.mjtGeom.mjGEOM_BOX
-        geom.size = [radius, radius, half]
+    kind, geom.size = round_off(float(geom.size[0]), float(geom.size[1]))
+    geom.type = getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")
 
 
 def _set_bits(spec: mujoco.MjSpec, in_pairs: Collection[str]) -> None:

@@ -15,6 +15,7 @@ from egoskin.policies.policy import (
     check_agent_tensors,
     sparse_sources,
 )
+from egoskin.robots.checks import check_trainable
 from egoskin.runs.config import INIT_HASH, SKIN_HASH, TrainConfig, read_config
 from egoskin.sensors import Skin
 from egoskin.storage.serialization import to_plain
@@ -55,11 +56,14 @@ def check_fits(
 ) -> None:
     """Raise ValueError unless the parts of a training fit together and into memory.
 
+    Also if its robot cannot be trained.
+
     Args:
         config: The training.
         skin: Its sensors.
         initial: The networks to start from, as returned by `load_networks`.
     """
+    check_trainable(config.env.robot_config)
     sources = sparse_sources(config.env, skin)
     one = make_worker_env(
         config.env, skin, num_envs=1, seed=config.seed, sparse=bool(sources)

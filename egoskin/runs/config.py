@@ -201,6 +201,8 @@ def _default_of(given: argparse.Namespace) -> TrainConfig:
         if given.standard is not None:
             raise ValueError("--config has its own throws: leave out --standard")
         path = Path(given.config)
+        if path.is_dir():
+            path /= "config.json"
         if not path.is_file():
             raise ValueError(f"no file {path}: --config takes the config.json of a run")
         return from_plain(TrainConfig, read_config(path)[0], str(path))

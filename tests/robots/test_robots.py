@@ -18,7 +18,7 @@ from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
 from egoskin.envs.physics import PhysicsConfig, Scene
 from egoskin.envs.physics.model import build_scene
 from egoskin.robots.builtin import H1_2
-from egoskin.robots.config import RobotConfig, read_robot
+from egoskin.robots.config import Gain, RobotConfig, read_robot
 from egoskin.robots.kinematics import LinkKinematics
 from egoskin.robots.surface import default_frames, distance_to
 from egoskin.sensors import FieldSensor, place_sensors
@@ -151,7 +151,25 @@ def test_shapes_that_touch_only_in_a_pair_are_collision_shapes(tmp_path):
     assert shape.size[0] == 0.1
 
 
-@pytest.mark.parametrize("kind", ["cylinder", "ellipsoid"])
+def test_a_cylinder_is_the_capsule_inside_it_or_if_flat_a_box(small_robot):
+    robot = small_robot(
+        "<geom type='cylinder' size='.1 .3'/>"
+        "<body name='b'><geom type='cylinder' size='.2 .05' pos='0 0 -.5'/></body>"
+    )
+    long, flat = robot.primitives
+    assert (long.kind, *long.size[:2]) == ("capsule", 0.1, pytest.approx(0.2))
+    assert (flat.kind, *flat.size) == ("box", 0.2, 0.2, 0.05)
+    assert robot.standing_height == pytest.approx(0.3 + 0.55)
+    assert len(place_sensors(robot, 20)) == 20
+
+
+def test_gains_are_positive_numbers():
+    for kp, kd in ((-60, 2), (0, 2), (60, -1), ("60", 2), (60, float("nan"))):
+        with pytest.raises(ValueError, match="a gain must have numbers kp > 0"):
+            Gain(kp=kp, kd=kd)
+
+
+@pytest.mark.parametrize("kind", ["ellipsoid"])
 def test_other_collision_shapes_are_refused_with_the_remedy(small_robot, kind):
     robot = small_robot(
         "<geom size='.1'/><body name='b'>"

@@ -34,6 +34,12 @@ def build_scene(scene: Scene) -> mujoco.MjModel:
     robot, config = scene.robot, scene.config
     robot.check_floating_base()
     spec = robot.spec()
+    named = [each.name for each in (*spec.bodies, *spec.geoms, *spec.joints)]
+    if taken := [x for x in named if x == "floor" or x.startswith("object")]:
+        raise ValueError(
+            f"{robot.name}: {taken[0]!r} is a name of the scene (floor, object..): "
+            "rename it in the robot"
+        )
     # A new specification has no settings of the robot's file.
     plain = mujoco.MjSpec()
     spec.option = plain.option

@@ -324,9 +324,9 @@ def test_sensors_are_placed_on_meshes(bare_robot):
 def test_a_link_whose_shape_is_no_primitive_takes_a_mesh(small_robot):
     robot = small_robot(
         "<geom size='.2'/>"
-        "<body name='b' pos='1 0 0'><geom type='cylinder' size='.1 .3'/></body>"
+        "<body name='b' pos='1 0 0'><geom type='ellipsoid' size='.1 .1 .3'/></body>"
     )
-    with pytest.raises(ValueError, match=r"link 'b' .* kind cylinder.*meshes=\{'b':"):
+    with pytest.raises(ValueError, match=r"link 'b' .* kind ellipsoid.*meshes=\{'b':"):
         place_sensors(robot, 50)
     tube = trimesh.creation.cylinder(0.1, 0.6)
     with pytest.raises(ValueError, match="link 'b' has a collision shape"):
