@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from copy import deepcopy
 from dataclasses import replace
 
 import pytest
@@ -261,6 +263,101 @@ def test_updates_move_the_mean_action_to_the_best():
     loc, _ = agent.head(torch.randn(1000, 3))
     assert (loc - 1).abs().mean() < 0.15
     assert metrics["action_std"] < 0.5
+
+
+def broken_rollout(agent: Agent) -> TensorDict:
+    """Episodes that end at random, some by a time limit, with values of any size."""
+    rollout = bandit_rollout(agent)
+    rollout["reward"] += torch.randn(16, 64, 1)
+    rollout["next_state_value"] = torch.randn(16, 64, 1)
+    rollout["done"] = torch.rand(16, 64, 1) < 0.2
+    rollout["terminated"] = rollout["done"] & (torch.rand(16, 64, 1) < 0.5)
+    return rollout
+
+
+def estimate(rollout: TensorDict, gamma: float, decay: float) -> Tensor:
+    """Generalised advantage estimates by the textbook's recursion, ``[T, N, 1]``."""
+    advantage, ahead = torch.zeros(16, 64, 1), torch.zeros(64, 1)
+    for i in reversed(range(16)):
+        row = rollout[i]
+        bootstrap = gamma * row["next_state_value"] * ~row["terminated"]
+        delta = row["reward"] + bootstrap - row["state_value"]
+        ahead = delta + gamma * decay * ahead * ~row["done"]
+        advantage[i] = ahead
+    return advantage
+
+
+def plain_update(agent: Agent, rollout: TensorDict, config: PPOConfig) -> float:
+    """Update an agent as PPO's paper says, in plain PyTorch; return the divergence."""
+    advantage = estimate(rollout, config.gamma, config.gae_lambda)
+    advantage = (advantage - advantage.mean()) / advantage.std()
+    assert config.value_lambda is not None
+    target = estimate(rollout, config.gamma, config.value_lambda)
+    target = (target + rollout["state_value"]).flatten()
+    inputs = rollout["inputs", "observation"].reshape(-1, 3)
+    action = rollout["action"].reshape(-1, 2)
+    before = rollout["action_log_prob"].flatten()
+    networks = [[*m.parameters()] for m in (agent.actor, agent.critic)]
+    adam = torch.optim.Adam(
+        [*networks[0], *networks[1]], config.learning_rate, eps=1e-5
+    )
+    low, high = config.network.std_bounds
+    for _ in range(config.ppo_epochs):
+        order = torch.randperm(len(action))
+        for index in order.chunk(config.num_mini_batches):
+            new = torch.distributions.Normal(*agent.head(inputs[index]))
+            ratio = (new.log_prob(action[index]).sum(-1) - before[index]).exp()
+            gain = advantage.flatten()[index]
+            clipped = ratio.clamp(1 - config.clip_epsilon, 1 + config.clip_epsilon)
+            objective = torch.minimum(ratio * gain, clipped * gain).mean()
+            state = TensorDict({"inputs": {"observation": inputs[index]}}, len(index))
+            error = agent.critic(state)["state_value"].flatten() - target[index]
+            loss = config.critic_coeff * error.square().mean() - objective
+            loss = loss - config.entropy_coeff * new.entropy().sum(-1).mean()
+            adam.zero_grad()
+            loss.backward()
+            for network in networks:
+                torch.nn.utils.clip_grad_norm_(network, config.max_grad_norm)
+            adam.step()
+            with torch.no_grad():
+                agent.head.log_std.clamp_(math.log(low), math.log(high))
+    with torch.no_grad():
+        after = torch.distributions.Normal(*agent.head(inputs))
+    then = (rollout["loc"].reshape(-1, 2), rollout["scale"].reshape(-1, 2))
+    old = torch.distributions.Normal(*then)
+    return float(torch.distributions.kl_divergence(old, after).sum(-1).mean())
+
+
+def test_an_update_is_that_of_plain_pytorch():
+    network = NetworkConfig(std_bounds=(0.366, 2.0), init_std=0.37)
+    # Minibatches and their shares of different sizes.
+    config = PPOConfig(
+        network=network, num_mini_batches=3, clip_epsilon=0.1, learning_rate=3e-3
+    )
+    torch.manual_seed(0)
+    agent = Agent({"observation": 3}, ["observation"], ["observation"], 2, network)
+    rollout, other = broken_rollout(agent), deepcopy(agent)
+    torch.manual_seed(1)
+    kl = plain_update(other, rollout, config)
+    # 1.2: the rate grows by the square root, far from its limits.
+    config = replace(config, desired_kl=1.2 * kl)
+    torch.manual_seed(1)
+    metrics = PPO(agent, config).update(rollout)
+    for (name, value), expected in zip(
+        agent.named_parameters(), other.parameters(), strict=True
+    ):
+        torch.testing.assert_close(value, expected, rtol=1e-3, atol=1e-5, msg=name)
+    assert metrics["kl"] == pytest.approx(kl, rel=1e-3)
+    assert metrics["learning_rate"] == pytest.approx(3e-3 * math.sqrt(1.2), rel=1e-3)
+    assert 0.05 < metrics["clip_fraction"] < 0.95
+    assert float(agent.head.log_std.detach().min().exp()) == pytest.approx(0.366)
+    target = estimate(rollout, 0.995, 0.95) + rollout["state_value"]
+    missed = (target - rollout["state_value"]).var() / target.var()
+    assert metrics["explained_variance"] == pytest.approx(1 - float(missed), rel=1e-4)
+    # The normalisers have seen this rollout, for the next one.
+    norm = agent.norms["observation"]
+    seen = rollout["observation"].reshape(-1, 3).double()
+    torch.testing.assert_close(norm.mean, seen.mean(0), rtol=1e-3, atol=1e-3)
 
 
 def test_the_learning_rate_follows_the_divergence_from_update_to_update():
