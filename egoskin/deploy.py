@@ -91,8 +91,9 @@ class Controller:
             joint_pos: Joint positions in the file's order [rad], ``[J]``.
             joint_vel: Joint velocities [rad/s], ``[J]``.
             body_age: Age of these measurements [s].
-            distance: Distances of the sensors [m], inf for no detection, NaN if
-                missing: ``[S]``, or ``[S, K]`` for grids; None for a blind policy.
+            distance: Distances of the sensors [m], inf for no detection, NaN or
+                negative if missing: ``[S]``, or ``[S, K]`` for grids; None for a blind
+                policy.
             skin_age: Age of the distances [s].
 
         Raises:
@@ -134,6 +135,8 @@ class Controller:
     def _signal(self, distance: np.ndarray | None) -> np.ndarray:
         """Return the signal computed from distances."""
         found = np.asarray(np.nan * self._range if distance is None else distance)
+        # Drivers report -1 for "no target".
+        found = np.where(found < 0, np.nan, found)
         if self._sensor["reduce"] == "min" and found.ndim == 2:
             found = np.fmin.reduce(found, 1)
         readings = self.metadata["readings"]

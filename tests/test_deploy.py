@@ -124,6 +124,7 @@ def state(controller) -> dict[str, Any]:
         ({"base_quat": np.zeros(4)}, "base_quat is not a unit quaternion"),
         ({"distance": None}, "100% of the skin is missing"),
         ({"distance": np.full(64, np.nan)}, "100% of the skin is missing"),
+        ({"distance": np.full(64, -1.0)}, "100% of the skin is missing"),
         ({"distance": np.repeat([np.nan, 1], [7, 57])}, "11% of the skin is missing"),
     ],
     ids=str,
@@ -162,11 +163,12 @@ def test_a_stop_from_the_first_step_on_leaves_the_robot_as_it_is(controller, sta
     assert controller.stopped == "the operator let go of the button"
 
 
-def test_a_sensor_that_is_missing_reads_as_one_of_nothing(controller, state):
+@pytest.mark.parametrize("missing", [np.nan, -1.0])
+def test_a_sensor_that_is_missing_reads_as_one_of_nothing(controller, state, missing):
     expected = controller.step(**state)
     controller.reset()
     distance = state["distance"].copy()
-    distance[[3, 60]] = np.nan
+    distance[[3, 60]] = missing
     target = controller.step(**{**state, "distance": distance})
     assert controller.stopped is None
     np.testing.assert_array_equal(target, expected)
@@ -216,6 +218,24 @@ def test_of_grids_of_beams_the_closest_count_where_a_policy_reads_those(tmp_path
         state |= {"base_quat": [0.6, 0, 0.8, 0], "base_ang_vel_b": np.ones(3)}
         targets.append(controller.step(**state, body_age=0, distance=given))
     np.testing.assert_array_equal(*targets)
+
+
+@pytest.mark.parametrize("kind", ["no limit", "closest beams"])
+@pytest.mark.filterwarnings("error")
+def test_no_kind_of_policy_takes_a_negative_distance_for_contact(kind, tmp_path):
+    controller = deploy(make_policy(KINDS[kind]), tmp_path)
+    state = {"joint_pos": np.zeros(21), "joint_vel": np.zeros(21), "body_age": 0}
+    state |= {"base_quat": [1, 0, 0, 0], "base_ang_vel_b": np.zeros(3)}
+    shape = (64, 64) if kind == "closest beams" else (64,)
+    missing, near = np.full(shape, np.inf), np.full(shape, 0.5)
+    targets = []
+    for first in (np.inf, -1.0):
+        # A sensor, and one beam of another.
+        missing[0], near.reshape(64, -1)[-1, 0] = first, first
+        for distance in (missing, near):
+            controller.reset()
+            targets.append(controller.step(**state, distance=distance))
+    np.testing.assert_array_equal(targets[:2], targets[2:])
 
 
 def test_targets_stay_within_limits_of_place_and_change(tmp_path):
