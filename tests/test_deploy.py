@@ -340,10 +340,13 @@ DRAWN = ("azimuth", "distance", "height", "speed", "interval", "aim_link", "aim_
     [
         (["run", "nope"], r"No such file .*nope.policy\.onnx"),
         (["prepare", "nope", "--out", "made"], "nope"),
+        (["prepare", "localization", "--out", "made"], "needs a tracker"),
     ],
     ids=str,
 )
-def test_the_example_names_what_it_lacks_in_one_line(args, text, tmp_path, monkeypatch):
+def test_the_example_tells_what_it_refuses_in_one_line(
+    args, text, tmp_path, monkeypatch
+):
     main = runpy.run_path(str(SCRIPTS / "deploy_mujoco.py"))["main"]
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["deploy_mujoco.py", *args])
