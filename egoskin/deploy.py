@@ -30,7 +30,9 @@ class Controller:
         max_change: Largest change of targets per control step, in the same unit.
 
     Raises:
-        ValueError: If it is no exported policy, or reads positions of balls.
+        ValueError: If it is no exported policy, or reads positions of balls, or a limit
+            is negative or NaN, or `max_missing` above 1.
+        OSError: If it cannot be read.
     """
 
     def __init__(
@@ -42,9 +44,18 @@ class Controller:
         margin: float = 1.0,
         max_change: float = 2.0,
     ) -> None:
+        limits = {"max_age": max_age, "margin": margin, "max_change": max_change}
+        for name, value in {**limits, "max_missing": max_missing}.items():
+            most = 1 if name == "max_missing" else np.inf
+            if not 0 <= value <= most:
+                raise ValueError(f"{name} must be in [0, {most}], got {value}")
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = 1
-        self._session = onnxruntime.InferenceSession(str(path), options)
+        content = Path(path).read_bytes()
+        try:
+            self._session = onnxruntime.InferenceSession(content, options)
+        except Exception as error:  # onnxruntime's have no common base
+            raise ValueError(f"{path} is not an ONNX file: {error}") from error
         text = self._session.get_modelmeta().custom_metadata_map.get("egoskin")
         if text is None:
             raise ValueError(f"{path} was not written by `egoskin export`")
@@ -91,10 +102,19 @@ class Controller:
             joint_pos: Joint positions in the file's order [rad], ``[J]``.
             joint_vel: Joint velocities [rad/s], ``[J]``.
             body_age: Age of these measurements [s].
-            distance: Distances of the sensors [m], inf for no detection, NaN if
-                missing: ``[S]``, or ``[S, K]`` for grids; None for a blind policy.
+            distance: Distances of the sensors [m], inf for no detection, NaN or
+                negative if missing: ``[S]``, or ``[S, K]`` for grids; None for a blind
+                policy.
             skin_age: Age of the distances [s].
+
+        Raises:
+            ValueError: If an input has the wrong shape.
         """
+        joints = self._default.shape
+        self._check_shape("base_quat", base_quat, (4,))
+        self._check_shape("base_ang_vel_b", base_ang_vel_b, (3,))
+        self._check_shape("joint_pos", joint_pos, joints)
+        self._check_shape("joint_vel", joint_vel, joints)
         w, x, y, z = base_quat  # of the rotation R; gravity_b = R^T (0, 0, -1)
         gravity_b = -2 * np.array([x * z - w * y, y * z + w * x, 0.5 - x * x - y * y])
         deviation = np.asarray(joint_pos) - self._default
@@ -116,11 +136,23 @@ class Controller:
         self._target = last if self.stopped else self._next_target(blocks, last)
         return self._target.copy()
 
+    def _check_shape(self, name: str, value: Any, *allowed: tuple[int, ...]) -> None:
+        """Raise ValueError if an input of `step` has none of the allowed shapes."""
+        if np.shape(value) not in allowed:
+            texts = " or ".join(str(list(shape)) for shape in allowed)
+            got = list(np.shape(value))
+            raise ValueError(f"{name} must have the shape {texts}, got {got}")
+
     def _signal(self, distance: np.ndarray | None) -> np.ndarray:
         """Return the signal computed from distances."""
         found = np.asarray(np.nan * self._range if distance is None else distance)
+        # Drivers report -1 for "no target".
+        found = np.where(found < 0, np.nan, found)
         if self._sensor["reduce"] == "min" and found.ndim == 2:
             found = np.fmin.reduce(found, 1)
+        readings = self.metadata["readings"]
+        grid = [(len(readings), readings[0])] if len(set(readings)) == 1 else []
+        self._check_shape("distance", found, self._range.shape, *grid)
         missing = np.isnan(found).reshape(len(self._range))
         if missing.mean() > self._max_missing:
             self.stop(f"{missing.mean():.0%} of the skin is missing")

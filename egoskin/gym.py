@@ -112,6 +112,14 @@ def _rows(td: TensorDictBase, key: str) -> np.ndarray:
     return value.reshape(-1, value.shape[-1]).numpy()
 
 
+def _finite(action: np.ndarray) -> Tensor:
+    """Return actions as a tensor, or raise ValueError if they are not finite."""
+    tensor = torch.as_tensor(action, dtype=torch.float32)
+    if not tensor.isfinite().all():
+        raise ValueError("an action must be finite, got NaN or infinite values")
+    return tensor
+
+
 def _column(td: TensorDictBase, key: str) -> np.ndarray:
     """Return a copy of an entry with one number per row, ``[B]``."""
     return _rows(td, key)[:, 0].copy()
@@ -182,8 +190,12 @@ class DodgeballGym(gymnasium.Env[np.ndarray, np.ndarray]):
     def step(
         self, action: np.ndarray
     ) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Return observation, reward, terminated, truncated and info."""
-        self._root["action"] = torch.as_tensor(action, dtype=torch.float32)[None]
+        """Return observation, reward, terminated, truncated and info.
+
+        Raises:
+            ValueError: If the action has a value that is NaN or infinite.
+        """
+        self._root["action"] = _finite(action)[None]
         step = self._env.step(self._root)
         self._root, after = self._env.step_mdp(step), step["next"]
         self._now, self._age = after, self._age + 1
@@ -288,11 +300,15 @@ class DodgeballVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def step(
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Return observations, rewards, terminations, truncations and infos."""
+        """Return observations, rewards, terminations, truncations and infos.
+
+        Raises:
+            ValueError: If an action has a value that is NaN or infinite.
+        """
         if self._env is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
         shape = (*self._root.batch_size, -1)
-        action = torch.as_tensor(actions, dtype=torch.float32).reshape(shape)
+        action = _finite(actions).reshape(shape)
         step, self._root = self._env.step_and_maybe_reset(
             self._root.set("action", action)
         )

@@ -38,10 +38,12 @@ def prepare(policy: str, out: Path, episodes: int, throw_set: int) -> None:
     from egoskin.envs.throws import Thrower
     from egoskin.evaluation.throw_set import play_throws, standard_task, throw_seed
     from egoskin.make import make_worker_env
-    from egoskin.policies.export import export_onnx
+    from egoskin.policies.export import export_onnx, needs_tracker
     from egoskin.policies.policy import load_policy
 
     loaded = load_policy(policy)
+    if needs_tracker(loaded):
+        raise ValueError(f"{policy} reads positions of balls, which needs a tracker")
     config = standard_task(loaded.env_config, "2")
     # What comes later is not used.
     task = replace(config.task, episode_length_s=config.task.success_s)
@@ -240,7 +242,10 @@ def main() -> None:
         "--margin", type=float, default=1.0, help="how far targets may be out of range"
     )
     args = vars(parser.parse_args())
-    {"prepare": prepare, "run": run}[args.pop("command")](**args)
+    try:
+        {"prepare": prepare, "run": run}[args.pop("command")](**args)
+    except (OSError, ValueError) as error:
+        raise SystemExit(f"error: {error}") from None
 
 
 if __name__ == "__main__":

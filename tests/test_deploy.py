@@ -7,6 +7,7 @@ import re
 import runpy
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -26,7 +27,7 @@ from egoskin.evaluation.throw_set import standard_task, throw_seed
 from egoskin.make import EnvConfig, make_worker_env
 from egoskin.policies.export import export_onnx
 from egoskin.policies.policy import Policy
-from egoskin.sensors.config import SensorConfig
+from egoskin.sensors.config import SensorConfig, SkinConfig
 from making import make_policy
 
 # A slow ball that comes near.
@@ -123,6 +124,7 @@ def state(controller) -> dict[str, Any]:
         ({"base_quat": np.zeros(4)}, "base_quat is not a unit quaternion"),
         ({"distance": None}, "100% of the skin is missing"),
         ({"distance": np.full(64, np.nan)}, "100% of the skin is missing"),
+        ({"distance": np.full(64, -1.0)}, "100% of the skin is missing"),
         ({"distance": np.repeat([np.nan, 1], [7, 57])}, "11% of the skin is missing"),
     ],
     ids=str,
@@ -161,14 +163,49 @@ def test_a_stop_from_the_first_step_on_leaves_the_robot_as_it_is(controller, sta
     assert controller.stopped == "the operator let go of the button"
 
 
-def test_a_sensor_that_is_missing_reads_as_one_of_nothing(controller, state):
+@pytest.mark.parametrize("missing", [np.nan, -1.0])
+def test_a_sensor_that_is_missing_reads_as_one_of_nothing(controller, state, missing):
     expected = controller.step(**state)
     controller.reset()
     distance = state["distance"].copy()
-    distance[[3, 60]] = np.nan
+    distance[[3, 60]] = missing
     target = controller.step(**{**state, "distance": distance})
     assert controller.stopped is None
     np.testing.assert_array_equal(target, expected)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "shapes"),
+    [
+        ("base_quat", np.ones(3), r"\[4\]"),
+        ("base_ang_vel_b", np.zeros((1, 3)), r"\[3\]"),
+        ("joint_pos", 0.0, r"\[21\]"),
+        ("joint_vel", np.zeros(20), r"\[21\]"),
+        ("distance", np.ones(63), r"\[64\] or \[64, 1\]"),
+        ("distance", np.ones((1, 64)), r"\[64\] or \[64, 1\]"),
+    ],
+    ids=str,
+)
+def test_an_input_of_a_wrong_shape_is_refused_by_name(
+    controller, state, name, value, shapes
+):
+    text = f"^{name} must have the shape {shapes}, got "
+    with pytest.raises(ValueError, match=text + re.escape(str([*np.shape(value)]))):
+        controller.step(**{**state, name: value})
+
+
+def test_grids_of_beams_must_not_be_transposed(tmp_path):
+    # 64 sensors of 64 beams would not show it.
+    skin = SkinConfig(num_sensors=10)
+    controller = deploy(make_policy(replace(KINDS["grid"], skin=skin)), tmp_path)
+    assert controller.metadata["readings"] == [64] * 10
+    state = {"joint_pos": np.zeros(21), "joint_vel": np.zeros(21), "body_age": 0}
+    state |= {"base_quat": [1, 0, 0, 0], "base_ang_vel_b": np.zeros(3)}
+    controller.step(**state, distance=np.ones((10, 64)))
+    with pytest.raises(
+        ValueError, match=r"^distance must have the shape .*\[64, 10\]$"
+    ):
+        controller.step(**state, distance=np.ones((64, 10)))
 
 
 def test_of_grids_of_beams_the_closest_count_where_a_policy_reads_those(tmp_path):
@@ -181,6 +218,24 @@ def test_of_grids_of_beams_the_closest_count_where_a_policy_reads_those(tmp_path
         state |= {"base_quat": [0.6, 0, 0.8, 0], "base_ang_vel_b": np.ones(3)}
         targets.append(controller.step(**state, body_age=0, distance=given))
     np.testing.assert_array_equal(*targets)
+
+
+@pytest.mark.parametrize("kind", ["no limit", "closest beams"])
+@pytest.mark.filterwarnings("error")
+def test_no_kind_of_policy_takes_a_negative_distance_for_contact(kind, tmp_path):
+    controller = deploy(make_policy(KINDS[kind]), tmp_path)
+    state = {"joint_pos": np.zeros(21), "joint_vel": np.zeros(21), "body_age": 0}
+    state |= {"base_quat": [1, 0, 0, 0], "base_ang_vel_b": np.zeros(3)}
+    shape = (64, 64) if kind == "closest beams" else (64,)
+    missing, near = np.full(shape, np.inf), np.full(shape, 0.5)
+    targets = []
+    for first in (np.inf, -1.0):
+        # A sensor, and one beam of another.
+        missing[0], near.reshape(64, -1)[-1, 0] = first, first
+        for distance in (missing, near):
+            controller.reset()
+            targets.append(controller.step(**state, distance=distance))
+    np.testing.assert_array_equal(targets[:2], targets[2:])
 
 
 def test_targets_stay_within_limits_of_place_and_change(tmp_path):
@@ -231,6 +286,30 @@ def test_a_file_of_others_is_refused(tmp_path):
         Controller(tmp_path / "other.onnx")
 
 
+@pytest.mark.parametrize("content", [b"", b"hello"])
+def test_what_is_no_onnx_file_is_refused_by_name(content, tmp_path):
+    (tmp_path / "bad.onnx").write_bytes(content)
+    with pytest.raises(ValueError, match=r"bad\.onnx is not an ONNX file: "):
+        Controller(tmp_path / "bad.onnx")
+    with pytest.raises(FileNotFoundError, match=r"none\.onnx"):
+        Controller(tmp_path / "none.onnx")
+
+
+@pytest.mark.parametrize(
+    ("limit", "value", "most"),
+    [
+        ("max_age", -1, "inf"),
+        ("max_age", np.nan, "inf"),
+        ("margin", -5, "inf"),
+        ("max_change", -1, "inf"),
+        ("max_missing", 2, "1"),
+    ],
+)
+def test_limits_that_make_no_sense_are_refused(limit, value, most):
+    with pytest.raises(ValueError, match=rf"^{limit} must be in \[0, {most}\], got "):
+        Controller("policy.onnx", **{limit: value})
+
+
 def test_it_needs_numpy_and_onnxruntime_alone():
     # As if nothing else that the package depends on were installed.
     missing = ("torch", "tensordict", "torchrl", "mujoco", "gymnasium", "tyro")
@@ -247,13 +326,33 @@ print(sorted(name for name in sys.modules if name.startswith("egoskin")))
 
 
 def test_it_is_short_enough_to_be_read_before_it_moves_a_robot():
-    assert len(Path(inspect.getfile(Controller)).read_text().splitlines()) <= 150
+    assert len(Path(inspect.getfile(Controller)).read_text().splitlines()) <= 190
 
 
 # --- the example ------------------------------------------------------------------
 
 
 DRAWN = ("azimuth", "distance", "height", "speed", "interval", "aim_link", "aim_point")
+
+
+@pytest.mark.parametrize(
+    ("args", "text"),
+    [
+        (["run", "nope"], r"No such file .*nope.policy\.onnx"),
+        (["prepare", "nope", "--out", "made"], "nope"),
+        (["prepare", "localization", "--out", "made"], "needs a tracker"),
+    ],
+    ids=str,
+)
+def test_the_example_tells_what_it_refuses_in_one_line(
+    args, text, tmp_path, monkeypatch
+):
+    main = runpy.run_path(str(SCRIPTS / "deploy_mujoco.py"))["main"]
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["deploy_mujoco.py", *args])
+    with pytest.raises(SystemExit, match=rf"^error: .*{text}.*$"):
+        main()
+    assert not (tmp_path / "made").exists()
 
 
 @pytest.mark.slow

@@ -95,9 +95,24 @@ def test_an_example_runs_as_given(number, tmp_path):
     )
     said = re.findall(r"print\(.*#(.*)", CODE[number])
     if number == 0:
-        said = ["the distances of the skin are 0.5 s old", "4 targets"]
+        said = ["4 targets", "the distances of the skin are 0.5 s old"]
     lines = [line.strip() for line in done.stdout.splitlines() if "torchrl" not in line]
     assert lines == [line.strip() for line in said]
+
+
+def test_the_loop_damps_the_motors_also_after_an_exception(tmp_path):
+    # The driver delivers 20 of 21 velocities.
+    (tmp_path / "my_robot.py").write_text(
+        DRIVER.replace("vel=still,", "vel=still[1:],")
+    )
+    policy = egoskin.load_policy("field_proximity")
+    (tmp_path / "policy.onnx").write_bytes(export_onnx(policy)[0])
+    done = subprocess.run(
+        [sys.executable, "-c", CODE[0]], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert done.stdout == "0 targets\n"
+    *_, last = done.stderr.splitlines()
+    assert last == "ValueError: joint_vel must have the shape [21], got [20]"
 
 
 def test_cleanrl_is_told_of_many_robots_what_it_wants():

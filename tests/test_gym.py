@@ -72,6 +72,21 @@ def test_a_name_alone_imports_what_it_needs():
     assert set(observation[48:]) <= {0.0, 1.0}
 
 
+@pytest.mark.parametrize("value", [np.nan, -np.inf])
+def test_an_action_that_is_not_finite_is_refused(value):
+    one, many = gymnasium.make(ENV_ID).unwrapped, make_vec(2, num_workers=1)
+    for env in (one, many):
+        env.reset(seed=0)
+        action = np.zeros(env.action_space.shape, dtype=np.float32)
+        action[..., -1] = value
+        with pytest.raises(ValueError, match=r"^an action must be finite, got NaN or"):
+            env.step(action)
+        # The episode goes on.
+        _, reward, *_ = env.step(np.zeros_like(action))
+        assert np.isfinite(reward).all()
+        env.close()
+
+
 def test_actions_are_bounded_where_more_asks_for_no_more_torque(robot):
     env = gymnasium.make(ENV_ID)
     kp, _ = robot.joint_gains("rotor_inertia")

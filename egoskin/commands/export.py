@@ -14,7 +14,7 @@ import tyro
 
 import egoskin.policies.export
 from egoskin.commands.errors import check_packages
-from egoskin.policies.export import export_onnx, observation_parts
+from egoskin.policies.export import export_onnx, needs_tracker, observation_parts
 from egoskin.policies.policy import load_policy
 from egoskin.runs.starts import git_state
 from egoskin.storage.files import check_output, write_file
@@ -53,3 +53,8 @@ def main(args: list[str]) -> None:
         age = f", {part['age']} steps before" if part["age"] else ""
         print(f"  {part['name']:<16} {part['width']:5} {part['unit']}{age}")
     print(f"equal to PyTorch within {difference:.1e} x max(1, |action|)")
+    if needs_tracker(policy):
+        print(
+            "egoskin.deploy refuses it: it reads positions of balls, which needs a "
+            "tracker"
+        )

@@ -36,6 +36,11 @@ def load(path: Path) -> tuple[PPO, TensorDict, dict[str, Any]]:
     Raises:
         ValueError: If the file is not a dump of an update.
     """
+    if path.is_dir():
+        raise ValueError(
+            f"{path} is a folder; give the file not-finite-<frames>.safetensors that "
+            "a training wrote into it when an update was not finite"
+        )
     tensors, header = load_tensors(path)
     if "error" not in header:
         raise ValueError(f"{path} is not a dump of an update: it has no error")

@@ -368,6 +368,7 @@ class Report:
         from egoskin.study.report import write_report
 
         folder = StudyFolder(self.dir)
+        folder.manifest()  # a wrong folder is named before --out
         out = self.out or self.dir / "report"
         if not out.absolute().parent.is_dir():
             raise ValueError(f"--out: there is no folder {out.absolute().parent}")

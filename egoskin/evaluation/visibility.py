@@ -365,7 +365,7 @@ def analyse(
     if num_throws < 1:
         raise ValueError(f"num_throws must be at least 1, got {num_throws}")
     body, ball = StandingRobot(robot), Sphere(radius=throws.radius)
-    skin.check_links(robot.links)
+    skin.check_links(robot.links, robot.name)
     cells = pipelines(robot, skin, sensors, max(ranges))
     far = farthest(cells)
 

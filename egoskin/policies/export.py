@@ -70,6 +70,15 @@ def observation_parts(policy: Policy) -> list[dict[str, Any]]:
     ]
 
 
+def needs_tracker(policy: Policy) -> bool:
+    """Return whether a policy reads positions of balls, which no skin measures.
+
+    `egoskin.deploy` refuses such a policy.
+    """
+    sensor = policy.env_config.sensor
+    return sensor.coverage == "oracle" or sensor.signal == "localization"
+
+
 def metadata(policy: Policy, commit: str | None) -> dict[str, Any]:
     """Return the metadata that a robot needs to run a policy, as JSON values.
 

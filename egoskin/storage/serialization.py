@@ -8,7 +8,16 @@ import math
 from collections.abc import Mapping
 from pathlib import Path
 from types import UnionType
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import dacite
 
@@ -96,7 +105,7 @@ def from_plain(kind: type[T], content: Any, what: str) -> T:
         raise ValueError(f"{what}: {path_to(error.owner, kind)}{error}") from error
     except dacite.UnexpectedDataError as error:
         key, *_ = sorted(error.keys)
-        hint = did_you_mean(key, kind.__annotations__)
+        hint = did_you_mean(key, _fields_beside(key, kind, content))
         raise ValueError(f"{what}: there is no field {key!r}{hint}") from error
     except dacite.MissingValueError as error:
         raise ValueError(f"{what}: {error.field_path} is missing") from error
@@ -109,6 +118,20 @@ def from_plain(kind: type[T], content: Any, what: str) -> T:
     # ValueError is raised by the checks of the configuration itself.
     except (dacite.DaciteError, ValueError) as error:
         raise ValueError(f"{what}: {error}") from error
+
+
+def _fields_beside(key: str, kind: Any, content: Any) -> list[str]:
+    """Return the fields of the dataclass, here or inside, that has an unknown key."""
+    if isinstance(content, dict) and dataclasses.is_dataclass(kind):
+        hints = get_type_hints(kind)
+        if key in content and key not in hints:
+            return list(hints)
+        parts = [(hints[name], item) for name, item in content.items() if name in hints]
+    else:
+        items = content.values() if isinstance(content, dict) else content
+        inside = items if isinstance(content, (dict, list, tuple)) else ()
+        parts = [(part, x) for part in get_args(kind) for x in (content, *inside)]
+    return [name for part, x in parts for name in _fields_beside(key, part, x)]
 
 
 def _described(kind: Any) -> str:

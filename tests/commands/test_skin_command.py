@@ -213,6 +213,7 @@ def test_a_picture_shows_sensors_and_normals_from_both_sides(mixed):
             ["show", "alien.json", "--picture", "a.png"],
             "for the robot 'alien': give its path with --robot PATH",
         ),
+        (["show", "alien.json", "--robot", "h1_2"], "which h1_2 does not have, did"),
         (["show", "alien.json", "--picture", "a.jpg"], "must end in .png"),
         (["place", "--density", "torso_link=x", "--out", "a.json"], "must be a number"),
         (["place", "--links", "torso_lnk", "--out", "a.json"], "torso_lnk"),

@@ -210,7 +210,13 @@ def test_the_command_writes_the_file_and_lists_its_input(tmp_path):
     assert f"{out}: observation [1, 51] -> action" in said
     assert "joint_vel           21 rad/s" in said
     assert "equal to PyTorch within" in said
+    assert "egoskin.deploy refuses it: it reads positions of balls" in said
     assert run(out.read_bytes(), np.zeros((1, 51))).shape == (1, 21)
+
+
+def test_what_a_skin_measures_is_exported_without_that_note(tmp_path):
+    said = succeed("export", "field_proximity", "--out", tmp_path / "policy.onnx")
+    assert "refuses" not in said
 
 
 def test_without_onnx_the_command_names_the_extra(tmp_path, monkeypatch):

@@ -448,6 +448,11 @@ def test_a_failed_normaliser_is_dumped_and_replayed(key, sensor, tmp_path, monke
     assert any(f"batch {key} [" in line for line in lines)
 
 
+def test_of_a_folder_the_replay_tells_which_file_it_expects(tmp_path):
+    error = fail("replay", tmp_path)
+    assert f"{tmp_path} is a folder; give the file not-finite-<frames>" in error
+
+
 def test_a_dump_that_is_none_is_refused(trained):
     assert "is not a dump of an update" in fail(
         "replay", trained / "checkpoint.safetensors"

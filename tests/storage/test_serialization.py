@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import Any
 
 import pytest
@@ -61,6 +62,22 @@ def test_the_types_of_a_study_file_are_told_in_words(content, text):
         content = {"purpose": "", **content}
     with pytest.raises(ValueError, match=text):
         from_plain(Study, content, "my.json")
+
+
+@pytest.mark.parametrize(
+    ("content", "hint"),
+    [
+        ({"env": {"sensor": {"signl": "binary"}}}, "'signl', did you mean 'signal'?"),
+        ({"env": {"task": {"throws": {"sped": 1}}}}, "'sped', did you mean 'speed'?"),
+        ({"env": {"sensr": {}}}, "'sensr', did you mean 'sensor'?"),
+        # A field of other parts, but not of this.
+        ({"env": {"sensor": {"history": 3}}}, "'history'"),
+    ],
+    ids=str,
+)
+def test_an_unknown_field_inside_is_compared_with_those_beside_it(content, hint):
+    with pytest.raises(ValueError, match=f"there is no field {re.escape(hint)}$"):
+        from_plain(TrainConfig, content, "my.json")
 
 
 def test_a_range_of_whole_numbers_is_one_of_numbers():

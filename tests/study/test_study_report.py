@@ -15,6 +15,7 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from calling import fail
 from egoskin.commands.study import what_is_seen
 from egoskin.runs.run import Run
 from egoskin.study.figures import (
@@ -65,6 +66,11 @@ def without_pictures(monkeypatch):
         (out / f"{name}.svg").write_text("<svg/>")
 
     monkeypatch.setattr("egoskin.study.report.save", save)
+
+
+def test_a_report_of_no_study_is_refused_for_that(tmp_path):
+    error = fail("study", "report", tmp_path / "nope")
+    assert f"{tmp_path / 'nope'} is not a study folder" in error
 
 
 def test_a_report_needs_nothing_else(folder: StudyFolder):

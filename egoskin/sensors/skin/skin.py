@@ -245,12 +245,18 @@ class Skin:
         """Number of sensors ``S``."""
         return len(self.links)
 
-    def check_links(self, known: Sequence[str]) -> None:
-        """Raise ValueError if a sensor sits on a link the robot does not have."""
+    def check_links(self, known: Sequence[str], robot: str | None = None) -> None:
+        """Raise ValueError if a sensor sits on a link the robot does not have.
+
+        Args:
+            known: Links of the robot.
+            robot: Its name, for the error text; None: that of the skin's robot.
+        """
+        robot = robot or self.robot
         for index, name in enumerate(self.links):
             if name not in known:
                 raise ValueError(
-                    f"sensor {index} sits on {name!r}, which {self.robot} does not "
+                    f"sensor {index} sits on {name!r}, which {robot} does not "
                     f"have{did_you_mean(name, known)} (links: {', '.join(known)})"
                 )
 

@@ -79,7 +79,7 @@ class SkinPage(ServedPage):
     def __init__(self, robot: RobotConfig, skin: Skin | None, port: int = 0) -> None:
         self.robot, self.skin = robot, skin
         if skin is not None:
-            skin.check_links(robot.links)
+            skin.check_links(robot.links, robot.name)
         self.body = Body(robot)
         super().__init__(port)
         self.joint_pos = robot.default_joint_pos.copy()

@@ -331,6 +331,9 @@ def test_an_unknown_link_is_refused_with_the_closest_name():
         match=r"sensor 0 sits on 'xyz', which h1_2 does not have \(links: ",
     ):
         skin.check_links(H1_2.links)
+    # Where it is checked for another robot than its own.
+    with pytest.raises(ValueError, match="which other does not have"):
+        skin.check_links(H1_2.links, "other")
 
 
 def test_placing_sensors_beside_a_skin_file_is_refused(tmp_path):
