@@ -694,6 +694,17 @@ def test_the_reward_is_the_sum_of_weighted_terms(whole_run):
     torch.testing.assert_close(terms["drift_speed"], config.drift_speed * speed)
     bent = (step["joint_pos"] - DEFAULT).square().mean(-1)
     torch.testing.assert_close(terms["posture"], config.posture * bent)
+    power = step["power"][..., 0]
+    assert power.max() > 100
+    torch.testing.assert_close(terms["energy"], config.energy * power)
+    # Episodes start at the origin.
+    way = step["base_pose"][..., :2].square().sum(-1).clamp(max=4.0)
+    torch.testing.assert_close(terms["drift_distance"], config.drift_distance * way)
+    w, x, y, z = step["base_pose"][..., 3:].unbind(-1)
+    # Components of the base's axes x and y along the vertical.
+    tilt = 4 * ((x * z - w * y).square() + (y * z + w * x).square())
+    upright = config.upright * (-tilt / 0.2).exp()
+    torch.testing.assert_close(terms["upright"], upright, rtol=1e-4, atol=1e-7)
     # The change is from the root's previous action to the action taken.
     before = torch.cat(
         (torch.zeros(1, 32, JOINTS), whole_run["root", "previous_action"][:-1])

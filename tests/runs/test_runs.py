@@ -61,6 +61,17 @@ def test_a_run_learns_with_its_own_number_of_threads(config: TrainConfig):
         torch.set_num_threads(before)
 
 
+def test_the_seed_draws_the_networks(tmp_path):
+    weights = []
+    for number, seed in enumerate((0, 1, 0)):
+        config = replace(blind_run(tmp_path / str(number), 64), seed=seed)
+        with open_trainer(Run.create(config)) as trainer:
+            weights.append([w.detach().clone() for w in trainer.agent.parameters()])
+    one, other, again = weights
+    assert all(torch.equal(a, b) for a, b in zip(one, again, strict=True))
+    assert not all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
+
+
 def test_one_process_trains_a_run_at_a_time(config: TrainConfig):
     run = Run.create(config)
     with open_trainer(run):
