@@ -57,7 +57,7 @@ class EvaluateConfig:
     """Throw sequences in the throw set."""
     standard: Literal["2", "1", "paper", "run"] = "2"
     """Version of the standard throw to play, independent of the policy's training;
-    run: the throws and terminations of its training."""
+    run: the throws and terminations of its training, without its randomisation."""
     mask: tuple[str, ...] | None = None
     """Links whose sensors are masked; alone: all sensors. The success that remains does
     not depend on them."""
@@ -228,9 +228,7 @@ def main(args: list[str]) -> None:
     """Run the command."""
     config = tyro.cli(EvaluateConfig, args=args)
     policy = load_policy(config.policy)
-    env_config = policy.env_config
-    if config.standard != "run":
-        env_config = standard_task(env_config, config.standard)
+    env_config = standard_task(policy.env_config, config.standard)
     env_config.pipeline(policy.skin).check_mask(config.masked)
     if config.map is not None:
         check_map(env_config)
@@ -267,10 +265,12 @@ def main(args: list[str]) -> None:
         checked = evaluate(policy, finer, policy.skin, **whole, **engine)
     line.finish()
     trained = policy.env_config.standard
-    played = trained if config.standard == "run" else config.standard
+    of_training = config.standard == "run"
+    played = trained if of_training else config.standard
+    throws = "the throws of its training" if of_training else f"standard {played}"
     title = (
         f"{config.policy}: trained for {policy.policy_spec.frames:,} frames "
-        f"on standard {trained}; evaluated on standard {played}, "
+        f"on standard {trained}; evaluated on {throws}, "
         f"throw set {config.throw_set} of {counted(config.episodes, 'episode')}"
     )
     if config.masked:
@@ -282,7 +282,9 @@ def main(args: list[str]) -> None:
     print(table(result, title + physics_rate(env_config), task))
     content = {
         **dataclasses.asdict(result),
+        "policy": str(config.policy),
         "standard": played,
+        "throws_of_training": of_training,
         "trained_on": trained,
         "throw_set": config.throw_set,
         "frames": policy.policy_spec.frames,

@@ -65,7 +65,8 @@ class RenderConfig:
     longest_of: Annotated[int, COUNT] = 1
     """Show the longest of this many episodes, from --episode on."""
     standard: Literal["2", "1", "paper", "run"] = "2"
-    """Version of the standard throw; run: the throws and terminations of training."""
+    """Version of the standard throw; run: the throws and terminations of training,
+    without its randomisation."""
     seconds: float | None = None
     """Stop at this age at the latest [s]; None: the whole episode."""
     fps: float = 30.0
@@ -113,7 +114,7 @@ def main(args: list[str]) -> None:
     else:
         policy = load_policy(config.policy)
         env_config, skin = policy.env_config, policy.skin
-    if config.standard != "run" and config.policy is not None:
+    if config.policy is not None:
         env_config = standard_task(env_config, config.standard)
     hz = env_config.task.physics.control_hz
     check_film(hz, config.fps, config.seconds)

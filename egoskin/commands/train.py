@@ -115,8 +115,9 @@ def with_resume_advice(run: Run) -> Iterator[None]:
         raise SystemExit(
             f"error: {error}\n"
             "a resume would repeat this update; to train on from the last checkpoint, "
-            "change an option, for example --ppo.learning-rate, and keep the others: "
-            f"egoskin train --init-from {quote(str(run.path))}"
+            "change an option, for example --ppo.learning-rate: egoskin train --config "
+            f"{quote(str(run.path / 'config.json'))} --init-from "
+            f"{quote(str(run.path))} --ppo.learning-rate ..."
         ) from error
     except (WorkerError, OSError) as error:
         raise SystemExit(f"error: {error}\n{run.resume_advice()}") from error

@@ -34,7 +34,8 @@ from egoskin.sensors import Skin
 _AGES = (1.0, 2.0, 3.0, 5.0)
 _NUMBERS = ("first", "second", "third", "later")
 # Bounds of the groups by height aimed at [m], by speed at arrival [m/s] and by time
-# since the previous throw [s]; each group has about a third of the standard throws.
+# since the previous throw [s]. Each group has about a third of the throws of standard
+# 1; standard 2 throws at no point of the H1-2 below 0.9 m.
 _HEIGHTS, _SPEEDS, _GAPS = (0.9, 1.2), (5.3, 6.7), (1.33, 1.67)
 # Time a robot needs to settle after its start [s].
 _SETTLED = 0.5

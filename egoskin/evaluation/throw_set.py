@@ -14,7 +14,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -23,6 +23,7 @@ from torch import Tensor, nn
 
 from egoskin.envs.dodgeball import DodgeballConfig
 from egoskin.envs.physics import Engine
+from egoskin.envs.randomization import RandomizationConfig
 from egoskin.envs.standards import Standard, evaluation_task
 from egoskin.make import (
     EnvConfig,
@@ -256,9 +257,21 @@ def play_throws(
     )
 
 
-def standard_task(config: EnvConfig, version: Standard = "2") -> EnvConfig:
-    """Return the configuration with the evaluation throws and ends of a standard."""
-    return dataclasses.replace(config, task=evaluation_task(version, config.task))
+def standard_task(
+    config: EnvConfig, version: Standard | Literal["run"] = "2"
+) -> EnvConfig:
+    """Return the configuration with the evaluation throws and ends of a standard.
+
+    Args:
+        config: The configuration.
+        version: The standard; "run" keeps the throws and ends of the configuration and
+            only switches its randomisation off.
+    """
+    if version == "run":
+        task = dataclasses.replace(config.task, randomization=RandomizationConfig())
+    else:
+        task = evaluation_task(version, config.task)
+    return dataclasses.replace(config, task=task)
 
 
 def throw_seed(config: EnvConfig, throw_set: int) -> int:

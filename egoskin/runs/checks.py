@@ -102,6 +102,11 @@ def _check_init(
             f"{path} has layers of {list(other.network.hidden)}, not of "
             f"{list(spec.network.hidden)} (ppo.network.hidden)"
         )
+    if other.network.normalize != spec.network.normalize:
+        raise ValueError(
+            f"{path} was trained with ppo.network.normalize="
+            f"{other.network.normalize}, not {spec.network.normalize}"
+        )
     for key, size in spec.sizes.items():
         if (given := other.sizes.get(key, 0)) != size:
             raise ValueError(

@@ -94,6 +94,8 @@ class TrainConfig:
                 f"training_task({self.standard!r}, DodgeballConfig())"
             )
         frames = self.num_envs * self.ppo.rollout_steps
+        if frames < 2:
+            raise ValueError("a rollout must have at least 2 frames, not 1")
         if frames < self.ppo.num_mini_batches:
             raise ValueError(
                 f"a rollout of {frames} frames cannot be split into "
@@ -201,10 +203,11 @@ def _default_of(given: argparse.Namespace) -> TrainConfig:
         if given.standard is not None:
             raise ValueError("--config has its own throws: leave out --standard")
         path = Path(given.config)
-        if path.is_dir():
-            path /= "config.json"
         if not path.is_file():
-            raise ValueError(f"no file {path}: --config takes the config.json of a run")
+            folder = f" (a folder: try {path / 'config.json'})" * path.is_dir()
+            raise ValueError(
+                f"no file {path}{folder}: --config takes the config.json of a run"
+            )
         return from_plain(TrainConfig, read_config(path)[0], str(path))
     if given.standard not in get_args(Standard):
         return TrainConfig()

@@ -116,6 +116,8 @@ class Trainer:
         """
         if (initial := self.run.initial_networks()) is not None:
             load_agent_tensors(self.agent, initial, str(self.config.init_from))
+            # They may be of other bounds.
+            self.agent.head.bound_std()
             if not has_critic(initial):
                 print(
                     f"note: {self.config.init_from} is of an older version and has no "

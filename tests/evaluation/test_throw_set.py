@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from egoskin.envs.dodgeball import DodgeballConfig
+from egoskin.envs.randomization import RandomizationConfig
 from egoskin.envs.standards import training_task
 from egoskin.envs.throws import ThrowConfig, Thrower
 from egoskin.evaluation.throw_set import (
@@ -24,6 +25,15 @@ from egoskin.make import EnvConfig
 from egoskin.sensors import Skin
 from egoskin.sensors.config import SensorConfig
 from throwing import TASK
+
+
+def test_the_throws_of_the_training_are_played_without_its_randomisation():
+    varied = RandomizationConfig(gains=(0.2, 0.2))
+    own = dataclasses.replace(DodgeballConfig(), success_s=2.0, randomization=varied)
+    config = EnvConfig(task=own)
+    plain = dataclasses.replace(own, randomization=RandomizationConfig())
+    assert standard_task(config, "run").task == plain
+    assert standard_task(config).task.throws.first_delay == (0.0, 0.0)
 
 
 def test_wilson_interval_by_hand():

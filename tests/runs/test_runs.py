@@ -252,6 +252,8 @@ def test_advice_after_a_failure_is_a_command_that_helps(config: TrainConfig, tmp
     ):
         raise NonFiniteError("loss_actor nan", TensorDict())
     assert "--resume" not in str(ended.value)
+    # The other options stay as they are.
+    assert f"--config '{run.path / 'config.json'}'" in str(ended.value)
 
 
 def test_metrics_go_to_weights_and_biases(config: TrainConfig, monkeypatch):
