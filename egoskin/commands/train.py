@@ -20,12 +20,8 @@ from egoskin.make import check_num_workers, device_of
 from egoskin.parallel import WorkerError
 from egoskin.progress import ProgressLine, counted, duration
 from egoskin.runs.config import TrainConfig, parse_config
-from egoskin.runs.estimate import estimate_seconds
 from egoskin.runs.run import Run
 from egoskin.runs.trainer import Trainer, open_trainer, train
-
-# Fewer frames [environment steps] take only seconds, like estimating their time.
-_SOON_DONE = 100_000
 
 
 class Stop:
@@ -63,21 +59,18 @@ def open_run(config: TrainConfig) -> Run:
 
 
 def announce(trainer: Trainer) -> None:
-    """Print the amount of work, its estimated time here, and how to watch it."""
+    """Print the amount of work, and how to watch it."""
     config, done = trainer.config, trainer.frames
     to_do = max(config.total_frames - done, 0)
     workers = check_num_workers(config.num_envs, config.num_workers)
-    where, time = counted(workers, "worker"), ""
+    where = counted(workers, "worker")
     if config.engine == "warp":
         where = f"MuJoCo Warp, {config.device}"
-    elif to_do > _SOON_DONE:
-        seconds = estimate_seconds(config, trainer.spec.skin, to_do)
-        time = f"; about {duration(seconds)} on this machine"
     print(
         f"{to_do:,} frames{f' after {done:,}' if done else ''}: "
         f"{counted(config.num_envs, 'agent')} on {where}, "
         f"learner on {config.device} with "
-        f"{counted(trainer.ppo.num_threads, 'thread')}{time}\n"
+        f"{counted(trainer.ppo.num_threads, 'thread')}\n"
         f"curves while it trains: tensorboard --logdir {quote(str(trainer.run.path))}",
         flush=True,
     )

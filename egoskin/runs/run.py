@@ -26,6 +26,7 @@ import fcntl
 import io
 import itertools
 import os
+import shutil
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -119,13 +120,18 @@ class Run:
                 f"{path} already exists; choose another --run-dir"
                 + f", or continue it with --resume {quote(str(path))}" * go_on
             )
-        (path / "policies").mkdir(parents=True)
         run = cls(path, config)
-        skin.save(run.skin_path)
         run._hashes = hashes
         run._initial = None if initial is None else initial[0]
-        # Written last, because a folder with a configuration can be resumed.
-        run.write_config()
+        (path / "policies").mkdir(parents=True)
+        try:
+            skin.save(run.skin_path)
+            # Written last, because a folder with a configuration can be resumed.
+            run.write_config()
+        except BaseException:
+            # A folder without one would only be in the way of another try.
+            shutil.rmtree(path, ignore_errors=True)
+            raise
         return run
 
     @classmethod

@@ -408,6 +408,8 @@ def test_a_full_disk_names_the_file(write, name: str, finished: Trainer):
         write(finished)
     assert Path(str(error.value.filename)).name.startswith(name)
     assert not list(finished.run.path.rglob(PARTIAL))
+    # A run that could not be created can be created again.
+    assert not (finished.run.path / "new").exists()
 
 
 def test_a_folder_renamed_while_it_trains_ends_with_one_clear_error(
