@@ -7,6 +7,7 @@ import dataclasses
 import io
 import json
 import os
+import select
 import shutil
 import signal
 import socket
@@ -27,6 +28,7 @@ from egoskin.runs.run import Run
 from egoskin.sensors import MASK_ALL
 from egoskin.storage.formats import read_sealed, sealed_json
 from egoskin.storage.serialization import to_plain
+from egoskin.storage.tensor_file import load_tensors, save_tensors
 from egoskin.study import cost as cost_module
 from egoskin.study import evaluation, job, store
 from egoskin.study.claims import claimed
@@ -34,8 +36,14 @@ from egoskin.study.cost import cost, measure, measure_all
 from egoskin.study.job import CLAIMED, STOPPED, Stop, work
 from egoskin.study.manifest import EvaluationPlan, Manifest, PlannedRun, Study, resolve
 from egoskin.study.metrics import runs_csv
-from egoskin.study.runner import LocalRunner, Progress, slurm_script
-from egoskin.study.store import Failure, RunStatus, StudyFolder
+from egoskin.study.runner import (
+    LocalRunner,
+    Progress,
+    end_job,
+    how_it_ended,
+    slurm_script,
+)
+from egoskin.study.store import Failure, RunStatus, StudyFolder, policy_hash
 from making import make_policy
 
 # 16 agents x 16 steps are 256 frames a rollout.
@@ -117,10 +125,14 @@ def test_a_run_that_was_trained_is_only_judged(folder: StudyFolder):
     expected = table(folder)
     shutil.rmtree(folder.result_path(NAME))
     before = files(folder.run_path(NAME))
+    # A stop while it is judged leaves no result.
+    assert work(folder, NAME, Never(requested=True)) == STOPPED
     assert folder.status(folder.manifest().runs)[0].state == "stopped"
+    folder.note_failure(NAME, "killed by SIGKILL")
     assert work(folder, NAME, Never()) == 0
     assert files(folder.run_path(NAME)) == before
     assert table(folder) == expected
+    assert folder.failure(NAME) is None
 
 
 def test_a_policy_without_the_last_checkpoint_is_not_trained_to_its_end(
@@ -132,6 +144,11 @@ def test_a_policy_without_the_last_checkpoint_is_not_trained_to_its_end(
     assert header["frames"] == 2 * BATCH
     planned = folder.manifest().run(NAME)
     assert folder.is_trained(planned)
+    last = run.checkpoint_path.read_bytes()
+    tensors, header = load_tensors(run.checkpoint_path)
+    save_tensors(run.checkpoint_path, tensors, {**header, "frames": BATCH})
+    assert not folder.is_trained(planned)
+    run.checkpoint_path.write_bytes(last)
     run.policy_path(2 * BATCH).unlink()
     assert not folder.is_trained(planned)
 
@@ -310,6 +327,45 @@ def test_a_result_that_was_edited_or_exchanged_is_refused(folder: StudyFolder):
     shutil.copy(policies / "000000000000.safetensors", policy)
     with pytest.raises(ValueError, match="does not belong to the policy"):
         table(folder)
+    content, _ = read_sealed(file)
+    file.write_bytes(sealed_json({**content, "frames": BATCH}))
+    with pytest.raises(ValueError, match="a policy of 256 frames, expected 512"):
+        table(folder)
+
+
+def test_a_hash_of_a_policy_is_of_what_it_is_and_not_of_its_file(
+    folder: StudyFolder, tmp_path: Path
+):
+    (path,) = (folder.result_path(NAME) / "policies").iterdir()
+    tensors, header = load_tensors(path)
+    spec = header["policy"]
+
+    def changed(**fields: object) -> str:
+        other = {**header, "policy": {**spec, **fields}, "made": "elsewhere"}
+        save_tensors(tmp_path / "other.safetensors", tensors, other)
+        return policy_hash(tmp_path / "other.safetensors")
+
+    skin = {**spec["skin"], "sensors": spec["skin"]["sensors"][1:]}
+    hashes = [changed(), changed(frames=BATCH), changed(skin=skin)]
+    assert hashes[0] == policy_hash(path)
+    # The same weights, trained for less or with other sensors.
+    assert len(set(hashes)) == 3
+
+
+def test_of_a_long_run_some_250_lines_of_metrics_are_stored(folder: StudyFolder):
+    (file,) = folder.result_path(NAME).glob("evaluation_*.json")
+    content, _ = read_sealed(file)
+    shutil.rmtree(folder.result_path(NAME))
+    run = Run.open(folder.run_path(NAME))
+    run.checkpoint_path.unlink()
+    # A line for each frame.
+    rows = [f"{frames},{frames / 1000}" for frames in range(1, 2 * BATCH + 1)]
+    text = "\n".join(["frames,time/wall_s", *rows]) + "\n"
+    (run.path / "metrics.csv").write_text(text)
+    folder.finish(folder.manifest().run(NAME), content)
+    _, *kept = (folder.result_path(NAME) / "metrics.csv").read_text().splitlines()
+    assert 200 < len(kept) < 300
+    assert kept[-1] == "512,0.512"
 
 
 def test_a_policy_is_judged_with_and_without_its_skin():
@@ -366,6 +422,8 @@ def test_the_last_words_of_a_worker_have_its_reason(folder: StudyFolder):
     assert folder.last_words(NAME) == "worker 0 of 1 raised: ValueError: x"
     path.write_text("--- started\nnote\nerror: the disk is full\n")
     assert folder.last_words(NAME) == "the disk is full"
+    assert how_it_ended(folder, NAME, 1) == "the disk is full"
+    assert how_it_ended(folder, NAME, -signal.SIGKILL) == "killed by SIGKILL"
 
 
 def test_a_failure_stays_on_a_terminal(monkeypatch: pytest.MonkeyPatch, capsys):
@@ -478,6 +536,79 @@ def test_only_the_chosen_runs_are_executed(folder: StudyFolder):
     assert (status.run.name, status.state) == (NAME, "done")
     with pytest.raises(InterruptedError, match="blind-seed2"):
         Asked(folder, runs=manifest.matching(["*-seed[02]"])).run()
+
+
+class Scripted(LocalRunner):
+    """A runner whose runs end at once, with these exit statuses in turn."""
+
+    def __init__(self, folder: StudyFolder, *statuses: int, **options) -> None:
+        super().__init__(folder, **options)
+        self.statuses, self.now = list(statuses), []
+        self.begun: list[tuple[str, ...]] = []
+
+    def _running(self) -> list[str]:
+        return self.now
+
+    def _begin(self, run: PlannedRun) -> None:
+        self.now.append(run.name)
+        self.begun.append(tuple(self.now))
+
+    def _ended(self) -> dict[str, tuple[int, str]]:
+        ended, self.now = self.now, []
+        return {name: (self.statuses.pop(0), "error") for name in ended}
+
+
+@pytest.fixture
+def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runners that do not wait."""
+    for name in ("_POLL", "_LOOK"):
+        monkeypatch.setattr(f"egoskin.study.runner.{name}", 0.0)
+
+
+@pytest.mark.usefixtures("at_once")
+def test_a_run_that_stops_or_is_claimed_by_others_has_not_failed(folder: StudyFolder):
+    shutil.rmtree(folder.result_path(NAME))
+    # Somebody sends its process a SIGTERM, or starts another runner.
+    runner = Scripted(folder, STOPPED, CLAIMED, job.FAILED, tries=1)
+    (status,) = runner.run()
+    assert runner.begun == [(NAME,)] * 3
+    assert status.failure == Failure(tries=1, error="error")
+
+
+@pytest.mark.usefixtures("at_once")
+def test_no_more_runs_are_executed_at_once_than_is_asked(folder: StudyFolder):
+    folder.plan(resolve(dataclasses.replace(SHORT, seeds=(0, 1, 2, 3))))
+    runner = Scripted(folder, *[job.FAILED] * 3, parallel=2, tries=1)
+    status = runner.run()
+    assert [each.state for each in status] == ["done", "failed", "failed", "failed"]
+    one, two, three = (f"blind-seed{seed}" for seed in (1, 2, 3))
+    assert runner.begun == [(one,), (one, two), (three,)]
+
+
+def test_a_run_that_does_not_stop_is_killed_with_its_workers():
+    script = "trap '' TERM; sleep 60 & echo started; wait"
+    with subprocess.Popen(
+        ["sh", "-c", script], stdout=subprocess.PIPE, start_new_session=True
+    ) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        process.terminate()
+        end_job(process, 0.1)
+        assert process.returncode == -signal.SIGKILL
+        # A worker that lives keeps the pipe open.
+        assert select.select([process.stdout], [], [], 10)[0]
+
+
+def test_a_run_whose_runner_has_ended_stops(monkeypatch: pytest.MonkeyPatch):
+    # pytest keeps its signal handlers.
+    monkeypatch.setattr(job, "take", lambda *args: None)
+    monkeypatch.setattr(job, "_LOOK", 0.01)
+    stop = Stop(parent=os.getppid())
+    time.sleep(0.05)
+    assert not stop.requested
+    # The system gives it to another process.
+    monkeypatch.setattr(os, "getppid", lambda: 1)
+    wait_for(lambda: stop.requested, seconds=10)
 
 
 class Waiting(Asked):
