@@ -123,6 +123,20 @@ def test_a_dead_owner_on_another_host_loses_its_claim(tmp_path: Path):
     assert not list(tmp_path.glob("run.owner.*"))
 
 
+@pytest.mark.parametrize("ahead", [-3600, 3600])
+def test_the_clocks_of_hosts_need_not_agree(
+    ahead: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    # Ages are by the clock of the shared file system.
+    living, dead = tmp_path / "living", tmp_path / "dead"
+    elsewhere(living, age=10)
+    elsewhere(dead, age=100)
+    own = time.time
+    monkeypatch.setattr(time, "time", lambda: own() + ahead)
+    assert is_claimed(living, "run", stale=60)
+    assert not is_claimed(dead, "run", stale=60)
+
+
 def test_an_owner_that_slept_learns_that_its_claim_was_taken(tmp_path: Path):
     lost = threading.Event()
     with claimed(tmp_path, "run", heartbeat=0.02, lost=lost.set) as mine:
