@@ -237,6 +237,57 @@ def test_one_claim_that_does_not_hold_refutes_a_finding():
     assert set(verdicts.values()) == {"confirmed"}
 
 
+@pytest.mark.parametrize(
+    ("label", "cell", "value"),
+    [
+        # In points; field localization has 34, 40, 50 and 70.
+        ("1b", "ray-localization-0.5m", 42.0),
+        ("3", "field-binary-0.5m", 32.0),
+        # Better than half of the field's 48.5, but worse than localization's 44.
+        ("4", "ray-proximity-1m", 30.0),
+        ("5", "ray-proximity-1m-reduce-min", 20.0),
+        ("6a", "ray-binary-1m-reduce-min", 5.0),
+    ],
+)
+def test_a_cell_that_is_not_as_the_paper_says_refutes_its_finding_alone(
+    label, cell, value
+):
+    tables = world()
+    row = tables["success_3s"][cell]
+    shift = value - np.mean(list(row.values()))
+    tables["success_3s"][cell] = {seed: x + shift for seed, x in row.items()}
+    judged = judge_findings(tables)
+    assert {j.finding.label for j in judged if j.verdict == "refuted"} == {label}
+    assert {j.verdict for j in judged if j.finding.label != label} == {"confirmed"}
+
+
+def test_learning_within_a_third_of_the_budget_is_neither_more_nor_less():
+    for share, verdict in ((30.0, "confirmed"), (37.0, "refuted")):
+        tables = world()
+        values = {seed: share + 0.1 * seed for seed in range(5)}
+        tables["share_to_90"] = {"field-proximity-2m": values}
+        (judged,) = (j for j in judge_findings(tables) if j.finding.label == "6b")
+        assert judged.verdict == verdict
+
+
+def test_one_of_several_claims_is_refuted_at_its_share_of_the_level():
+    # One of finding 4's four claims, by five seeds; nothing else is known.
+    (finding,) = (f for f in FINDINGS if f.label == "4")
+    field, ray = finding.claims[0].weights
+    half_less_ray = [-3.0, -6.0, -2.0, -5.0, -3.5]
+    table = {
+        field: dict.fromkeys(range(5), 60.0),
+        ray: {seed: 30 - value for seed, value in enumerate(half_less_ray)},
+    }
+    tables = {"success_3s": table, "share_to_90": {}}
+    (judged,) = (j for j in judge_findings(tables) if j.finding is finding)
+    p_value = stats.ttest_1samp(half_less_ray, 0, alternative="less").pvalue
+    # Bonferroni over the claims, Holm over the findings.
+    assert judged.p_value == pytest.approx(9 * 4 * p_value)
+    assert 9 * p_value < 0.05 < 9 * 4 * p_value
+    assert judged.verdict == "undecided"
+
+
 def test_a_finding_whose_cells_are_missing_is_undecided():
     tables = world()
     del tables["success_3s"]["ray-binary-1m-reduce-min"]
