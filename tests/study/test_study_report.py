@@ -110,8 +110,19 @@ def test_the_table_has_a_row_for_each_run_in_full_precision(
     result = folder.result(manifest.run("field-proximity-2m-seed1"))
     row = by_run[result.run.name]
     share = result.stored.evaluation["success"]["mean"]
+    end = result.run.end
     assert float(row["success_3s"]) == 100 * share
     assert float(row["later_avoided"]) == 100 * (0.8 * share)
+    assert float(row["success_5s"]) == 100 * (share / 2)
+    assert float(row["survival_s"]) == 1 + 6 * share
+    assert float(row["falls"]) == 100 * (0.1 * (1 - share))
+    assert float(row["masked_success_3s"]) == 1
+    # In an hour.
+    assert float(row["frames_per_s"]) == end / 3600
+    # 1 - exp(-t / 0.2) reaches these shares of 0.9924, its end value, at these t.
+    for percent, t in ((50, 0.1371), (90, 0.4473)):
+        frames = float(row[f"m_frames_to_{percent}"]) * 1e6
+        assert frames == pytest.approx(t * end, rel=2e-3)
     assert (row["range_m"], row["signal"], row["frames"]) == (
         "2.0",
         "proximity",
@@ -120,6 +131,18 @@ def test_the_table_has_a_row_for_each_run_in_full_precision(
     # A blind robot has no signal and no sensors to mask.
     blind = by_run["blind-seed0"]
     assert blind["signal"] == blind["range_m"] == blind["masked_success_3s"] == ""
+
+
+def test_the_table_tells_the_throws_of_training_from_those_of_judgement(
+    tmp_path: Path,
+):
+    plan = dataclasses.replace(SMOKE.evaluation, standard="1", episodes=16)
+    mine = resolve(dataclasses.replace(SMOKE, standard="paper", evaluation=plan))
+    folder, run = StudyFolder(tmp_path), mine.runs[0]
+    store(folder, mine, run, 50.0)
+    (row,) = csv.DictReader(io.StringIO(runs_csv(mine, [folder.result(run)])))
+    assert (row["trained_on"], row["judged_on"]) == ("paper", "1")
+    assert (row["throws"], row["throw_set"]) == ("16", str(plan.throw_set))
 
 
 def test_nothing_but_named_columns_depends_on_when_and_where(
