@@ -96,6 +96,12 @@ def test_runs_are_chosen_by_patterns_in_the_order_of_the_study():
         manifest.matching(["*", "blind-sed1"])
 
 
+def test_runs_end_with_a_whole_rollout():
+    # Of 32 agents x 16 steps: no fewer frames than are asked.
+    ends = [changed(frames=frames).runs[0].end for frames in (1, 512, 513)]
+    assert ends == [512, 512, 1024]
+
+
 def test_a_cell_is_named_by_what_differs():
     manifest = changed(
         cells=(

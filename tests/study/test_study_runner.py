@@ -218,13 +218,14 @@ def test_a_run_is_judged_on_all_its_cores(
     shutil.rmtree(folder.result_path(NAME))
     play = evaluation.play_throws
 
-    def noted(*args, num_workers: int, **options):
-        used.append(num_workers)
-        return play(*args, num_workers=num_workers, **options)
+    def noted(*args, num_workers: int, hold: bool = False, **options):
+        used.append((num_workers, hold))
+        return play(*args, num_workers=num_workers, hold=hold, **options)
 
     monkeypatch.setattr(evaluation, "play_throws", noted)
     assert work(folder, NAME, Never(), cores=2) == 0
-    assert used == [2, 2]
+    # Also the robot held rigid.
+    assert sorted(used) == [(2, False), (2, True)]
     assert table(folder) == expected
 
 
