@@ -10,11 +10,13 @@ import onnx
 import onnxruntime
 import pytest
 import torch
+from torch import nn
 
 import egoskin
 from calling import fail, hide, succeed
 from egoskin.agents.networks import NetworkConfig, input_keys
-from egoskin.envs.physics.contract import Scene
+from egoskin.envs.dodgeball import DodgeballConfig
+from egoskin.envs.physics.contract import PhysicsConfig, Scene
 from egoskin.envs.physics.model import build_scene
 from egoskin.make import EnvConfig, make_worker_env
 from egoskin.policies.export import (
@@ -138,6 +140,19 @@ def test_an_export_that_is_not_exact_is_refused(monkeypatch):
         export_onnx(policy)
 
 
+def test_a_policy_that_is_exact_only_for_small_observations_is_refused():
+    # The signal, in metres, is not limited by a normalisation.
+    config = EnvConfig(sensor=SensorConfig(signal="localization"))
+    policy = make_policy(config, NetworkConfig(hidden=(16, 16), normalize="body"))
+    *_, of_signal = (x for x in policy.head.body.inputs if isinstance(x, nn.Linear))
+    of_signal.weight.data.mul_(1e33)
+    content = to_onnx(policy).SerializeToString()
+    small = sample_observations(policy, 10, 1e-3)
+    assert largest_difference(content, policy, small) < 1e-5
+    with pytest.raises(ValueError, match="its weights are too large for float32"):
+        export_onnx(policy)
+
+
 def test_an_old_runtime_on_a_robot_reads_the_file():
     model = to_onnx(egoskin.load_policy("field_binary"))
     # https://onnxruntime.ai/docs/reference/compatibility.html: from version 1.6 on.
@@ -174,8 +189,10 @@ def test_the_metadata_say_what_the_simulated_robot_is():
     # q* moves by 0.3 x the error that asks for the full torque.
     limit = model.actuator_forcerange[:, 1]
     np.testing.assert_allclose(data["action_scale"], 0.3 * limit / kp)
-    assert data["control_hz"] == 60
+    assert (data["control_hz"], data["target_velocity"]) == (60, "zero")
+    assert data["base"] == model.body(model.jnt_bodyid[0]).name
     assert (data["standard"], data["commit"]) == ("2", "abc123")
+    assert data["frames"] == policy.policy_spec.frames > 1e6
     assert data["egoskin"] is not None
     assert data["sensor"]["signal"] == "proximity"
     sensors = data["skin"]["sensors"]
@@ -188,6 +205,20 @@ def test_the_metadata_say_what_the_simulated_robot_is():
     )
     assert data["range"] == [2.0] * 64
     assert data["readings"] == [1] * 64
+
+
+def test_the_metadata_are_those_of_the_policys_own_task():
+    physics = PhysicsConfig(
+        gains="real", control_hz=50, target_velocity="finite_difference"
+    )
+    task = DodgeballConfig(physics=physics, success_s=2.0)
+    data = told(make_policy(EnvConfig(task=task, skin=FEW)))
+    # Unitree's figures for the knees.
+    knee = data["joints"].index("left_knee_joint")
+    assert (data["kp"][knee], data["kd"][knee]) == (300, 4)
+    assert data["action_scale"][knee] == 0.3 * data["torque_limit"][knee] / 300
+    assert (data["control_hz"], data["target_velocity"]) == (50, "finite_difference")
+    assert (data["standard"], data["frames"]) == ("custom", 0)
 
 
 @pytest.mark.parametrize("kind", MADE)
