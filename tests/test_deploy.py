@@ -122,6 +122,7 @@ def state(controller) -> dict[str, Any]:
         ({"joint_vel": np.full(21, np.nan)}, "the state of the body is not finite"),
         ({"base_quat": np.full(4, np.inf)}, "the state of the body is not finite"),
         ({"base_quat": np.zeros(4)}, "base_quat is not a unit quaternion"),
+        ({"base_quat": np.eye(4)[0] * 1.1}, "base_quat is not a unit quaternion"),
         ({"distance": None}, "100% of the skin is missing"),
         ({"distance": np.full(64, np.nan)}, "100% of the skin is missing"),
         ({"distance": np.full(64, -1.0)}, "100% of the skin is missing"),
@@ -142,6 +143,26 @@ def test_a_watchdog_stops_it_for_good(controller, state, change, why):
     controller.reset()
     assert (controller.step(**moved) != last).any()
     assert controller.stopped is None
+
+
+def test_after_a_reset_nothing_is_left_of_the_episode_before(tmp_path):
+    policy = make_policy(KINDS["history"])
+    controller = deploy(policy, tmp_path, margin=np.inf, max_change=np.inf)
+    rng = np.random.default_rng(0)
+    velocities, distances = rng.normal(size=(3, 21)), rng.uniform(0, 3, (3, 64))
+
+    def play() -> list[np.ndarray]:
+        state = {"base_quat": [1, 0, 0, 0], "base_ang_vel_b": np.zeros(3)}
+        state |= {"joint_pos": np.zeros(21), "body_age": 0}
+        return [
+            controller.step(**state, joint_vel=velocity, distance=distance)
+            for velocity, distance in zip(velocities, distances, strict=True)
+        ]
+
+    first, later = play(), play()
+    assert (first[0] != later[0]).any()
+    controller.reset()
+    np.testing.assert_array_equal(play(), first)
 
 
 def test_an_action_that_is_not_finite_stops_it_for_good(controller, state, monkeypatch):
@@ -308,6 +329,16 @@ def test_what_is_no_onnx_file_is_refused_by_name(content, tmp_path):
 def test_limits_that_make_no_sense_are_refused(limit, value, most):
     with pytest.raises(ValueError, match=rf"^{limit} must be in \[0, {most}\], got "):
         Controller("policy.onnx", **{limit: value})
+
+
+def test_the_limits_are_those_of_the_documentation():
+    text = (SCRIPTS.parent / "docs" / "deploy.md").read_text()
+    (age,) = re.findall(r"than `max_age` \(([\d.]+) s\)", text)
+    limits = re.findall(r"`(\w+)` x torque limit / kp \(default ([\d.]+)\)", text)
+    told = {"max_age": age, **dict(limits)}
+    assert list(told) == ["max_age", "margin", "max_change"]
+    parameters = inspect.signature(Controller).parameters
+    assert all(parameters[name].default == float(x) for name, x in told.items())
 
 
 def test_it_needs_numpy_and_onnxruntime_alone():
