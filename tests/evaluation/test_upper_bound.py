@@ -11,6 +11,7 @@ import pytest
 import torch
 from torchrl.envs import TransformedEnv
 
+from egoskin.evaluation import upper_bound
 from egoskin.evaluation.behaviour import Watcher
 from egoskin.evaluation.throw_set import play_throws, standard_task, throw_seed
 from egoskin.evaluation.upper_bound import (
@@ -79,6 +80,9 @@ def test_the_empty_plan_is_the_policy(policy: Policy, bound: UpperBound):
     # All of them come into range; some hit, some do not.
     assert torch.equal(bound.policy.avoided, ~hit)
     assert 0 < int(hit.sum()) < THROWS
+    # The heights are those of the first balls.
+    height, _ = watcher._thrower.at_standing_robot(watcher._draw)
+    torch.testing.assert_close(bound.height, height.reshape(THROWS, -1)[:, 0])
 
 
 @pytest.mark.slow
@@ -120,6 +124,22 @@ def test_a_search_finds_more_than_the_policy_does_and_loses_nothing(bound: Upper
     for outcome in (own, best):
         assert not (outcome.stood & ~outcome.avoided).any()
     assert int(best.avoided.sum()) > int(own.avoided.sum())
+
+
+def test_a_search_gets_far_from_the_policys_plan(
+    policy: Policy, monkeypatch: pytest.MonkeyPatch
+):
+    def play(env, policy, start, plan, steps) -> tuple[torch.Tensor, torch.Tensor]:
+        # As if one joint had to move at once, by far more than the first plans do.
+        age = steps - (10 * (plan[:, 0, 0] - 4).abs()).long()
+        return age > 0, age
+
+    monkeypatch.setattr(upper_bound, "_play", play)
+    search = SearchConfig(samples=64)
+    bound = find_upper_bound(
+        policy, task(policy), search, throw_set=0, throws=1, reach=2.0
+    )
+    assert (bound.policy.stood.tolist(), bound.best.stood.tolist()) == ([False], [True])
 
 
 def test_the_step_of_a_hit_is_not_survived(policy: Policy):
