@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 from egoskin.envs.randomization import RandomizationConfig
 from egoskin.evaluation import perturbations
 from egoskin.evaluation.perturbations import PERTURBATIONS, Perturbed, perturb
 from egoskin.evaluation.throw_set import play_throws, standard_task, summarize
 from egoskin.policies.policy import load_policy
+
+
+def test_the_last_perturbation_is_of_all_others_together():
+    none, *alone, together = map(asdict, PERTURBATIONS.values())
+    assert none == asdict(RandomizationConfig())
+    for ranges in alone:
+        assert ranges != none
+        for name in (name for name in ranges if ranges[name] != none[name]):
+            (low, high), (least, most) = ranges[name], together[name]
+            assert least <= low <= high <= most
 
 
 def test_each_perturbation_is_played_and_so_is_the_mask(monkeypatch):
