@@ -43,6 +43,26 @@ def test_separate_inputs_equal_one_layer_of_their_concatenation():
     torch.testing.assert_close(net(x, y), net.tail(joined(torch.cat((x, y), 1))))
 
 
+def test_layers_begin_orthogonal_and_all_inputs_as_one_layer():
+    torch.manual_seed(0)
+    net = KeyedMLP([4, 7], [8, 8], 2, 0.5)
+    first = torch.cat([layer.weight for layer in net.inputs], 1)
+    _, second, _, last = net.tail
+    # The squared gains are 2, and 0.25 in the last layer.
+    for weight, square in ((first, 2), (second.weight, 2), (last.weight, 0.25)):
+        torch.testing.assert_close(weight @ weight.mT, square * torch.eye(len(weight)))
+    biases = [value for name, value in net.named_parameters() if "bias" in name]
+    assert len(biases) == 3
+    assert not any(bias.any() for bias in biases)
+
+
+def test_the_first_actions_are_small_and_the_first_values_are_not():
+    agent, batch = make_agent(), make_batch()
+    out = agent.critic(agent.actor(agent.encode(batch)))
+    assert out["loc"].abs().max() < 0.05
+    assert out["state_value"].std() > 0.5
+
+
 def test_running_norm_equals_the_statistics_of_all_data():
     norm = RunningNorm(3)
     parts = [torch.randn(n, 3) * 5 + 2 for n in (7, 100, 1)]
