@@ -441,7 +441,9 @@ def test_the_ends_are_told_apart(whole_run):
 
 def test_an_episode_is_truncated_at_its_length_and_not_terminated():
     # .5 s at 60 Hz: 30 steps.
-    env = make(4, hold=True, throws=MISS, episode_length_s=0.5)
+    # The second ball is due in the last step, and is thrown no more.
+    throws = replace(MISS, interval=(0.5, 0.5))
+    env = make(4, hold=True, throws=throws, episode_length_s=0.5)
     root = env.reset()
     for age in range(1, 31):
         step, root = advance(env, root)
@@ -449,11 +451,13 @@ def test_an_episode_is_truncated_at_its_length_and_not_terminated():
         assert (step["truncated"] == (age == 30)).all()
         assert (step["done"] == (age == 30)).all()
         assert not step["terminated"].any()
+    assert (step["object_active"] == torch.tensor([True, False])).all()
     assert (root["episode_step"] == 0).all()
 
 
 def test_a_hit_in_the_last_step_terminates(chest):
-    env = make(2, hold=True, throws=MISS, episode_length_s=0.1)
+    throws = replace(MISS, interval=(0.1, 0.1))
+    env = make(2, hold=True, throws=throws, episode_length_s=0.1)
     root = env.reset()
     for _ in range(5):
         _, root = advance(env, root)
@@ -462,6 +466,8 @@ def test_a_hit_in_the_last_step_terminates(chest):
     assert (step["episode_step"] == 6).all()
     assert step["terminated"].all()
     assert not step["truncated"].any()
+    # The ball that was due is not thrown.
+    assert (step["object_active"] == torch.tensor([True, False])).all()
 
 
 @pytest.mark.parametrize("ends", [False, True])
@@ -598,6 +604,27 @@ def test_first_and_later_balls_are_counted_once_as_arrived_and_avoided(chest):
     assert step["hit"].all()
     assert counts(step) == [[1, 2], [1, 1]]
     assert counts(root) == [[0, 0], [0, 0]]
+
+
+def test_a_ball_passes_the_base_wherever_it_is_and_however_fast():
+    # A robot far from the origin, in the air, that flies along x at 3 m/s.
+    env = make(4, throws=MISS)
+    root, rows = env.reset(), torch.arange(4)
+    base = torch.tensor([5.0, -3, 3, 1, 0, 0, 0]).expand(4, 7)
+    env.physics.reset(rows, base, DEFAULT.expand(4, -1))
+    env.physics.push(rows, torch.tensor([3.0, 0, 0]).expand(4, 3))
+    # Distance ahead of the base [m] and speed [m/s] of a ball, and whether it passes:
+    balls = [
+        (0.8, 6.0, False),  # not a metre away
+        (1.5, 6.0, True),
+        (1.5, 1.0, False),  # the robot catches up with it
+        (-1.5, 1.0, True),  # the robot leaves it behind
+    ]
+    for row, (ahead, speed, _) in enumerate(balls):
+        throw(env, 0, (5 + ahead, -3.0, 3.0), (speed, 0, 0), rows=[row])
+    step, _ = advance(env, root)
+    assert not step["done"].any()
+    assert step["object_arrived"][:, 0].tolist() == [passes for *_, passes in balls]
 
 
 def test_a_hit_by_the_first_ball_is_arrived_and_not_avoided(chest):
