@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import mujoco
 import pytest
 import torch
@@ -12,6 +14,7 @@ from egoskin.envs.randomization import RandomizationConfig
 from egoskin.envs.standards import evaluation_task, standard_of
 from egoskin.envs.throws import ThrowConfig
 from egoskin.robots.builtin import H1_2
+from throwing import assert_same
 
 NO_BALLS = ThrowConfig(first_delay=(100.0, 100.0))
 EVERYTHING = RandomizationConfig(
@@ -26,7 +29,7 @@ EVERYTHING = RandomizationConfig(
 JOINTS = len(H1_2.joints)
 
 
-def make(num_envs: int = 4, **ranges) -> DodgeballEnv:
+def make(num_envs: int = 4, hold: bool = False, **ranges) -> DodgeballEnv:
     return DodgeballEnv(
         H1_2,
         DodgeballConfig(
@@ -36,6 +39,7 @@ def make(num_envs: int = 4, **ranges) -> DodgeballEnv:
         ),
         num_envs=num_envs,
         seed=5,
+        hold=hold,
     )
 
 
@@ -150,6 +154,26 @@ def test_a_push_changes_the_velocity_of_the_base_by_its_speed():
     assert not change[:, 2].any()
     assert len({tuple(row) for row in change.tolist()}) == 4
     assert due.tolist() == [6] * 4
+
+
+def test_a_robot_that_is_held_is_not_pushed():
+    pushes = {"push_speed": (2.0, 2.0), "push_interval": (0.02, 0.02)}
+    (one, _), (other, _) = play(make(hold=True, **pushes), 6), play(make(hold=True), 6)
+    assert_same(one, other)
+
+
+def test_an_episode_remembers_nothing_of_the_one_before():
+    # Episode 1 after an episode 0 with pushes, and after one that never began.
+    used, fresh = (make(**dataclasses.asdict(EVERYTHING)) for _ in range(2))
+    play(used, 15)
+    assert used.randomization.state["push"].any()
+    assert used.randomization.state["late_actions"].any()
+    used.reset()
+    fresh.reset()
+    fresh.reset()
+    one, other = used.simulation_state(), fresh.simulation_state()
+    for key, value in one.items():
+        assert torch.equal(value, other[key]), key
 
 
 def test_a_split_gives_the_same_bits_and_so_does_a_resume():
