@@ -322,6 +322,23 @@ def test_the_speed_is_horizontal_if_ballistic_and_whole_if_straight(
     assert release.velocity.isfinite().all()
 
 
+@pytest.mark.parametrize("flight", FLIGHTS)
+@pytest.mark.parametrize(("share", "led"), [(0.8, 0.8), (3.0, 0.9)])
+def test_a_base_is_led_up_to_nine_tenths_of_the_speed_of_the_ball(flight, share, led):
+    thrower = make(ThrowConfig(flight=flight))
+    drawn, (base_pose, joint_pos) = draw(thrower), poses()
+    angle = torch.linspace(0, 2 * math.pi, N)
+    way = torch.stack((angle.cos(), angle.sin()), -1)
+    run = torch.nn.functional.pad(drawn.speed[:, None] * way, (0, 1))
+    release = thrower.release(drawn, base_pose, share * run, joint_pos)
+    # Seen from a point that moves at the speed led, the ball flies straight to it.
+    gap = aim_points(thrower, drawn, base_pose, joint_pos) - release.position
+    seen = release.velocity - led * run
+    used = 2 if flight == "ballistic" else 3
+    one, other = (torch.nn.functional.normalize(x[:, :used]) for x in (gap, seen))
+    torch.testing.assert_close(one, other, atol=1e-3, rtol=0)
+
+
 # 4 m away, to a target at the height of release.
 LEVEL = ThrowConfig(
     flight="ballistic",
