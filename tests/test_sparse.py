@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
@@ -153,6 +154,10 @@ def test_histories_and_mixed_skins_are_left_as_well():
     assert not sparse_sources(replace(config, history=2), SKIN)
     coverage = (Ray(), Ray(grid=(4, 4)), *SKIN.coverage[2:])
     assert not sparse_sources(config, replace(SKIN, coverage=coverage))
+    reach = np.full(len(SKIN), 2.0)
+    assert sparse_sources(config, replace(SKIN, range=reach))
+    reach[3] = 1.0
+    assert not sparse_sources(config, replace(SKIN, range=reach))
 
 
 @every_matrix

@@ -16,7 +16,12 @@ from torchrl.envs.utils import check_env_specs
 from egoskin.envs.dodgeball import DodgeballEnv
 from egoskin.robots.builtin import H1_2
 from egoskin.sensors import FieldSensor, Proximity, place_sensors
-from egoskin.sensors.imperfections.corruption import Corruption, Moment, corrupt
+from egoskin.sensors.imperfections.corruption import (
+    Corruption,
+    Moment,
+    Places,
+    corrupt,
+)
 from egoskin.sensors.imperfections.models import (
     Bias,
     DeadSensors,
@@ -103,6 +108,8 @@ def test_latency_by_hand():
     distances = torch.arange(6.0).reshape(6, 1, 1, 1)
     got = sequence([Latency(seconds=0.024)], distances).flatten().tolist()
     assert got == [0, 0, 0, 1, 2, 3]
+    got = sequence([Latency(seconds=0.026)], distances).flatten().tolist()
+    assert got == [0, 0, 0, 0, 1, 2]
     got = sequence([Latency(seconds=0.004)], distances).flatten().tolist()
     assert got == [0, 1, 2, 3, 4, 5]
 
@@ -245,6 +252,16 @@ def test_readings_are_lost_with_their_probability(model, speed, chance):
     lost = read([model], many(2.0), speed=speed).isinf()
     error = 5 * (chance * (1 - chance) / MANY) ** 0.5
     assert (lost.double().mean() - chance).abs() <= error
+
+
+def test_traits_are_constant_and_independent_of_the_draws_of_every_step():
+    row, place = torch.ones(50, 64).nonzero(as_tuple=True)
+    places = Places(row, place, beams=1)
+    traits = [places.draw_trait(moment(50, step)) for step in (0, 7)]
+    assert torch.equal(*traits)
+    for step in (0, 7):
+        # Of 3,200 pairs of 16-bit numbers, hardly one is equal by chance.
+        assert (places.draw(moment(50, step)) == traits[0]).sum() < 5
 
 
 def test_dead_sensors_are_dead_for_an_episode():
