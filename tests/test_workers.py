@@ -495,7 +495,13 @@ def test_the_default_number_of_workers_is_the_largest_divisor_not_above_the_core
 
 
 @pytest.mark.parametrize(
-    ("quota", "cores"), [("100000 100000", 1), ("50000 100000", 1), ("max 100000", 2)]
+    ("quota", "cores"),
+    [
+        ("100000 100000", 1),
+        ("50000 100000", 1),
+        ("400000 100000", 2),
+        ("max 100000", 2),
+    ],
 )
 def test_a_container_gets_no_more_cores_than_its_quota(
     quota, cores, tmp_path, monkeypatch
