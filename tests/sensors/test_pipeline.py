@@ -11,10 +11,13 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import Composite, Unbounded
 
+from egoskin.envs.physics import PhysicsConfig
 from egoskin.make import EnvConfig, make_worker_env
 from egoskin.robots.builtin import H1_2
 from egoskin.sensors import Field, Ray, SensorPipeline, Skin, place_sensors
 from egoskin.sensors.config import SensorConfig
+from egoskin.sensors.imperfections.models import FalsePositives, Latency
+from egoskin.sensors.imperfections.presets import PRESETS
 from egoskin.shapes import Sphere
 from throwing import TASK
 
@@ -114,6 +117,67 @@ def test_a_real_sensor_signals_nothing_from_beyond_its_range(
     beyond = (reading > reach) & (reading < math.inf)
     assert beyond.sum() > 50
     assert torch.equal(stored["signal"], (reading <= reach).float())
+
+
+# --- errors of real sensors -----------------------------------------------------------
+
+
+def make(skin: Skin, corruption="acoustic", hz=60, throws=TASK.throws, **options):
+    """Return an environment with real sensors and the first ball at once."""
+    physics = PhysicsConfig(control_hz=hz, substeps=120 // hz)
+    task = replace(TASK, physics=physics, throws=throws)
+    config = EnvConfig(task=task, sensor=SensorConfig(range=5.0, corruption=corruption))
+    return make_worker_env(config, skin, **options)
+
+
+@pytest.fixture
+def noisy(monkeypatch) -> None:
+    """Half of the sensors that see nothing detect something."""
+    false = FalsePositives(probability=0.5, max_range=4.0)
+    monkeypatch.setitem(PRESETS, "acoustic", lambda: (false,))
+
+
+def false_signals(skin: Skin, **options) -> torch.Tensor:
+    """Return the first signals of sensors that see nothing, ``[B, S]``."""
+    env = make(skin, throws=replace(TASK.throws, first_delay=(1.0, 1.0)), **options)
+    signal = env.reset()["signal"]
+    assert 0.3 < (signal < 1).float().mean() < 0.7
+    return signal
+
+
+def test_errors_are_drawn_with_the_seed_for_each_global_row(skin, noisy):
+    whole = false_signals(skin, num_envs=4, seed=3)
+    assert len(whole.unique(dim=0)) == 4
+    part = false_signals(skin, num_envs=2, seed=3, row_offset=2)
+    assert torch.equal(part, whole[2:])
+    other = false_signals(skin, num_envs=4, seed=4)
+    assert (other == whole).float().mean() < 0.5
+
+
+def test_errors_of_two_kinds_of_sensors_are_independent(random_state, noisy):
+    wide, tall = Ray(grid=(4, 1)), Ray(grid=(1, 4))
+    skin = replace(place_sensors(H1_2, 20, seed=0), coverage=(wide, tall) * 10)
+    state = random_state(20, seed=0)
+    state["object_active"][:] = False
+    config = SensorConfig(coverage="ray", range=5.0, corruption="acoustic")
+    stored = measured(config, skin, state)
+    one, other = (stored[f"reading_{i}"].isfinite() for i in range(2))
+    # Of 800 pairs of independent flags, half are equal.
+    assert one.shape == other.shape == (20, 1, 10, 4)
+    assert (one == other).float().mean() == pytest.approx(0.5, abs=0.1)
+
+
+@pytest.mark.parametrize(("hz", "steps"), [(60, 2), (30, 1)])
+def test_a_latency_is_a_time_at_any_control_rate(skin, hz, steps, monkeypatch):
+    monkeypatch.setitem(PRESETS, "acoustic", lambda: (Latency(seconds=1 / 30),))
+    ideal, late = (
+        make(skin, hz=hz, corruption=kind, num_envs=4, seed=0, hold=True).rollout(
+            hz // 3, lambda td: td.set("action", torch.zeros(4, 21))
+        )["signal"]
+        for kind in ("none", "acoustic")
+    )
+    assert torch.equal(late[:, steps:], ideal[:, :-steps])
+    assert not torch.equal(late, ideal)
 
 
 @pytest.mark.parametrize("kind", ["proximity", "closeness", "binary"])
