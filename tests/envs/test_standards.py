@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import get_args
 
 import pytest
+import torch
 
 from egoskin.envs.dodgeball import DodgeballConfig
 from egoskin.envs.physics import PhysicsConfig
@@ -18,8 +19,9 @@ from egoskin.envs.standards import (
     standard_of,
     training_task,
 )
-from egoskin.envs.throws import ThrowConfig
+from egoskin.envs.throws import ThrowConfig, Thrower
 from egoskin.make import EnvConfig
+from egoskin.robots.builtin import H1_2
 
 # All values are repeated here: a standard never changes; a better one is a new version.
 SHARED = {
@@ -59,6 +61,21 @@ def test_a_version_never_changes(version):
     assert dataclasses.asdict(task.throws) == THROWS[version]
     assert {name: getattr(task, name) for name in ENDS} == ENDS
     assert standard_of(task) == version
+
+
+def test_the_throws_of_version_2_never_change():
+    # The first throws of three rows with seed 0, at the standing H1-2: position [m] and
+    # velocity [m/s].
+    throws = [
+        [(-5.9488, 0.3115, 2.2012), (7.2496, -0.0755, -1.4212)],
+        [(-1.4918, 4.5346, 2.7447), (2.1704, -6.6584, -2.3826)],
+        [(3.2464, 3.1262, 2.3862), (-3.9907, -3.4984, -1.5190)],
+    ]
+    thrower = Thrower(DodgeballConfig().throws, H1_2, PhysicsConfig().timestep)
+    row = torch.arange(3)
+    release = thrower.release_at_standing_robot(thrower.draw(0, row, 0 * row, 0 * row))
+    found = torch.stack((release.position, release.velocity), 1)
+    torch.testing.assert_close(found, torch.tensor(throws), atol=2e-4, rtol=0)
 
 
 @pytest.mark.parametrize("version", VERSIONS)
