@@ -131,12 +131,15 @@ def test_many_robots_give_the_bits_of_our_environment():
     config = envs.config
     own = egoskin.make_worker_env(config, num_envs=6, seed=3)
     rollout = own.rollout(70, still, break_when_any_done=False)
-    observations, _ = envs.reset(seed=3)
+    extra = "privileged_observation"
+    observations, infos = envs.reset(seed=3)
     ends = 0
     for step in range(70):
         td = rollout[:, step]
         given = torch.cat([td[key] for key in config.actor_keys], -1)
         np.testing.assert_array_equal(observations, given)
+        # Where an episode has ended, the info is of the next one.
+        np.testing.assert_array_equal(infos[extra], td[extra])
         observations, rewards, terminated, truncated, infos = envs.step(
             np.zeros((6, 21))
         )
@@ -157,6 +160,8 @@ def test_many_robots_give_the_bits_of_our_environment():
                     assert final is None
             hit = td["next", "hit"][:, 0].numpy()
             np.testing.assert_array_equal(infos["final_info"]["hit"], hit)
+            told = np.where(done[:, None], td["next", extra], 0)
+            np.testing.assert_array_equal(infos["final_info"][extra], told)
     assert ends > 3
     envs.close()
 
