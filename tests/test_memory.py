@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import os
 import resource
+from dataclasses import replace
 
 import pytest
 
 from egoskin.agents.networks import NetworkConfig
 from egoskin.agents.ppo import PPOConfig
-from egoskin.make import EnvConfig, check_num_workers, make_env
+from egoskin.make import (
+    EnvConfig,
+    check_env_memory,
+    check_num_workers,
+    make_env,
+    make_worker_env,
+)
 from egoskin.memory import (
     check_memory,
     check_shared_memory,
@@ -80,6 +87,11 @@ def test_an_evaluation_that_does_not_fit_is_refused(monkeypatch):
     monkeypatch.setattr("egoskin.memory.machine_memory", lambda: 10**9)
     with pytest.raises(ValueError, match=r"needs at least .*episodes"):
         make_env(BLIND, num_envs=2**20, seed=0)
+    # 256 steps of 48 values and the rest, before and after a step, in the worker and
+    # sent to the parent: 4 x 256 x 48 x 4 bytes x 10,000 agents = 2 GB.
+    long = make_worker_env(replace(BLIND, history=256), num_envs=1, seed=0)
+    with pytest.raises(ValueError, match=r"at least 2\.\d GB .*history"):
+        check_env_memory(long, 10_000)
     with pytest.raises(ValueError, match="episodes must be at most 1,048,576"):
         check_num_workers(10**9, None, "episodes")
 

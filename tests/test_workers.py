@@ -473,11 +473,18 @@ def test_a_worker_that_dies_between_commands_is_reported(skin):
 
 
 def test_a_closed_pool_can_be_used_again(skin):
-    pool = make_pool(skin, 2)
-    first = pool.reset()
-    pool.close()
-    assert_same(first, pool.reset())
-    pool.close()
+    before = torch.get_num_threads()
+    torch.set_num_threads(5)
+    try:
+        pool = make_pool(skin, 2)
+        first = pool.reset()
+        pool.close()
+        assert_same(first, pool.reset())
+        # The parent keeps its threads.
+        assert torch.get_num_threads() == 5
+        pool.close()
+    finally:
+        torch.set_num_threads(before)
 
 
 def test_closing_twice_is_allowed(skin):
@@ -523,6 +530,9 @@ import torch
 from egoskin.parallel import keep_freed_memory
 if sys.argv[1] == "keep":
     keep_freed_memory()
+if sys.argv[1] == "pool":
+    from egoskin.make import EnvConfig, make_env
+    make_env(EnvConfig(), num_envs=1, seed=0, num_workers=1)
 
 def faults():
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
@@ -542,8 +552,10 @@ print(faults())
 )
 def test_freed_memory_is_kept():
     counts = {}
-    for how in ("keep", "leave"):
+    for how in ("keep", "pool", "leave"):
         command = [sys.executable, "-c", FAULTS, how]
         done = subprocess.run(command, capture_output=True, text=True, check=True)
         counts[how] = int(done.stdout)
     assert counts["keep"] < counts["leave"] / 10
+    # A pool does so as well.
+    assert counts["pool"] < counts["leave"] / 10
