@@ -391,6 +391,9 @@ def test_a_bad_weight_is_named_by_the_replay(run):
     resume = ("--resume", run, "--total-frames", (DONE + 1) * BATCH)
     message, dump = check_fails_not_finite(run, *resume)
     assert "norm of the weights" in message
+    # The rate as it was adapted, with which the replay goes on.
+    assert header["learning_rate"] != PPOConfig().learning_rate
+    assert load_tensors(dump)[1]["learning_rate"] == header["learning_rate"]
     assert path.read_bytes() == before
     assert "first: agent head.log_std [21]" in succeed("replay", dump)
 

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -27,6 +28,7 @@ from egoskin.envs.dodgeball import DodgeballConfig
 from egoskin.envs.rewards import TERMS
 from egoskin.envs.standards import training_task
 from egoskin.make import EnvConfig
+from egoskin.runs import trainer as trainer_module
 from egoskin.runs.config import TrainConfig, parse_config
 from egoskin.runs.events import EventFile
 from egoskin.runs.films import FilmMaker
@@ -61,15 +63,18 @@ def test_a_run_learns_with_its_own_number_of_threads(config: TrainConfig):
         torch.set_num_threads(before)
 
 
-def test_the_seed_draws_the_networks(tmp_path):
-    weights = []
+def test_the_seed_draws_the_networks_and_the_episodes(tmp_path):
+    drawn = []
     for number, seed in enumerate((0, 1, 0)):
         config = replace(blind_run(tmp_path / str(number), 64), seed=seed)
         with open_trainer(Run.create(config)) as trainer:
-            weights.append([w.detach().clone() for w in trainer.agent.parameters()])
-    one, other, again = weights
+            weights = [w.detach().clone() for w in trainer.agent.parameters()]
+            drawn.append((weights, trainer.root["observation"].clone()))
+    (one, start), (other, other_start), (again, same_start) = drawn
     assert all(torch.equal(a, b) for a, b in zip(one, again, strict=True))
     assert not all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
+    assert torch.equal(start, same_start)
+    assert not torch.isclose(start, other_start).all(-1).any()
 
 
 def test_one_process_trains_a_run_at_a_time(config: TrainConfig):
@@ -492,17 +497,24 @@ def test_a_header_that_no_training_writes_is_refused(name, value, finished: Trai
 # --- what is logged -----------------------------------------------------------------
 
 
-def test_an_episode_ends_by_one_cause(finished: Trainer):
-    flags = {k: torch.zeros(4, dtype=torch.bool) for k in METRIC_KEYS}
-    # Of four: hit and thrown over; hit; fallen; and one that goes on.
-    flags["hit"][:2] = True
-    flags["fallen"][[0, 2]] = True
-    flags["terminated"][:3] = True
-    info = TensorDict({k: v[None, :, None] for k, v in flags.items()}, [1, 4])
+def outputs(steps: int, agents: int) -> TensorDict:
+    """Return the outputs of a rollout in which nothing happens, ``[T, N]``."""
+    info = TensorDict(batch_size=[steps, agents])
+    for key in METRIC_KEYS:
+        info[key] = torch.zeros(steps, agents, 1, dtype=torch.bool)
     for key in ("episode_step", "first_throw_step"):
-        info[key] = torch.zeros(1, 4, 1, dtype=torch.int64)
-    info["reward"] = torch.zeros(1, 4, 1)
-    info["reward_terms"] = torch.zeros(1, 4, len(TERMS))
+        info[key] = info[key].long()
+    info["reward"] = torch.zeros(steps, agents, 1)
+    info["reward_terms"] = torch.zeros(steps, agents, len(TERMS))
+    return info
+
+
+def test_an_episode_ends_by_one_cause(finished: Trainer):
+    info = outputs(1, 4)
+    # Of four: hit and thrown over; hit; fallen; and one that goes on.
+    info["hit"][0, :2] = True
+    info["fallen"][0, [0, 2]] = True
+    info["terminated"][0, :3] = True
     metrics = finished._episode_metrics(info)
     assert metrics["episode/ended_by_ball"] == pytest.approx(2 / 3)
     assert metrics["episode/ended_by_fall"] == pytest.approx(1 / 3)
@@ -518,16 +530,12 @@ def test_success_and_survival_count_from_the_first_throw(
         monkeypatch.setattr(finished, "survival", curve)
         # Steps 30 to 30 + 3 s of four agents, thrown at after step 30; one ends at 31.
         steps = torch.arange(30, 31 + round(task.success_s * task.physics.control_hz))
-        info = TensorDict(batch_size=[len(steps), 4])
-        for key in METRIC_KEYS:
-            info[key] = torch.zeros(*info.shape, 1, dtype=torch.bool)
+        info = outputs(len(steps), 4)
         info["episode_step"] = (later + steps)[:, None, None].expand(-1, 4, 1).clone()
         info["first_throw_step"] = torch.full((*info.shape, 1), later + 30)
         info["terminated"][1, 0] = True
         # It has started again, and waits for its first throw.
         info["episode_step"][2:, 0] = 1
-        info["reward"] = torch.zeros(*info.shape, 1)
-        info["reward_terms"] = torch.zeros(*info.shape, len(TERMS))
         return finished._episode_metrics(info)
 
     found = metrics(0)
@@ -538,6 +546,53 @@ def test_success_and_survival_count_from_the_first_throw(
     assert found["episode/survival_s"] == pytest.approx(expected)
     # Only the age counts.
     np.testing.assert_equal(metrics(7), found)
+
+
+def test_the_survival_of_earlier_rollouts_fades(finished: Trainer, monkeypatch):
+    task = finished.config.env.task
+    curve = SurvivalCurve(task.episode_steps)
+    monkeypatch.setattr(finished, "survival", curve)
+    # Four of four end at age 1, and none of four in the next rollout.
+    info = outputs(1, 4)
+    info["episode_step"][:] = 1
+    info["terminated"][:] = True
+    finished._episode_metrics(info)
+    assert curve.probability(1) == 0
+    info["terminated"][:] = False
+    finished._episode_metrics(info)
+    # The first four count as 0.9 each: 3.6 of 7.6 end.
+    assert curve.probability(1) == pytest.approx(4 / 7.6)
+
+
+def test_rewards_and_diverged_rows_by_hand(finished: Trainer):
+    info = outputs(3, 2)
+    info["reward"][:, :, 0] = torch.tensor([[-1.0, 2], [3, 4], [-3, 7]])
+    info["diverged"][:2, 1] = True
+    # The n-th term is n and n + 2 of the two agents.
+    number = torch.arange(float(len(TERMS)))
+    info["reward_terms"][:, 0], info["reward_terms"][:, 1] = number, number + 2
+    metrics = finished._episode_metrics(info)
+    assert metrics["reward/mean"] == pytest.approx(2.0)
+    assert metrics["reward/negative_share"] == pytest.approx(2 / 6)
+    assert metrics["episode/diverged"] == 2
+    for i, name in enumerate(TERMS):
+        assert metrics[f"reward/{name}"] == pytest.approx(i + 1)
+
+
+def test_times_by_hand_also_of_a_training_that_goes_on(finished: Trainer, monkeypatch):
+    tensors, header = finished.run.load_checkpoint()
+    before = header["wall_s"]
+    assert before > 0
+    # Three seconds for the rollout of 64 frames, one for the update.
+    times = iter((10.0, 13.0, 14.0))
+    clock = SimpleNamespace(perf_counter=lambda: next(times))
+    monkeypatch.setattr(trainer_module, "time", clock)
+    metrics = finished.iterate()
+    assert metrics["time/collect_share"] == pytest.approx(3 / 4)
+    assert metrics["time/steps_per_s"] == pytest.approx(16.0)
+    assert metrics["time/wall_s"] == pytest.approx(before + 4)
+    finished.load(tensors, header)
+    assert finished.wall_s == before
 
 
 @pytest.mark.parametrize("back", [False, True])
