@@ -46,10 +46,11 @@ def test_separate_inputs_equal_one_layer_of_their_concatenation():
 def test_layers_begin_orthogonal_and_all_inputs_as_one_layer():
     torch.manual_seed(0)
     net = KeyedMLP([4, 7], [8, 8], 2, 0.5)
-    first = torch.cat([layer.weight for layer in net.inputs], 1)
-    _, second, _, last = net.tail
+    *parts, second, last = (x for n, x in net.named_parameters() if "weight" in n)
+    first = torch.cat(parts, 1)
+    assert first.shape == (8, 11)
     # The squared gains are 2, and 0.25 in the last layer.
-    for weight, square in ((first, 2), (second.weight, 2), (last.weight, 0.25)):
+    for weight, square in ((first, 2), (second, 2), (last, 0.25)):
         torch.testing.assert_close(weight @ weight.mT, square * torch.eye(len(weight)))
     biases = [value for name, value in net.named_parameters() if "bias" in name]
     assert len(biases) == 3
