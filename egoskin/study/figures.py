@@ -215,14 +215,18 @@ def _draw_warnings(
 
 
 def _legend_above(figure: Figure, panels: Iterable[Axes]) -> None:
-    """Draw one legend for all panels."""
+    """Draw one legend for all panels, signals first."""
     handles: dict[str, Any] = {}
     for axes in panels:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
+    labels = [
+        *(s for s in _STYLES if s in handles),
+        *(h for h in handles if h not in _STYLES),
+    ]
     figure.legend(
-        list(handles.values()),
-        list(handles),
+        [handles[label] for label in labels],
+        labels,
         loc="outside upper center",
         # An entry is up to 1.5 inches wide.
         ncols=min(len(handles), 5, int(figure.get_figwidth() / 1.5)),
