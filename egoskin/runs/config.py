@@ -66,7 +66,8 @@ class TrainConfig:
     """Maximum age of the latest checkpoint [s]."""
     init_from: Path | None = None
     """Policy or run whose networks are trained further, as on another task or range.
-    Only the networks and normalisers are taken. None: new networks."""
+    Only the networks, with their standard deviation, and normalisers are taken; frames
+    and schedules start at 0. None: new networks."""
     config: Path | None = None
     """config.json of a run to repeat: its values are the defaults, and the skin must be
     the same."""

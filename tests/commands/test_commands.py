@@ -382,6 +382,8 @@ CELLS = [
             ("ray", []),
             ("ray", ["--sensor.reduce", "min"]),
         )
+        # Refused: a localization does not depend on it.
+        if not (reduced and signal == "localization")
     ),
     ["--sensor.corruption", "time_of_flight", "--history", "3"],
     ["--sensor.occlusion"],

@@ -618,9 +618,9 @@ def test_memory_stays_flat(start, tmp_path):
     minutes = float(os.environ.get("EGOSKIN_MEMORY_MINUTES", "3"))
     run = tmp_path / "run"
     training = start("--run-dir", run, "--total-frames", 10**9)
-    training.wait_for(lambda: len(rows(run)) > 10, 300)
-    warm_up = time.monotonic() + 60
-    training.wait_for(lambda: time.monotonic() > warm_up, 300)
+    # Freed memory is kept, and the largest that a step needs comes with time: counted
+    # in rollouts, as another process may slow the training down.
+    training.wait_for(lambda: len(rows(run)) > 40, 600)
     samples = []
     end = time.monotonic() + 60 * minutes
     while time.monotonic() < end:
