@@ -7,6 +7,7 @@ run resumes from its last checkpoint. Requires the extra `ray`.
 
 from __future__ import annotations
 
+import logging
 import signal
 import socket
 import time
@@ -60,7 +61,7 @@ def connect(address: str) -> None:
         ray.init(
             address=address,
             log_to_driver=False,
-            logging_level="ERROR",
+            logging_level=logging.ERROR,
             # Nodes have egoskin installed: nothing is sent to them.
             runtime_env={"env_vars": {**own_settings(), **_LET_LIVE}},
         )

@@ -126,7 +126,7 @@ class WarpPhysics(Physics):
             raise ValueError(f"{SETTING} must be a positive integer, got {text!r}")
         return int(text)
 
-    def _put_model(self, **options: object) -> mjw.Model:
+    def _put_model(self, **options: Any) -> mjw.Model:
         model = mjw.put_model(self._mujoco, **options)
         # `note` reports overflows; reaching the iteration limit invalidates no row.
         model.opt.warn_overflow = 0

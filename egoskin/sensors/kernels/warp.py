@@ -9,9 +9,12 @@ of zero). Sums are therefore in its order, and the module is compiled without fu
 multiply-add. Warp's CPU device runs the same code; it is meant for tests.
 """
 
-# In a kernel float(0.0) is a variable and 0.0 a constant, and types are values.
+# In a kernel float(0.0) is a variable and 0.0 a constant, and types are values. Type
+# checkers know neither its operators nor its overloads.
 # ruff: noqa: UP018
-# pyright: reportInvalidTypeForm=false
+# pyright: reportInvalidTypeForm=false, reportGeneralTypeIssues=false
+# pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false
+# pyright: reportOperatorIssue=false, reportReturnType=false
 
 from __future__ import annotations
 
