@@ -590,6 +590,10 @@ def test_a_run_that_stored_whether_to_compile_goes_on(run):
 # --- memory ---------------------------------------------------------------------
 
 
+# Bound of the holes in the memory of parent and workers [kB].
+_HOLES = 250_000
+
+
 def usage(training: Training) -> tuple[int, int, int]:
     """Resident memory [kB], open files, shared memory [kB] of all processes.
 
@@ -618,8 +622,7 @@ def test_memory_stays_flat(start, tmp_path):
     minutes = float(os.environ.get("EGOSKIN_MEMORY_MINUTES", "3"))
     run = tmp_path / "run"
     training = start("--run-dir", run, "--total-frames", 10**9)
-    # Freed memory is kept, and the largest that a step needs comes with time: counted
-    # in rollouts, as another process may slow the training down.
+    # In rollouts, as another process may slow the training down.
     training.wait_for(lambda: len(rows(run)) > 40, 600)
     samples = []
     end = time.monotonic() + 60 * minutes
@@ -640,7 +643,10 @@ def test_memory_stays_flat(start, tmp_path):
         f"{max(files[:part])} -> {max(files[-part:])}, shared "
         f"{max(shared[:part])} -> {max(shared[-part:])} kB"
     )
-    assert last <= 1.02 * first
+    # glibc leaves holes where large aligned blocks were: 11 MB in each worker at each
+    # checkpoint, until there are about ten, and some 60 MB in the parent. The data of
+    # rollouts, kept by mistake, would be more after a few of them.
+    assert last <= first + _HOLES
     assert max(files[-part:]) <= max(files[:part])
     assert max(shared[-part:]) <= max(shared[:part])
     training.check_nothing_is_left()
