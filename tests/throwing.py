@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDictBase
 
-from egoskin.envs.dodgeball import DodgeballConfig
+from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
 from egoskin.envs.throws import ThrowConfig
 from egoskin.robots.builtin import H1_2
 
@@ -25,3 +25,18 @@ def wild_actions(rows: int, steps: int = 150) -> torch.Tensor:
 def assert_same(one: TensorDictBase, other: TensorDictBase) -> None:
     """Assert that the same entries are equal bit for bit, and none is NaN."""
     torch.testing.assert_close(one.to_dict(), other.to_dict(), rtol=0, atol=0)
+
+
+def assert_forgets(used: DodgeballEnv, fresh: DodgeballEnv) -> None:
+    """Assert that episode 1 begins as after an episode 0 that never began.
+
+    Args:
+        used: Environment in episode 0.
+        fresh: The same environment, not reset yet.
+    """
+    used.reset()
+    fresh.reset()
+    fresh.reset()
+    one, other = used.simulation_state(), fresh.simulation_state()
+    for key, value in one.items():
+        assert torch.equal(value, other[key]), key

@@ -17,7 +17,7 @@ from egoskin.envs.rewards import TERMS, RewardConfig, reward_terms
 from egoskin.envs.throws import ThrowConfig
 from egoskin.robots.builtin import H1_2
 from egoskin.robots.surface import sample_surface
-from throwing import AT_ONCE, assert_same, wild_actions
+from throwing import AT_ONCE, assert_forgets, assert_same, wild_actions
 
 JOINTS = len(H1_2.joints)
 DEFAULT = torch.from_numpy(H1_2.default_joint_pos).float()
@@ -170,12 +170,7 @@ def test_an_episode_remembers_nothing_of_the_one_before():
     root = used.reset()
     for action in wild_actions(6)[:25]:
         root = used.step(root.set("action", action))["next"]
-    used.reset()
-    fresh.reset()
-    fresh.reset()
-    one, other = used.simulation_state(), fresh.simulation_state()
-    for key, value in one.items():
-        assert torch.equal(value, other[key]), key
+    assert_forgets(used, fresh)
 
 
 # --- start ----------------------------------------------------------------------

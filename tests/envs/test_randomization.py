@@ -14,7 +14,7 @@ from egoskin.envs.randomization import RandomizationConfig
 from egoskin.envs.standards import evaluation_task, standard_of
 from egoskin.envs.throws import ThrowConfig
 from egoskin.robots.builtin import H1_2
-from throwing import assert_same
+from throwing import assert_forgets, assert_same
 
 NO_BALLS = ThrowConfig(first_delay=(100.0, 100.0))
 EVERYTHING = RandomizationConfig(
@@ -168,12 +168,7 @@ def test_an_episode_remembers_nothing_of_the_one_before():
     play(used, 15)
     assert used.randomization.state["push"].any()
     assert used.randomization.state["late_actions"].any()
-    used.reset()
-    fresh.reset()
-    fresh.reset()
-    one, other = used.simulation_state(), fresh.simulation_state()
-    for key, value in one.items():
-        assert torch.equal(value, other[key]), key
+    assert_forgets(used, fresh)
 
 
 def test_a_split_gives_the_same_bits_and_so_does_a_resume():
