@@ -28,6 +28,7 @@ from egoskin.make import (
     save_env_state,
 )
 from egoskin.parallel import (
+    WorkerEnv,
     WorkerError,
     WorkerPool,
     available_cores,
@@ -438,11 +439,32 @@ def test_a_worker_that_fails_while_it_starts_is_reported(
     pool.close()
 
 
+def test_a_worker_sends_its_state_in_the_same_memory_every_time(skin):
+    # New memory for every checkpoint leaves holes: 70 MB in a worker of 2,048 agents.
+    plain = make_worker_env(CONFIG, skin, num_envs=4, seed=0)
+    env = WorkerEnv(plain.base_env, plain.transform.clone(), Path("unused"))
+    root = env.reset()
+    first = env.simulation_state()
+    pointers = {key: value.data_ptr() for key, value in first.items()}
+    assert all(value.is_shared() for value in first.values())
+    before = {key: value.clone() for key, value in first.items()}
+    root["action"] = torch.zeros(4, 21)
+    env.step(root)
+    second = env.simulation_state()
+    assert {key: value.data_ptr() for key, value in second.items()} == pointers
+    assert not torch.equal(second["physics"], before["physics"])
+    for key, value in plain.base_env.simulation_state().items():
+        assert torch.equal(second[key], value), key
+
+
 def test_a_worker_that_fails_when_asked_is_reported(skin, monkeypatch):
     pool = make_pool(skin, 2)
     pool.reset()
-    with pytest.raises(WorkerError, match=r"raised\n(.|\n)*AttributeError.*'nonsense'"):
-        pool._ask("nonsense")
+    state = pool.simulation_state()
+    with pytest.raises(WorkerError, match=r"raised\n(.|\n)*KeyError: 'physics'"):
+        pool.load_simulation_state(
+            {key: state[key] for key in state if key != "physics"}
+        )
     pool.close()
     pool = make_pool(skin, 2)
     pool.reset()

@@ -205,10 +205,10 @@ class MujocoPhysics(Physics):
 
     def state(self) -> Tensor:
         """Return everything needed to continue bit for bit, ``[B, n]`` float64."""
-        parts = [torch.tensor(self._batch.state)]
+        state = torch.tensor(self._batch.state)
         if self.config.target_velocity == "finite_difference":
-            parts.append(self._last_target.double())
-        return torch.cat(parts, -1)
+            state = torch.cat((state, self._last_target.double()), -1)
+        return state
 
     def load_state(self, state: Tensor) -> None:
         """Restore a state that `state` returned."""
