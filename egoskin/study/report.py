@@ -39,7 +39,7 @@ from egoskin.study.statistics import (
     separation,
     spread,
 )
-from egoskin.study.store import Result, RunStatus, StudyFolder
+from egoskin.study.store import Result, StudyFolder
 
 # The budget is the same for all runs: the share of it adds nothing to the frames.
 _SHOWN = [m for m in METRICS if m.name != "share_to_90"]
@@ -61,22 +61,21 @@ def write_report(folder: StudyFolder, out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     values = tables(results)
     names = [cell.name for cell in manifest.cells]
-    concerned: list[Judged] = []
+    judged: list[Judged] = []
     found: list[Difference] = []
     if set(names) >= CELLS:
         judged = judge_findings(values)
-        concerned = [j for j in judged if any(c.effect for c in j.claims)]
     else:
         found = differences(names, values["success_3s"])
     seen = _seen(folder)
-    pictures = _pictures(manifest, results, values["success_3s"], concerned, seen)
+    pictures = _pictures(manifest, results, values["success_3s"], judged, seen)
     for name, (figure, _) in pictures.items():
         save(figure, out, name)
     shown = {
         name: f"![{caption}]({name}.png)\n\n*{caption}*"
         for name, (_, caption) in pictures.items()
     }
-    blocks = _blocks(folder, manifest, results, values, concerned, found, shown, seen)
+    blocks = _blocks(folder, manifest, results, values, judged, found, shown, seen)
     text = "\n\n".join(blocks) + "\n"
     contents = {
         "runs.csv": runs_csv(manifest, results),
@@ -95,6 +94,7 @@ def _pictures(
     seen: Sequence[Mapping[str, Any]],
 ) -> dict[str, tuple[Figure, str]]:
     """Return the figures for which there are data, with their captions."""
+    tested = [j for j in judged if _is_tested(j)]
     warnings = (
         "Below: time from the first detection of a ball to its contact with a standing "
         "robot, median and 5 to 95 %. "
@@ -107,9 +107,9 @@ def _pictures(
             "Infinite ranges are left out.",
         ),
         "findings": (
-            forest(judged) if judged else None,
-            "The findings. Shaded: the region claimed for each effect; 90 % (thick) "
-            "and 95 % (thin) intervals; hollow: one seed, no interval.",
+            forest(tested) if tested else None,
+            "The findings with runs. Shaded: the region claimed for each effect; 90 % "
+            "(thick) and 95 % (thin) intervals; hollow: one seed, no interval.",
         ),
         "equivalence": (
             equivalence(manifest, success),
@@ -174,6 +174,7 @@ def _blocks(
             "by a stand-in."
         )
         yield _finding_rows(judged, results)
+    if "findings" in shown:
         yield shown["findings"]
     first = manifest.cells[0].name
     if not judged and len(manifest.cells) > 1 and not values["success_3s"].get(first):
@@ -242,23 +243,41 @@ def _blocks(
 
 
 def _missing_runs(folder: StudyFolder, manifest: Manifest) -> Iterator[str]:
+    """Yield the runs that are not done: their cells, by the seeds that are missing."""
     yield "## Missing runs"
-    missing = [s for s in folder.status(manifest.runs) if s.state != "done"]
-    yield ", ".join(map(_missing, missing)) or "None: all runs are done."
+    seeds: dict[str, list[str]] = {}
+    for status in folder.status(manifest.runs):
+        if status.state != "done":
+            note = f" ({status.state})" * (status.state != "missing")
+            own = seeds.setdefault(status.run.cell.name, [])
+            own.append(f"{status.run.seed}{note}")
+    cells: dict[str, list[str]] = {}
+    for cell, own in seeds.items():
+        cells.setdefault(", ".join(own), []).append(cell)
+    if cells:
+        rows = [(own, ", ".join(names)) for own, names in cells.items()]
+        yield table(("seeds", "cells"), rows)
+    else:
+        yield "None: all runs are done."
 
 
-def _missing(status: RunStatus) -> str:
-    name, state = status.run.name, status.state
-    return name if state == "missing" else f"{name} ({state})"
+def _is_tested(judged: Judged) -> bool:
+    """Return whether any claim of a finding has runs."""
+    return any(c.effect is not None for c in judged.claims)
 
 
 def _answer(judged: Sequence[Judged]) -> str:
     """Return the verdicts in a sentence."""
-    parts = []
-    for verdict in ("confirmed", "refuted", "undecided"):
-        labels = [j.finding.label for j in judged if j.verdict == verdict]
-        if labels:
-            parts.append(f"{verdict}: {', '.join(labels)}")
+    labels: dict[str, list[str]] = {
+        "confirmed": [],
+        "refuted": [],
+        "undecided": [],
+        "untested": [],
+    }
+    for j in judged:
+        verdict = j.verdict if _is_tested(j) else "untested"
+        labels[verdict].append(j.finding.label)
+    parts = [f"{verdict}: {', '.join(own)}" for verdict, own in labels.items() if own]
     return f"**Of the paper's findings {'; '.join(parts)}.**"
 
 
@@ -282,10 +301,18 @@ def _finding_rows(judged: Sequence[Judged], results: Sequence[Result]) -> str:
     have = Counter(result.run.cell.name for result in results)
     rows = []
     for j in judged:
+        text = j.finding.text
+        if j.finding.stand_in:
+            text += f". Stand-in: {j.finding.stand_in}"
+        known = sum(c.effect is not None for c in j.claims)
+        claims = f"{known} of {len(j.claims)}"
+        if not known:
+            none = (f"**{j.verdict}**", "", "no runs yet", "0", claims, "")
+            rows.append((j.finding.label, text, *none))
+            continue
         claim = _deciding(j)
         effect = claim.effect
         assert effect is not None
-        known = sum(c.effect is not None for c in j.claims)
         more = cost = ""
         if j.verdict == "undecided":
             cells = {name for c in j.deciding for name in c.claim.weights}
@@ -293,9 +320,6 @@ def _finding_rows(judged: Sequence[Judged], results: Sequence[Result]) -> str:
             if j.seeds_needed is not None and hours:
                 runs = sum(max(j.seeds_needed - have[c], 0) for c in cells)
                 cost = f"{runs * fmean(hours):,.0f}"
-        text = j.finding.text
-        if j.finding.stand_in:
-            text += f". Stand-in: {j.finding.stand_in}"
         rows.append(
             (
                 j.finding.label,
@@ -304,7 +328,7 @@ def _finding_rows(judged: Sequence[Judged], results: Sequence[Result]) -> str:
                 _p_value(j.p_value),
                 f"{claim.claim.name}: {_effect(effect)}",
                 f"{effect.seeds}{more}",
-                f"{known} of {len(j.claims)}",
+                claims,
                 cost,
             )
         )

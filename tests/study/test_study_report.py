@@ -94,8 +94,40 @@ def test_the_answer_comes_first_and_what_is_missing_is_told(folder: StudyFolder)
         r"\*\*Of the paper's findings (\w+: [\w, ]+(; )?)+\.\*\*", first[4]
     )
     missing = text.split("## Missing runs")[1].split("##")[0]
-    assert missing.count("-seed1") == missing.count("-seed2") == 16
+    (row,) = (line for line in missing.splitlines() if line.startswith("| 1, 2 |"))
+    assert row.count("ray-") == 16
+    assert "field" not in missing
     assert "blind" not in missing
+
+
+def test_a_finding_without_runs_is_listed_as_undecided(
+    manifest: Manifest, tmp_path: Path, without_pictures
+):
+    folder = StudyFolder(tmp_path)
+    folder.plan(manifest)
+    store_all(folder, manifest, keep=lambda r: r.cell.name == "field-proximity-2m")
+    write_report(folder, tmp_path / "report")
+    text = (tmp_path / "report" / "report.md").read_text()
+    verdicts = "refuted: 6b; untested: 1a, 1b, 1c, 2, 3, 4, 5, 6a"
+    assert f"**Of the paper's findings {verdicts}.**" in text
+    for label, claims in (("1a", 20), ("3", 1), ("6a", 1)):
+        (row,) = (line for line in text.splitlines() if line.startswith(f"| {label} |"))
+        assert row.endswith(
+            f"| **undecided** |  | no runs yet | 0 | 0 of {claims} |  |"
+        )
+
+
+def test_a_run_that_failed_is_told_among_the_missing(
+    manifest: Manifest, tmp_path: Path, without_pictures
+):
+    folder = StudyFolder(tmp_path)
+    folder.plan(manifest)
+    keep = "field-proximity-1m"
+    store_all(folder, manifest, keep=lambda r: r.cell.name != keep)
+    folder.note_failure(f"{keep}-seed1", "no memory")
+    write_report(folder, tmp_path / "report")
+    text = (tmp_path / "report" / "report.md").read_text()
+    assert f"| 0, 1 (failed), 2 | {keep} |" in text
 
 
 def test_the_table_has_a_row_for_each_run_in_full_precision(
