@@ -23,7 +23,8 @@ class Controller:
 
     Args:
         path: The exported policy.
-        max_age: Stop when states or distances are older than this [s].
+        max_age: Stop when states or distances are older than this, or as far in the
+            future [s].
         max_missing: Stop when more than this share of the distances is missing.
         margin: How far targets may lie outside the joint ranges, in units of torque
             limit / kp, the position error that commands full torque.
@@ -123,18 +124,22 @@ class Controller:
             self.stop("the state of the body is not finite")
         if not abs(np.linalg.norm(base_quat) - 1) <= 0.01:
             self.stop("base_quat is not a unit quaternion")
-        if not body_age <= self._max_age:
-            self.stop(f"the state of the body is {body_age:.3g} s old")
+        self._check_age("the state of the body is", body_age)
         if self.metadata["previous_action"]:
             blocks[0] = np.concatenate((blocks[0], self._action))
         if self._sensor["coverage"] != "none":
             blocks.append(self._signal(distance))
-            if not skin_age <= self._max_age:
-                self.stop(f"the distances of the skin are {skin_age:.3g} s old")
-        first = self._default + np.nan_to_num(deviation)
+            self._check_age("the distances of the skin are", skin_age)
+        # At the start, the joints stay where they are, within the limits.
+        first = np.clip(self._default + np.nan_to_num(deviation), *self._limits)
         last = first if self._target is None else self._target
         self._target = last if self.stopped else self._next_target(blocks, last)
         return self._target.copy()
+
+    def _check_age(self, what: str, age: float) -> None:
+        """Stop if an input is too old, or if it comes from the future."""
+        if not -self._max_age <= age <= self._max_age:
+            self.stop(f"{what} {age:.3g} s old")
 
     def _check_shape(self, name: str, value: Any, *allowed: tuple[int, ...]) -> None:
         """Raise ValueError if an input of `step` has none of the allowed shapes."""
@@ -148,15 +153,15 @@ class Controller:
         found = np.asarray(np.nan * self._range if distance is None else distance)
         # Drivers report -1 for "no target".
         found = np.where(found < 0, np.nan, found)
+        lost = np.isnan(found).mean()
         if self._sensor["reduce"] == "min" and found.ndim == 2:
             found = np.fmin.reduce(found, 1)
         readings = self.metadata["readings"]
         grid = [(len(readings), readings[0])] if len(set(readings)) == 1 else []
         self._check_shape("distance", found, self._range.shape, *grid)
-        missing = np.isnan(found).reshape(len(self._range))
-        if missing.mean() > self._max_missing:
-            self.stop(f"{missing.mean():.0%} of the skin is missing")
-        found = np.where(missing, np.inf, found.reshape(len(self._range)))
+        if lost > self._max_missing:
+            self.stop(f"{lost:.0%} of the skin is missing")
+        found = np.where(np.isnan(found), np.inf, found).reshape(len(self._range))
         limit = np.minimum(self._range, np.finfo(float).max)
         if self._sensor["signal"] == "binary":
             return (found <= limit) * 1.0

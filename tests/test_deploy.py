@@ -118,7 +118,9 @@ def state(controller) -> dict[str, Any]:
     [
         ({"body_age": 0.2}, "the state of the body is 0.2 s old"),
         ({"body_age": np.nan}, "the state of the body is nan s old"),
+        ({"body_age": -0.2}, "the state of the body is -0.2 s old"),
         ({"skin_age": 1.5}, "the distances of the skin are 1.5 s old"),
+        ({"skin_age": -1e9}, "the distances of the skin are -1e+09 s old"),
         ({"joint_vel": np.full(21, np.nan)}, "the state of the body is not finite"),
         ({"base_quat": np.full(4, np.inf)}, "the state of the body is not finite"),
         ({"base_quat": np.zeros(4)}, "base_quat is not a unit quaternion"),
@@ -182,6 +184,38 @@ def test_a_stop_from_the_first_step_on_leaves_the_robot_as_it_is(controller, sta
     controller.stop("the operator let go of the button")
     np.testing.assert_allclose(controller.step(**state), state["joint_pos"])
     assert controller.stopped == "the operator let go of the button"
+
+
+@pytest.mark.parametrize("position", [100.0, -100.0, np.inf])
+def test_a_wrong_encoder_at_the_start_gives_no_target_beyond_the_limits(
+    controller, state, position
+):
+    state["joint_pos"] = state["joint_pos"].copy()
+    state["joint_pos"][0] = position
+    target = controller.step(**state)
+    data = controller.metadata
+    beyond = np.array(data["torque_limit"]) / np.array(data["kp"])
+    low, high = np.array(data["joint_range"])
+    assert (low - beyond <= target).all()
+    assert (target <= high + beyond).all()
+
+
+def test_an_age_is_allowed_to_be_a_little_negative(controller, state):
+    controller.step(**{**state, "body_age": -0.05, "skin_age": -0.05})
+    assert controller.stopped is None
+
+
+def test_dead_beams_of_live_sensors_count_as_missing(tmp_path):
+    controller = deploy(make_policy(KINDS["closest beams"]), tmp_path)
+    state = {"joint_pos": np.zeros(21), "joint_vel": np.zeros(21), "body_age": 0}
+    state |= {"base_quat": [1, 0, 0, 0], "base_ang_vel_b": np.zeros(3)}
+    distance = np.full((64, 64), np.inf)
+    distance[:, 59:] = np.nan
+    controller.step(**state, distance=distance)
+    assert controller.stopped is None
+    distance[:, 1:] = -1.0
+    controller.step(**state, distance=distance)
+    assert controller.stopped == "98% of the skin is missing"
 
 
 @pytest.mark.parametrize("missing", [np.nan, -1.0])
