@@ -112,9 +112,13 @@ def _rows(td: TensorDictBase, key: str) -> np.ndarray:
     return value.reshape(-1, value.shape[-1]).numpy()
 
 
-def _finite(action: np.ndarray) -> Tensor:
-    """Return actions as a tensor, or raise ValueError if they are not finite."""
+def _checked(action: np.ndarray, shape: tuple[int, ...]) -> Tensor:
+    """Return actions as a tensor, or raise ValueError if they are not valid."""
     tensor = torch.as_tensor(action, dtype=torch.float32)
+    if tensor.shape != shape:
+        raise ValueError(
+            f"an action must have the shape {list(shape)}, got {list(tensor.shape)}"
+        )
     if not tensor.isfinite().all():
         raise ValueError("an action must be finite, got NaN or infinite values")
     return tensor
@@ -193,9 +197,10 @@ class DodgeballGym(gymnasium.Env[np.ndarray, np.ndarray]):
         """Return observation, reward, terminated, truncated and info.
 
         Raises:
-            ValueError: If the action has a value that is NaN or infinite.
+            ValueError: If the action has another shape, or a value that is NaN or
+                infinite.
         """
-        self._root["action"] = _finite(action)[None]
+        self._root["action"] = _checked(action, self._rows.action_space.shape)[None]
         step = self._env.step(self._root)
         self._root, after = self._env.step_mdp(step), step["next"]
         self._now, self._age = after, self._age + 1
@@ -303,12 +308,12 @@ class DodgeballVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """Return observations, rewards, terminations, truncations and infos.
 
         Raises:
-            ValueError: If an action has a value that is NaN or infinite.
+            ValueError: If they have another shape, or a value that is NaN or infinite.
         """
         if self._env is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
-        shape = (*self._root.batch_size, -1)
-        action = _finite(actions).reshape(shape)
+        shape = self.num_envs, *self._rows.action_space.shape
+        action = _checked(actions, shape).reshape(*self._root.batch_size, -1)
         step, self._root = self._env.step_and_maybe_reset(
             self._root.set("action", action)
         )

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -17,6 +18,9 @@ from torchrl.data import Composite, TensorSpec
 from torchrl.envs import Transform
 
 from egoskin.rounding import pad_rows
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 
 class _KeyedTransform(Transform):
@@ -29,6 +33,13 @@ class _KeyedTransform(Transform):
             if isinstance(keys, str):
                 raise ValueError(f"{name} must be a list of keys, got {keys!r}")
         super().__init__(in_keys=list(in_keys), out_keys=list(out_keys))
+
+    def clone(self) -> Self:
+        """Return a copy for another environment, which shares nothing that changes."""
+        new = super().clone()
+        for name, buffer in self.named_buffers(recurse=False):
+            new.register_buffer(name, buffer.clone())
+        return new
 
     @abstractmethod
     def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
@@ -204,6 +215,12 @@ class StatefulTransform(_KeyedTransform):
         # Reference to the last state written. On a reset after a step, TorchRL only
         # passes which rows reset; this is the state at the end of their episodes.
         self._last: list[Tensor] | None = None
+
+    def clone(self) -> Self:
+        """Return a copy for another environment, where it starts at the beginning."""
+        new = super().clone()
+        new._last = None
+        return new
 
     @abstractmethod
     def start(

@@ -38,12 +38,13 @@ def prepare(policy: str, out: Path, episodes: int, throw_set: int) -> None:
     from egoskin.envs.throws import Thrower
     from egoskin.evaluation.throw_set import play_throws, standard_task, throw_seed
     from egoskin.make import make_worker_env
-    from egoskin.policies.export import export_onnx, needs_tracker
+    from egoskin.policies.export import export_onnx, metadata, needs_tracker
     from egoskin.policies.policy import load_policy
 
     loaded = load_policy(policy)
     if needs_tracker(loaded):
         raise ValueError(f"{policy} reads positions of balls, which needs a tracker")
+    check_supported(metadata(loaded, None))
     config = standard_task(loaded.env_config, "2")
     # What comes later is not used.
     task = replace(config.task, episode_length_s=config.task.success_s)
@@ -85,6 +86,18 @@ def prepare(policy: str, out: Path, episodes: int, throw_set: int) -> None:
     print(f"{out}: {episodes} episodes; PyTorch succeeds in {success:.1%}")
 
 
+def check_supported(metadata: dict[str, Any]) -> None:
+    """Raise ValueError if a policy needs what the driver below does not have."""
+    sensor, around = metadata["sensor"], {"coverage": "field", "half_angle_deg": 180}
+    kinds = metadata["skin"].get("types", {}).values()
+    if any(kind != around for kind in kinds) or sensor["occlusion"]:
+        raise ValueError("this example needs field sensors that see all around")
+    if sensor["corruption"] != "none":
+        raise ValueError("this example has no model of real sensors")
+    if metadata["target_velocity"] != "zero":
+        raise ValueError("this example sends no velocity targets")
+
+
 class Robot:
     """The robot, its skin and the balls in MuJoCo, as a driver would access them.
 
@@ -94,9 +107,7 @@ class Robot:
     """
 
     def __init__(self, model: mujoco.MjModel, metadata: dict[str, Any]) -> None:
-        sensor = metadata["sensor"]
-        if sensor["coverage"] == "ray" or sensor["field"]["half_angle_deg"] < 180:
-            raise SystemExit("this example needs field sensors that see all around")
+        check_supported(metadata)
         self.model, self.data = model, mujoco.MjData(model)
         joints = [model.joint(name) for name in metadata["joints"]]
         self._q = np.array([joint.qposadr[0] for joint in joints])

@@ -22,11 +22,13 @@ import egoskin
 from calling import SCRIPTS
 from egoskin.deploy import Controller
 from egoskin.envs.dodgeball import DodgeballConfig
+from egoskin.envs.physics import PhysicsConfig
 from egoskin.envs.throws import ThrowConfig
 from egoskin.evaluation.throw_set import standard_task, throw_seed
 from egoskin.make import EnvConfig, make_worker_env
-from egoskin.policies.export import export_onnx
+from egoskin.policies.export import export_onnx, metadata
 from egoskin.policies.policy import Policy
+from egoskin.sensors import Field
 from egoskin.sensors.config import SensorConfig, SkinConfig
 from making import make_policy
 
@@ -418,6 +420,28 @@ def test_the_example_tells_what_it_refuses_in_one_line(
     with pytest.raises(SystemExit, match=rf"^error: .*{text}.*$"):
         main()
     assert not (tmp_path / "made").exists()
+
+
+CONE = SensorConfig(field=Field(half_angle_deg=90.0))
+PD = PhysicsConfig(target_velocity="finite_difference")
+
+
+@pytest.mark.parametrize(
+    ("config", "text"),
+    [
+        (EnvConfig(sensor=SensorConfig(occlusion=True)), "see all around"),
+        (EnvConfig(sensor=SensorConfig(coverage="ray")), "see all around"),
+        (EnvConfig(sensor=CONE), "see all around"),
+        (EnvConfig(sensor=SensorConfig(corruption="acoustic")), "real sensors"),
+        (EnvConfig(task=DodgeballConfig(physics=PD)), "velocity targets"),
+    ],
+)
+def test_the_example_refuses_what_its_driver_does_not_do(config, text):
+    check = runpy.run_path(str(SCRIPTS / "deploy_mujoco.py"))["check_supported"]
+    for fine in (EnvConfig(), KINDS["blind"]):
+        check(metadata(make_policy(fine), None))
+    with pytest.raises(ValueError, match=text):
+        check(metadata(make_policy(config), None))
 
 
 @pytest.mark.slow

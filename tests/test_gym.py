@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import runpy
 from typing import Any
 
@@ -84,6 +85,18 @@ def test_an_action_that_is_not_finite_is_refused(value):
         # The episode goes on.
         _, reward, *_ = env.step(np.zeros_like(action))
         assert np.isfinite(reward).all()
+        env.close()
+
+
+def test_an_action_of_another_shape_is_refused():
+    one, many = gymnasium.make(ENV_ID).unwrapped, make_vec(2, num_workers=1)
+    wrong = {one: [(1,), (20,), (1, 21)], many: [(21, 2), (42,), (21,), (1, 21)]}
+    for env, shapes in wrong.items():
+        env.reset(seed=0)
+        for shape in shapes:
+            expected = re.escape(f"{list(env.action_space.shape)}, got {list(shape)}")
+            with pytest.raises(ValueError, match=f"^an action must .* {expected}$"):
+                env.step(np.zeros(shape, dtype=np.float32))
         env.close()
 
 

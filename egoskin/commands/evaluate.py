@@ -90,6 +90,10 @@ class EvaluateConfig:
         check_output(self.map, "--map", PICTURE_SUFFIXES)
         if self.map is not None:
             check_packages("--map", "plot", "matplotlib")
+        if self.engine == "warp" and self.num_workers not in (None, 1):
+            raise ValueError(
+                "engine warp simulates in one process: leave out num_workers"
+            )
         engine_of(self.engine)
         if self.engine == "mujoco" and device_of(self.device).type != "cpu":
             raise ValueError("engine mujoco simulates on the CPU: leave out device")

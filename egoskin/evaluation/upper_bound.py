@@ -180,11 +180,11 @@ def find_upper_bound(
         plans = mean[:, None] + spread[:, None] * noise
         plans[:, 0], plans[:, 1] = 0.0, mean
         plan = plans.flatten(0, 1).repeat_interleave(_HELD, 1)
-        avoided, age = (
-            x.reshape(n, samples) for x in _play(env, policy, starts, plan, steps)
+        untouched, avoided, age = (
+            x.reshape(n, samples) for x in _play(env, policy, starts, plan, steps, ball)
         )
-        stood = avoided & (age == steps)
-        cost = torch.where(avoided, 1.0 - age / steps, 2.0)
+        stood = untouched & (age == steps)
+        cost = torch.where(untouched, 1.0 - age / steps, 2.0)
         cost += _SIZE_COST * plans.square().mean((2, 3))
         if iteration == 1:
             own = Outcome(avoided=avoided[:, 0], stood=stood[:, 0])
@@ -261,17 +261,25 @@ def _until_in_reach(
 
 
 def _play(
-    env: TransformedEnv, policy: Policy, start: _Start, plan: Tensor, steps: int
-) -> tuple[Tensor, Tensor]:
+    env: TransformedEnv,
+    policy: Policy,
+    start: _Start,
+    plan: Tensor,
+    steps: int,
+    ball: int,
+) -> tuple[Tensor, Tensor, Tensor]:
     """Play from the start states with plans ``[M, T, J]`` added to the actions.
 
     Returns:
-        Whether no ball hit, ``[M]`` bool, and number of steps survived, ``[M]``.
+        Whether no ball hit; whether the given ball did not, which a fall before it has
+        passed leaves open and counts as no, ``[M]`` bool each; and number of steps
+        survived, ``[M]``.
     """
     _task(env).load_simulation_state(start.simulation)
     root = start.root.clone()
     running = torch.ones(len(root), dtype=torch.bool)
-    avoided, age = running.clone(), torch.full((len(root),), steps)
+    untouched, avoided = running.clone(), running.clone()
+    age = torch.full((len(root),), steps)
     for number in range(steps):
         action = policy(root)["action"]
         if number < plan.shape[1]:
@@ -279,10 +287,11 @@ def _play(
         step, root = env.step_and_maybe_reset(root)
         after = cast(TensorDictBase, step["next"])
         ended = running & after["done"][:, 0]
-        avoided &= ~(ended & after["hit"][:, 0])
+        untouched &= ~(ended & after["hit"][:, 0])
+        avoided &= ~(ended & (after["balls_avoided"].sum(-1) < ball))
         age[ended] = number
         running &= ~ended
-    return avoided, age
+    return untouched, untouched & avoided, age
 
 
 def _task(env: TransformedEnv) -> DodgeballEnv:

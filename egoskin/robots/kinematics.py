@@ -206,23 +206,27 @@ class LinkKinematics:
         """Return the tables in the dtype and on the device of joint positions."""
         kind = joint_pos.dtype, joint_pos.device
         if kind not in self._constants:
-
-            def index(x: np.ndarray) -> Tensor:
-                return torch.from_numpy(x).to(joint_pos.device)
-
-            self._constants[kind] = _Constants(
-                # Steps without a joint use the 0 appended to the joint positions.
-                joint=index(self.steps.joint % (self.num_joints + 1)),
-                matrices=[
-                    torch.from_numpy(x)[..., None].to(joint_pos) for x in self.steps[2:]
-                ],
-                unit=torch.eye(3, dtype=joint_pos.dtype, device=joint_pos.device)[
-                    ..., None
-                ],
-                levels=[(index(x), index(self.steps.parent[x])) for x in self._levels],
-                wanted=index(self.frames),
-            )
+            # They are kept for later calls, which may need gradients.
+            with torch.inference_mode(False):
+                self._constants[kind] = self._constants_of(*kind)
         return self._constants[kind]
+
+    def _constants_of(self, dtype: torch.dtype, device: torch.device) -> _Constants:
+        """Return the tables as tensors."""
+
+        def index(x: np.ndarray) -> Tensor:
+            return torch.from_numpy(x).to(device)
+
+        return _Constants(
+            # Steps without a joint use the 0 appended to the joint positions.
+            joint=index(self.steps.joint % (self.num_joints + 1)),
+            matrices=[
+                torch.from_numpy(x)[..., None].to(device, dtype) for x in self.steps[2:]
+            ],
+            unit=torch.eye(3, dtype=dtype, device=device)[..., None],
+            levels=[(index(x), index(self.steps.parent[x])) for x in self._levels],
+            wanted=index(self.frames),
+        )
 
 
 def _frames(chain: pk.Chain) -> list[tuple[pk.Frame, int]]:

@@ -14,8 +14,9 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterable, Sequence
+from copy import copy
 from numbers import Real
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 import pytorch_kinematics as pk
@@ -33,6 +34,9 @@ from egoskin.sensors.skin.coverage import Coverage
 from egoskin.sensors.skin.skin import Indices, Skin, indices
 from egoskin.shapes import Solid, Sphere
 from egoskin.transform import RowTransform
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 # Margin for rounding when rows are culled [m].
 _SLACK = 1e-3
@@ -233,7 +237,7 @@ class ProximitySensor(RowTransform):
             "link": self._link.numpy(),
             "offset": self._offset[..., 0].t().numpy(),
             "axes": self._axes[..., 0].permute(2, 0, 1).numpy(),
-            "range": self._range.numpy(),
+            "range": self._range.numpy().copy(),
             "farthest": self._farthest.numpy(),
         }
         self._kernels = Kernels(kind, self._kinematics, balls, {**own, **constants})
@@ -251,8 +255,23 @@ class ProximitySensor(RowTransform):
         self._range.copy_(self._skin_range)
         # No distance is within a negative range.
         self._range[sensors] = -1.0
+        self._tell_ranges()
+
+    def _tell_ranges(self) -> None:
+        """Give the ranges, with masks, to the kernels."""
         if self._kernels is not None:
-            self._kernels.set_constants(range=self._range.cpu().numpy())
+            self._kernels.set_constants(range=self._range.cpu().numpy().copy())
+
+    def clone(self) -> Self:
+        """Return a copy for another environment, with a mask of its own."""
+        new = super().clone()
+        new._kernels = copy(self._kernels)
+        return new
+
+    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
+        super()._load_from_state_dict(*args, **kwargs)
+        # It may hold another mask.
+        self._tell_ranges()
 
     @property
     def ranges(self) -> Tensor:

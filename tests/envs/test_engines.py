@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from importlib.util import find_spec
+from pathlib import Path
 
 import pytest
 import torch
@@ -11,6 +12,7 @@ import torch
 from calling import call
 from egoskin.agents.ppo import PPO, PPOConfig
 from egoskin.agents.rollout import collect
+from egoskin.commands.evaluate import EvaluateConfig
 from egoskin.envs.physics import engine_of
 from egoskin.envs.physics.mujoco import MujocoPhysics
 from egoskin.envs.randomization import RandomizationConfig
@@ -111,6 +113,8 @@ def test_engines_say_what_they_cannot():
     with pytest.raises(ValueError, match="engine warp simulates all agents in one"):
         TrainConfig(engine="warp", num_workers=2)
     TrainConfig(engine="warp", num_workers=1)
+    with pytest.raises(ValueError, match="engine warp simulates in one process"):
+        EvaluateConfig(policy=Path("blind"), engine="warp", num_workers=2)
     env = make_worker_env(EnvConfig(), num_envs=1, seed=0, device="meta")
     with pytest.raises(ValueError, match="engine mujoco simulates on the CPU"):
         env.base_env.check_scene()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -101,7 +102,7 @@ def test_the_second_ball_comes_at_a_robot_that_has_dodged_the_first(policy: Poli
     empty = torch.zeros(len(start.throw), 0, len(config.robot_config.joints))
     env = make(policy, config, len(start.throw))
     env.reset()
-    avoided, _ = _play(env, policy, start, empty, steps=75)
+    _, avoided, _ = _play(env, policy, start, empty, steps=75, ball=2)
     assert torch.equal(avoided, ~second)
     assert 0 < int(second.sum()) < len(second)
 
@@ -129,10 +130,10 @@ def test_a_search_finds_more_than_the_policy_does_and_loses_nothing(bound: Upper
 def test_a_search_gets_far_from_the_policys_plan(
     policy: Policy, monkeypatch: pytest.MonkeyPatch
 ):
-    def play(env, policy, start, plan, steps) -> tuple[torch.Tensor, torch.Tensor]:
+    def play(env, policy, start, plan, steps, ball) -> tuple[torch.Tensor, ...]:
         # As if one joint had to move at once, by far more than the first plans do.
         age = steps - (10 * (plan[:, 0, 0] - 4).abs()).long()
-        return age > 0, age
+        return age > 0, age > 0, age
 
     monkeypatch.setattr(upper_bound, "_play", play)
     search = SearchConfig(samples=64)
@@ -147,11 +148,24 @@ def test_the_step_of_a_hit_is_not_survived(policy: Policy):
     env = make(policy, config, THROWS)
     start = _until_in_reach(env, policy, config, reach=2.0)
     empty = torch.zeros(THROWS, 0, len(config.robot_config.joints))
-    avoided, survived = _play(env, policy, start, empty, steps=60)
-    row = int((~avoided).nonzero()[0])
+    untouched, _, survived = _play(env, policy, start, empty, steps=60, ball=1)
+    row = int((~untouched).nonzero()[0])
     steps = int(survived[row])
-    assert _play(env, policy, start, empty, steps)[0][row]
-    assert not _play(env, policy, start, empty, steps + 1)[0][row]
+    assert _play(env, policy, start, empty, steps, ball=1)[0][row]
+    assert not _play(env, policy, start, empty, steps + 1, ball=1)[0][row]
+
+
+def test_a_ball_that_comes_after_a_fall_does_not_count_as_avoided(policy: Policy):
+    config = task(policy)
+    # It arrives after 1.9 s at the earliest.
+    throws = replace(config.task.throws, speed=(2.0, 2.1))
+    config = replace(config, task=replace(config.task, throws=throws))
+    env = make(policy, config, THROWS)
+    start = _until_in_reach(env, policy, config, reach=math.inf)
+    plan = torch.full((len(start.throw), 60, len(config.robot_config.joints)), 3.0)
+    untouched, avoided, survived = _play(env, policy, start, plan, steps=90, ball=1)
+    assert (untouched & (survived < 90)).all()
+    assert not avoided.any()
 
 
 def test_a_search_ends_when_nothing_is_left_to_improve(policy: Policy):

@@ -104,6 +104,20 @@ def test_gradients_are_those_of_finite_differences(skin, random_state, kind, sha
     assert all(x.grad is not None and x.grad.isfinite().all() for x in poses)
 
 
+@pytest.mark.parametrize("kind", [FieldSensor, RaySensor])
+def test_a_sensor_used_in_inference_mode_has_gradients_later(skin, random_state, kind):
+    sensor = kind(skin, H1_2.chain, Sphere(radius=0.15), 5.0, compile=False)
+    state = random_state(8, objects=1)
+    with torch.inference_mode():
+        sensor.compute(*(state[key] for key in KEYS))
+    inputs = [state[key].clone() for key in KEYS]
+    inputs[1].requires_grad_()
+    distance = sensor.compute(*inputs)[0]
+    distance[distance.isfinite()].sum().backward()
+    assert inputs[1].grad is not None
+    assert inputs[1].grad.any()
+
+
 @pytest.mark.parametrize(
     ("key", "change", "message"),
     [

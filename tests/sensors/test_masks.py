@@ -164,6 +164,38 @@ def test_a_copied_sensor_keeps_its_mask(random_state):
     assert_same_bits(measure(copy.deepcopy(sensor), state), measure(sensor, state))
 
 
+@COMPILED
+@pytest.mark.parametrize("kind", [FieldSensor, RaySensor])
+def test_a_clone_has_its_own_mask(kind, compiled, random_state, monkeypatch):
+    monkeypatch.setenv(SETTING, "1")
+    sensor = kind(SKIN, H1_2.chain, BALLS, 5.0, compile=compiled)
+    state = random_state(16)
+    before = measure(sensor, state)
+    clone = sensor.clone()
+    clone.mask(range(24))
+    assert torch.isinf(measure(clone, state)[0]).all()
+    assert_same_bits(measure(sensor, state), before)
+    sensor.mask([0, 1])
+    clone.mask([])
+    assert_same_bits(measure(clone, state), before)
+    # A clone begins with the mask of its original.
+    assert_same_bits(measure(sensor.clone(), state), measure(sensor, state))
+
+
+@COMPILED
+def test_a_loaded_state_dict_brings_its_mask(compiled, random_state, monkeypatch):
+    monkeypatch.setenv(SETTING, "1")
+    masked, plain = (
+        FieldSensor(SKIN, H1_2.chain, BALLS, 5.0, compile=compiled) for _ in range(2)
+    )
+    masked.mask([0, 1])
+    state = random_state(16)
+    without_mask = measure(plain, state)
+    plain.load_state_dict(masked.state_dict())
+    assert_same_bits(measure(plain, state), measure(masked, state))
+    assert not torch.equal(measure(plain, state)[0], without_mask[0])
+
+
 def test_a_mask_may_be_a_tensor_or_flags(random_state):
     sensor = FieldSensor(SKIN, H1_2.chain, BALLS, 5.0)
     sensor.mask([0, 2])

@@ -222,6 +222,24 @@ def test_the_state_travels_to_processes_and_back(side):
 
 
 @every_transform
+def test_a_clone_of_a_used_transform_starts_anew_with_any_number_of_rows(build):
+    used = make(build, 4)
+    run(used)
+    for rows in (1, 4, 8):
+        env = TransformedEnv(ScriptedEnv(rows), used.transform.clone())
+        keys = used.transform.out_keys
+        assert_same_bits(run(env), run(make(build, rows)), keys)
+
+
+def test_a_new_seed_for_a_clone_is_its_own():
+    build = BUILDERS["corruption"]
+    transform = build()
+    transform.clone().restart(seed=7)
+    env = TransformedEnv(ScriptedEnv(4), transform)
+    assert_same_bits(run(env), run(make(build, 4)), transform.out_keys)
+
+
+@every_transform
 def test_environment_keeps_its_specs(build):
     env = make(build, 3)
     check_env_specs(env)

@@ -393,7 +393,8 @@ class Corruption(StatefulTransform):
         """
         if seed is not None:
             stream_key(seed, Stream.SENSOR)
-            self._settings["seed"] = seed
+            # Not in place: clones share the dictionary.
+            self._settings = {**self._settings, "seed": seed}
         self._last = None
 
     def mask(self, sensors: Indices) -> None:

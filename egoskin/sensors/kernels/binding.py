@@ -112,7 +112,8 @@ class Kernels:
         Args:
             constants: As in the class.
         """
-        self._constants.update(constants)
+        # Not in place: copies share the dictionary.
+        self._constants = {**self._constants, **constants}
         self._tables = None
         self._warp.clear()
 
