@@ -374,6 +374,41 @@ def test_a_dragged_slider_is_applied_once_with_its_last_value(page: Page, monkey
     page.load(0, "field_proximity")
 
 
+def test_numbers_typed_beyond_a_sliders_limits_are_clamped(page: Page, monkeypatch):
+    session, panel = page.sessions[0], page.panel
+    # What the box sends while "0.5" is typed.
+    for slider in (panel.speed, panel.height, panel.slowdown):
+        monkeypatch.setattr(slider._impl, "value", 0)
+    page._show()
+    page.throw_from(0.0)
+    page.play()
+    start = page.sessions[0].frame.balls[0]
+    page.play()
+    speed = np.linalg.norm(session.frame.balls[0] - start) * page.hz
+    assert (speed, start[2]) == pytest.approx((1.0, 0.3), abs=1e-3)
+    # At most once a second.
+    panel.tempo.value = 600
+    throws = session.task.balls.state["throw"]
+    before = int(throws)
+    for _ in range(57):
+        page.play()
+    assert int(throws) == before
+
+
+def test_a_range_is_ignored_while_it_is_typed(page: Page):
+    slider, before = page.panel._range, page.sessions[0].config.sensor
+    for typed in (0.0, 50.0):
+        slider.value = typed
+        page._do(lambda: page.sense("range"))
+        assert not page.error
+        assert slider.value == typed
+        assert page.sessions[0].config.sensor == before
+    slider.value = 0.5
+    page._do(lambda: page.sense("range"))
+    assert page.sessions[0].config.sensor.range == 0.5
+    page.load(0, "field_proximity")
+
+
 def test_a_setting_changes_both_robots_or_none(pair: Page):
     one, other = pair.sessions
     before = [session.config.sensor for session in pair.sessions]

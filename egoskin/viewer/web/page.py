@@ -20,7 +20,7 @@ import viser
 from egoskin.policies.policy import CHECKPOINT_NAME, policy_file, shipped_policies
 from egoskin.viewer.web.panel import EPISODES, MEMORY, Panel, Wishes
 from egoskin.viewer.web.scene import RobotScene, set_stage
-from egoskin.viewer.web.server import ServedPage
+from egoskin.viewer.web.server import ServedPage, slider_value
 from egoskin.viewer.web.session import Frame, Session, Throw
 
 _PAUSE_AFTER_END = 1.2
@@ -143,7 +143,7 @@ class Page(ServedPage):
                 continue
             late = time.monotonic() - due
             self._do(partial(self.advance, late > 1 / self.hz))
-            due += self.panel.slowdown.value / self.hz
+            due += slider_value(self.panel.slowdown) / self.hz
             if late > _TOO_LATE:
                 due = time.monotonic()
             # Handle requests until the next step is due, at least all queued so far.
@@ -186,7 +186,7 @@ class Page(ServedPage):
         """Compute one control step of all robots; if this fails, stop until a reset."""
         self._has_failed = True
         self._since_throw += 1
-        tempo = self.panel.tempo.value
+        tempo = slider_value(self.panel.tempo)
         ended = [session.frame.ending is not None for session in self.sessions]
         # Not while an end is shown, which a throw would cut short.
         if tempo and self._since_throw >= 60 * self.hz / tempo and not any(ended):
@@ -290,8 +290,8 @@ class Page(ServedPage):
                 azimuth=azimuth,
                 distance=distance,
                 target=target,
-                speed=self.panel.speed.value,
-                height=self.panel.height.value,
+                speed=slider_value(self.panel.speed),
+                height=slider_value(self.panel.height),
             )
         )
 
@@ -384,6 +384,8 @@ class Page(ServedPage):
             ValueError: If a policy cannot read such sensors.
         """
         changes = self.panel.sensor_changes(name)
+        if changes is None:
+            return
         wanted = []
         for session, scene in zip(self.sessions, self._scenes, strict=True):
             if session.skin is None:
@@ -428,7 +430,7 @@ class Page(ServedPage):
         now = time.monotonic()
         passed, done = now - self._panel_shown, self.steps - self._steps_shown
         self._panel_shown, self._steps_shown = now, self.steps
-        wanted = self.hz / self.panel.slowdown.value
+        wanted = self.hz / slider_value(self.panel.slowdown)
         is_slow = 0 < done < 0.9 * wanted * passed - 1
         self._speed = f"Slow: {done / passed:.0f} of {wanted:.0f} steps per second."
         if not is_slow:
