@@ -127,6 +127,30 @@ def test_a_click_on_the_floor_throws_from_there(page: Page):
     np.testing.assert_allclose(page.sessions[0].frame.balls[0, :2], [2, -3], atol=0.02)
 
 
+@pytest.mark.parametrize(
+    ("origin", "way", "place"),
+    [
+        ((2.0, -3.0, 2.0), (0.0, 0.0, -1.0), (2.0, -3.0)),
+        # On the robot: from the visitor's side, in the middle of the task's distances.
+        ((8.0, 1.0, 1.0), (-1.0, 0.0, 0.0), (4.96, 0.62)),
+    ],
+)
+def test_a_click_after_an_end_throws_from_the_clicked_side(
+    page: Page, origin: tuple, way: tuple, place: tuple
+):
+    session = page.sessions[0]
+    moved = session.frame.qpos.copy()
+    moved[:2] = 1.0
+    # Turned by 90 degrees.
+    moved[3:7] = np.sqrt((0.5, 0, 0, 0.5))
+    session.frame = dataclasses.replace(session.frame, qpos=moved, ending="fall")
+    page._shown = [session.frame]
+    page.click(np.array(origin), np.array(way))
+    page.play()
+    ball = session.frame.balls[session.frame.active][0, :2]
+    np.testing.assert_allclose(ball, place, atol=0.05)
+
+
 def test_a_click_on_the_robot_throws_at_it(page: Page):
     # At the chest, between sensors or not: the click hits the body here.
     page.sessions[0].mask(set())

@@ -261,11 +261,16 @@ class Page(ServedPage):
         """Throw one ball at each robot."""
         self._since_throw = 0
         self._replayed.clear()
+        # A reset would discard the throw.
+        self._begin_episodes()
         for session in self.sessions:
-            # A reset would discard the throw.
+            session.throw(throw)
+
+    def _begin_episodes(self) -> None:
+        """Reset the robots whose episode has ended."""
+        for session in self.sessions:
             if session.frame.ending is not None:
                 session.reset()
-            session.throw(throw)
 
     def throw_from(self, bearing: float | None) -> None:
         """Throw a ball with the speed and height of the sliders.
@@ -324,11 +329,14 @@ class Page(ServedPage):
             session, local = self.sessions[i], origins[i]
             target = session.target_near(local + nearest * direction)
             distance = float(np.mean(session.distances))
+            # The throw is relative to the pose in which it begins.
+            self._begin_episodes()
             self._throw(session.azimuth_of(local), distance, target)
         elif direction[2] < 0:
             floor = [o - o[2] / direction[2] * direction for o in origins]
             i = int(np.argmin(np.linalg.norm(floor, axis=-1)))
             session, point = self.sessions[i], floor[i]
+            self._begin_episodes()
             self._throw(session.azimuth_of(point), session.distance_of(point))
 
     def mask(self, i: int, sensors: Collection[int]) -> None:
