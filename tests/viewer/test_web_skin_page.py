@@ -183,6 +183,23 @@ def test_a_robot_of_ones_own_that_stands_fixed_is_shown(tmp_path):
         page.close()
 
 
+def test_a_robot_whose_shapes_are_all_left_out_is_shown(tmp_path):
+    path = tmp_path / "arm.urdf"
+    mesh = "<collision><geometry><mesh filename='no.stl'/></geometry></collision>"
+    path.write_text(
+        f"<robot name='arm'><link name='base'>{mesh}</link><link name='upper'>{mesh}"
+        "</link><joint name='lift' type='revolute'><parent link='base'/>"
+        "<child link='upper'/><origin xyz='0 0 0.4'/><axis xyz='0 1 0'/>"
+        "<limit lower='-1' upper='1' effort='1' velocity='1'/></joint></robot>"
+    )
+    page = SkinPage(read_robot(path), None)
+    try:
+        low, high = page.body.bounds()
+        assert 0.4 < high[2] - low[2] < 0.6
+    finally:
+        page.close()
+
+
 @pytest.mark.parametrize(
     ("args", "text"),
     [
