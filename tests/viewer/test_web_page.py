@@ -748,3 +748,20 @@ def test_all_robots_are_seen_beside_the_panel(page: Page, width: int, height: in
         assert 0 < y < height
         # On a narrow screen the panel is collapsed.
         assert 0 < x < (width - 340 if width > 600 else width)
+
+
+@pytest.mark.parametrize("density", [1, 2, 3])
+@pytest.mark.parametrize(("width", "height"), [(1440, 900), (1000, 800), (800, 900)])
+def test_two_robots_are_seen_beside_the_panel_on_a_dense_screen(
+    pair: Page, width: int, height: int, density: int
+):
+    camera = pair.server.initial_camera
+    pair._look(camera, (width * density, height * density))
+    forward = np.array(camera.look_at) - camera.position
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0, 0, 1])
+    right /= np.linalg.norm(right)
+    for side in (-1.7, 1.7):
+        way = np.array([0, side, 1.0]) - camera.position
+        scale = height / 2 / np.tan(camera.fov / 2) / (way @ forward)
+        assert 0 < width / 2 + scale * (way @ right) < width - 340

@@ -37,7 +37,7 @@ _FIELD_OF_VIEW = 0.75
 _HALF_WIDTH, _HALF_HEIGHT = 1.2, 1.75
 """Visible space beside the outer robots, and above and below their middle [m]."""
 _PANEL_WIDTH, _USUAL_SIZE = 340, (1440, 900)
-"""Width of the panel, and size of a usual window [px]."""
+"""Width of the panel, and size of a usual window [CSS px]."""
 _PICK_RADIUS = 0.035
 """A click this close to a sensor selects it [m]."""
 
@@ -229,10 +229,13 @@ class Page(ServedPage):
 
         Args:
             camera: The camera.
-            size: Width and height of its view [px].
+            size: Width and height of its view [device px].
         """
         width, height = size
-        free = max(1 - _PANEL_WIDTH / width, 0.4)
+        # The panel is as wide in CSS pixels, of which a view has fewer on a dense
+        # screen. Their number is not known: assume no higher window than a usual one.
+        density = max(height / _USUAL_SIZE[1], 1.0)
+        free = max(1 - _PANEL_WIDTH * density / width, 0.4)
         half = _HALF_WIDTH + _SPACING * (len(self.sessions) - 1) / 2
         # Half the visible height at a distance of 1 m [m].
         slope = math.tan(_FIELD_OF_VIEW / 2)
