@@ -134,7 +134,7 @@ def main(args: list[str]) -> None:
     painter = painter_of(env_config, skin, size=config.size, camera=config.camera)
     line = StatusLine(f"playing {counted(config.longest_of, 'episode')}")
     with painter:
-        recordings = record_episodes(
+        (recording,) = record_episodes(
             env_config,
             skin,
             policy,
@@ -142,11 +142,11 @@ def main(args: list[str]) -> None:
             first=config.episode,
             episodes=config.longest_of,
             hold=config.hold,
+            longest=True,
             on_step=lambda step, running: line.show(
                 f"{step / hz:.2f} s played, {running} still running"
             ),
         )
-        recording = max(recordings, key=lambda recording: len(recording.states))
         frames = render_recording(
             painter,
             env_config,
