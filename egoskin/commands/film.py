@@ -45,6 +45,10 @@ from egoskin.viewer.film import (
 from egoskin.viewer.offscreen import CameraConfig, painter_of
 from egoskin.viewer.recording import check_film, record_episodes, render_recording
 
+# Browsers show a picture of a GIF for 100 ms if its delay, whole centiseconds, is
+# below 20 ms.
+_GIF_FPS = 50.0
+
 
 @dataclass(frozen=True, kw_only=True)
 class RenderConfig:
@@ -70,7 +74,8 @@ class RenderConfig:
     seconds: float | None = None
     """Stop at this age at the latest [s]; None: the whole episode."""
     fps: float = 30.0
-    """Frames per second of the episode, at most the control rate."""
+    """Frames per second of the episode, at most the control rate; in a .gif, at most
+    50 per second played."""
     slowdown: Annotated[float, Interval(gt=0, le=100)] = 1.0
     """The film plays this many times slower than real time."""
     size: tuple[int, int] = (960, 540)
@@ -88,6 +93,13 @@ class RenderConfig:
         check_output(self.sheet_path, "--sheet", (".png",))
         check_seed(self.throw_set, "throw_set")
         check_bounds(self)
+        played = self.fps / self.slowdown
+        if self.out.suffix.lower() == ".gif" and played > _GIF_FPS:
+            raise ValueError(
+                f"browsers play a GIF with at most {_GIF_FPS:g} pictures per second, "
+                f"got {played:g} (--fps divided by --slowdown): lower --fps, or write "
+                "an .mp4"
+            )
         if self.policy is not None and self.env != EnvConfig():
             raise ValueError(
                 "a policy brings its own robot, task, skin and sensors: leave their "
@@ -122,7 +134,7 @@ def main(args: list[str]) -> None:
     painter = painter_of(env_config, skin, size=config.size, camera=config.camera)
     line = StatusLine(f"playing {counted(config.longest_of, 'episode')}")
     with painter:
-        recordings = record_episodes(
+        (recording,) = record_episodes(
             env_config,
             skin,
             policy,
@@ -130,11 +142,11 @@ def main(args: list[str]) -> None:
             first=config.episode,
             episodes=config.longest_of,
             hold=config.hold,
+            longest=True,
             on_step=lambda step, running: line.show(
                 f"{step / hz:.2f} s played, {running} still running"
             ),
         )
-        recording = max(recordings, key=lambda recording: len(recording.states))
         frames = render_recording(
             painter,
             env_config,

@@ -5,10 +5,13 @@ from __future__ import annotations
 import io
 import math
 import os
-from collections.abc import Sequence
-from contextlib import closing
+import subprocess
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
+from threading import Thread
 
 import imageio_ffmpeg
 import numpy as np
@@ -23,6 +26,10 @@ _GIF_PALETTE = (
     "[0:v]split[a][b];[a]palettegen=stats_mode=diff[p];[b][p]paletteuse=dither=bayer"
     ":bayer_scale=4:diff_mode=rectangle"
 )
+_GIF = ("-c:v", "gif", "-pix_fmt", "pal8", "-filter_complex", _GIF_PALETTE)
+# H.264 needs an even width and height.
+_EVEN = "scale=ceil(iw/2)*2:ceil(ih/2)*2"
+_MP4 = ("-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "10", "-vf", _EVEN)
 FILM_SUFFIXES = (".mp4", ".gif")
 """Supported suffixes of film files."""
 
@@ -156,38 +163,64 @@ def save_film(path: Path, frames: Sequence[Frame], fps: float) -> None:
 
     Raises:
         ValueError: If the suffix is wrong, or the folder does not exist.
+        OSError: If the film cannot be written, as on a full disk.
     """
     check_output(path, "path", FILM_SUFFIXES)
-    if path.suffix.lower() == ".gif":
-        options = {
-            "codec": "gif",
-            "pix_fmt_out": "pal8",
-            "quality": None,
-            "output_params": ["-filter_complex", _GIF_PALETTE],
-        }
-    else:
-        options = {"codec": "libx264", "quality": 8}
-    height, width = frames[0].image.shape[:2]
     part = path.with_name(f".{path.stem}.part{path.suffix}")
-    writer = imageio_ffmpeg.write_frames(
-        part,
-        (width, height),
-        fps=fps,  # pyright: ignore[reportArgumentType] - ffmpeg takes fractions
-        macro_block_size=2,
-        ffmpeg_log_level="error",
-        **options,
-    )
     try:
-        with closing(writer):
-            # Start the generator; it accepts pictures from its first yield on.
-            writer.send(None)
-            for frame in frames:
-                writer.send(annotate(frame).tobytes())
-            for _ in range(round(_LAST_PICTURE * fps)):
-                writer.send(annotate(frames[-1]).tobytes())
+        failure = _encode(part, frames, fps)
+        if failure:
+            raise OSError(f"{path}: ffmpeg could not write the film: {failure}")
         os.replace(part, path)
     finally:
         part.unlink(missing_ok=True)
+
+
+def _encode(path: Path, frames: Sequence[Frame], fps: float) -> str:
+    """Write a film and return why ffmpeg failed, or ""."""
+    height, width = frames[0].image.shape[:2]
+    # Not by imageio_ffmpeg.write_frames, which ignores ffmpeg's exit status.
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error"]
+    command += ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
+    command += ["-r", str(Fraction(fps).limit_denominator()), "-i", "-"]
+    command += [*(_GIF if path.suffix.lower() == ".gif" else _MP4), str(path)]
+    errors: list[bytes] = []
+    with subprocess.Popen(
+        command,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        # Ctrl-C is for this process alone.
+        start_new_session=True,
+    ) as ffmpeg:
+        assert ffmpeg.stdin is not None
+        assert ffmpeg.stderr is not None
+        # Read meanwhile: ffmpeg waits if the pipe of its errors is full.
+        reader = Thread(target=lambda pipe: errors.extend(pipe), args=(ffmpeg.stderr,))
+        reader.start()
+        try:
+            # If it ends early, its exit status says so.
+            with suppress(BrokenPipeError), ffmpeg.stdin as pipe:
+                for picture in _pictures(frames, fps):
+                    pipe.write(picture.tobytes())
+        except BaseException:
+            ffmpeg.kill()
+            raise
+        finally:
+            reader.join()
+        status = ffmpeg.wait()
+    if status == 0:
+        return ""
+    # Its last line, without the part of ffmpeg that it comes from.
+    last = errors[-1].decode(errors="replace").strip() if errors else ""
+    return last.rpartition("] ")[2] or f"exit status {status}"
+
+
+def _pictures(frames: Sequence[Frame], fps: float) -> Iterator[np.ndarray]:
+    """Yield the annotated pictures of a film; the last one is held."""
+    yield from map(annotate, frames)
+    for _ in range(round(_LAST_PICTURE * fps)):
+        yield annotate(frames[-1])
 
 
 def save_picture(path: Path, image: np.ndarray) -> None:

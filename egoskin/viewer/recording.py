@@ -16,6 +16,10 @@ from egoskin.sensors import Skin
 from egoskin.viewer.film import Frame
 from egoskin.viewer.offscreen import Painter
 
+_READ = ("base_pose", "joint_pos", "object_pose", "object_active", "balls_avoided")
+_ENDS = ("truncated", "hit", "fallen", "diverged", "terminated")
+"""Keys that a film and `ending_of` read, besides the distances."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Recording:
@@ -24,7 +28,7 @@ class Recording:
     row: int
     """Row of the episode in its throw set."""
     states: list[TensorDictBase]
-    """State after each control step, the start first, raw keys kept."""
+    """State after each control step, the start first."""
     ending: str | None
     """Why the episode ended ("hit", "fall", "time limit", ...)."""
 
@@ -38,6 +42,7 @@ def record_episodes(
     first: int = 0,
     episodes: int = 1,
     hold: bool = False,
+    longest: bool = False,
     on_step: Callable[[int, int], None] | None = None,
 ) -> list[Recording]:
     """Return recordings of some episodes of a throw set.
@@ -54,17 +59,37 @@ def record_episodes(
         first: Row of the first episode.
         episodes: Number of episodes.
         hold: Whether the robot is held rigid in its default pose.
+        longest: Whether to return only the longest episode (the first of several), with
+            only the keys that `render_recording` reads; this needs far less memory.
         on_step: Called with (steps done, episodes still running).
     """
-    states: list[list[TensorDictBase]] = [[] for _ in range(episodes)]
+    keys: list[str] | None = None
+    if longest:
+        distances = (f"distance{g.suffix}" for g in config.pipeline(skin).groups)
+        keys = [*_READ, *_ENDS, *distances]
+    # Episodes that are recorded, and their states after each step: in one tensordict,
+    # as those of single states need more memory than their content.
+    kept, history = torch.arange(episodes), list[TensorDictBase]()
+    last_step = torch.zeros(episodes, dtype=torch.int64)
+
+    def add(state: TensorDictBase) -> None:
+        history.append((state if keys is None else state.select(*keys))[kept])
 
     def watch(
         before: TensorDictBase, after: TensorDictBase, running: torch.Tensor
     ) -> None:
-        for i in running.nonzero()[:, 0].tolist():
-            if not states[i]:
-                states[i].append(before[i].clone())
-            states[i].append(after[i].clone())
+        nonlocal kept
+        if not history:
+            add(before)
+        last_step[running] += 1
+        left = running[kept]
+        # Episodes that still run are longer than those that have ended. Not dropped one
+        # by one, which would copy all states each time.
+        if longest and 2 * int(left.sum()) <= len(kept):
+            kept = kept[left]
+            for step, states in enumerate(history):
+                history[step] = states[left]
+        add(after)
 
     play_throws(
         policy,
@@ -77,10 +102,16 @@ def record_episodes(
         on_step=on_step,
         watch=watch,
     )
-    return [
-        Recording(row=first + i, states=seen, ending=ending_of(seen[-1]))
-        for i, seen in enumerate(states)
-    ]
+    wanted = range(episodes)
+    if longest:
+        wanted = [int(last_step.argmax())]
+    recordings = []
+    for i in wanted:
+        (place,) = (kept == i).nonzero()[:, 0].tolist()
+        states = [state[place] for state in history[: int(last_step[i]) + 1]]
+        ending = ending_of(states[-1])
+        recordings.append(Recording(row=first + i, states=states, ending=ending))
+    return recordings
 
 
 def render_recording(

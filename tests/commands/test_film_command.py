@@ -68,6 +68,7 @@ def test_a_film_is_of_the_longest_of_the_episodes_that_are_evaluated(
         (["--episode", "-1"], "episode must not be negative"),
         (["--longest-of", "0"], "longest_of must be at least 1"),
         (["--fps", "61"], "fps must be in"),
+        (["--out", "a.gif", "--fps", "60"], "play a GIF with at most 50 pictures"),
         (["--standard", "3"], "--standard"),
         (["nothing.safetensors"], "nothing.safetensors"),
         (["--standard", "1"], "--standard needs a policy"),
@@ -80,6 +81,13 @@ def test_bad_input_is_an_error_and_writes_nothing(
     monkeypatch.chdir(tmp_path)
     assert text in fail("film", *args)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_slow_gif_and_a_fast_mp4_are_no_errors():
+    from egoskin.commands.film import RenderConfig
+
+    RenderConfig(out=Path("a.gif"), fps=60, slowdown=1.2)
+    RenderConfig(out=Path("a.mp4"), fps=60)
 
 
 @pytest.mark.parametrize(

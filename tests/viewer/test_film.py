@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import multiprocessing
 from pathlib import Path
 
 import imageio_ffmpeg
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from calling import limit_file_size
 from egoskin.viewer.film import (
     Frame,
     annotate,
@@ -144,3 +146,49 @@ def test_a_film_that_fails_leaves_the_old_file_and_nothing_else(tmp_path: Path):
         save_film(path, [frame(), broken], fps=10)
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def save_on_a_full_disk(paths: list[Path]) -> None:
+    limit_file_size(400)
+    for path in paths:
+        text = f"{path.name}: ffmpeg could not write the film"
+        with pytest.raises(OSError, match=text):
+            save_film(path, approach(20, closest=2), fps=10)
+
+
+def test_a_film_on_a_full_disk_is_an_error_and_the_old_file_stays(tmp_path: Path):
+    paths = [tmp_path / "film.gif", tmp_path / "film.mp4"]
+    for path in paths:
+        path.write_text("old")
+    # In another process: the limit is for the whole process.
+    spawn = multiprocessing.get_context("spawn")
+    child = spawn.Process(target=save_on_a_full_disk, args=(paths,))
+    child.start()
+    child.join(120)
+    assert child.exitcode == 0
+    assert [path.read_text() for path in paths] == ["old", "old"]
+    assert sorted(tmp_path.iterdir()) == paths
+
+
+@pytest.mark.parametrize(
+    ("script", "text"),
+    [
+        ("exit 3", "exit status 3"),
+        ("cat > /dev/null; kill -9 $$", "exit status -9"),
+        # Many errors, the last from a part of ffmpeg.
+        (
+            "yes | head -n 50000 >&2; echo '[mp4 @ 0x1] No space' >&2; exit 1",
+            "No space",
+        ),
+    ],
+)
+def test_a_film_fails_with_the_reason_of_ffmpeg(
+    script: str, text: str, tmp_path: Path, monkeypatch
+):
+    ffmpeg, path = tmp_path / "ffmpeg", tmp_path / "film.mp4"
+    ffmpeg.write_text(f"#!/bin/sh\n{script}\n")
+    ffmpeg.chmod(0o700)
+    monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", lambda: str(ffmpeg))
+    with pytest.raises(OSError, match=f"could not write the film: {text}$"):
+        save_film(path, approach(20, closest=2), fps=10)
+    assert list(tmp_path.iterdir()) == [ffmpeg]

@@ -265,6 +265,41 @@ def test_recordings_are_of_the_rows_of_the_throw_set(skin: Skin):
         td = env.step(td)["next"]
 
 
+@pytest.mark.parametrize("coverage", ["field", "none"])
+def test_the_longest_episode_is_recorded_in_little_memory(coverage, skin: Skin):
+    config = EnvConfig(task=TASK, sensor=SensorConfig(coverage=coverage))
+    which = {"throw_set": 3, "first": 2, "episodes": 8, "hold": True}
+    every = record_episodes(config, skin, None, **which)
+    longest = max(every, key=lambda recording: len(recording.states))
+    (alone,) = record_episodes(config, skin, None, **which, longest=True)
+    assert (alone.row, alone.ending) == (longest.row, longest.ending)
+    for state, expected in zip(alone.states, longest.states, strict=True):
+        assert all(torch.equal(state[key], expected[key]) for key in state.keys())
+    # Without most other episodes and keys.
+    (state, *_) = alone.states
+    rows = state["base_pose"].untyped_storage().nbytes() // (7 * 4)
+    assert rows <= 2
+    assert "observation" not in state.keys()
+
+
+def test_of_equally_long_episodes_the_first_is_recorded(skin: Skin, monkeypatch):
+    state = TensorDict({"hit": torch.zeros(6, 1, dtype=torch.bool)}, [6])
+    keys = ("base_pose", "joint_pos", "object_pose", "object_active", "distance")
+    flags = ("balls_avoided", "truncated", "fallen", "diverged", "terminated")
+    for key in (*keys, *flags):
+        state[key] = torch.zeros(6, 1)
+    state["base_pose"] = torch.arange(6)[:, None]
+
+    def play(*args, watch, **kwargs) -> None:
+        for running in ([1, 1, 1, 1, 1, 1], [1, 0, 1, 0, 1, 1], [0, 0, 1, 0, 0, 1]):
+            watch(state, state, torch.tensor(running, dtype=torch.bool))
+
+    monkeypatch.setattr("egoskin.viewer.recording.play_throws", play)
+    (alone,) = record_episodes(EnvConfig(), skin, None, episodes=6, longest=True)
+    assert alone.row == 2
+    assert [int(state["base_pose"]) for state in alone.states] == [2] * 4
+
+
 @pytest.mark.parametrize(
     ("options", "text"),
     [

@@ -127,6 +127,30 @@ def test_a_click_on_the_floor_throws_from_there(page: Page):
     np.testing.assert_allclose(page.sessions[0].frame.balls[0, :2], [2, -3], atol=0.02)
 
 
+@pytest.mark.parametrize(
+    ("origin", "way", "place"),
+    [
+        ((2.0, -3.0, 2.0), (0.0, 0.0, -1.0), (2.0, -3.0)),
+        # On the robot: from the visitor's side, in the middle of the task's distances.
+        ((8.0, 1.0, 1.0), (-1.0, 0.0, 0.0), (4.96, 0.62)),
+    ],
+)
+def test_a_click_after_an_end_throws_from_the_clicked_side(
+    page: Page, origin: tuple, way: tuple, place: tuple
+):
+    session = page.sessions[0]
+    moved = session.frame.qpos.copy()
+    moved[:2] = 1.0
+    # Turned by 90 degrees.
+    moved[3:7] = np.sqrt((0.5, 0, 0, 0.5))
+    session.frame = dataclasses.replace(session.frame, qpos=moved, ending="fall")
+    page._shown = [session.frame]
+    page.click(np.array(origin), np.array(way))
+    page.play()
+    ball = session.frame.balls[session.frame.active][0, :2]
+    np.testing.assert_allclose(ball, place, atol=0.05)
+
+
 def test_a_click_on_the_robot_throws_at_it(page: Page):
     # At the chest, between sensors or not: the click hits the body here.
     page.sessions[0].mask(set())
@@ -371,6 +395,41 @@ def test_a_dragged_slider_is_applied_once_with_its_last_value(page: Page, monkey
     assert session.config.sensor.range == slider.value == 0.7
     # The meshes are not sent again.
     assert page._scenes[0] is scene
+    page.load(0, "field_proximity")
+
+
+def test_numbers_typed_beyond_a_sliders_limits_are_clamped(page: Page, monkeypatch):
+    session, panel = page.sessions[0], page.panel
+    # What the box sends while "0.5" is typed.
+    for slider in (panel.speed, panel.height, panel.slowdown):
+        monkeypatch.setattr(slider._impl, "value", 0)
+    page._show()
+    page.throw_from(0.0)
+    page.play()
+    start = page.sessions[0].frame.balls[0]
+    page.play()
+    speed = np.linalg.norm(session.frame.balls[0] - start) * page.hz
+    assert (speed, start[2]) == pytest.approx((1.0, 0.3), abs=1e-3)
+    # At most once a second.
+    panel.tempo.value = 600
+    throws = session.task.balls.state["throw"]
+    before = int(throws)
+    for _ in range(57):
+        page.play()
+    assert int(throws) == before
+
+
+def test_a_range_is_ignored_while_it_is_typed(page: Page):
+    slider, before = page.panel._range, page.sessions[0].config.sensor
+    for typed in (0.0, 50.0):
+        slider.value = typed
+        page._do(lambda: page.sense("range"))
+        assert not page.error
+        assert slider.value == typed
+        assert page.sessions[0].config.sensor == before
+    slider.value = 0.5
+    page._do(lambda: page.sense("range"))
+    assert page.sessions[0].config.sensor.range == 0.5
     page.load(0, "field_proximity")
 
 
@@ -689,3 +748,20 @@ def test_all_robots_are_seen_beside_the_panel(page: Page, width: int, height: in
         assert 0 < y < height
         # On a narrow screen the panel is collapsed.
         assert 0 < x < (width - 340 if width > 600 else width)
+
+
+@pytest.mark.parametrize("density", [1, 2, 3])
+@pytest.mark.parametrize(("width", "height"), [(1440, 900), (1000, 800), (800, 900)])
+def test_two_robots_are_seen_beside_the_panel_on_a_dense_screen(
+    pair: Page, width: int, height: int, density: int
+):
+    camera = pair.server.initial_camera
+    pair._look(camera, (width * density, height * density))
+    forward = np.array(camera.look_at) - camera.position
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0, 0, 1])
+    right /= np.linalg.norm(right)
+    for side in (-1.7, 1.7):
+        way = np.array([0, side, 1.0]) - camera.position
+        scale = height / 2 / np.tan(camera.fov / 2) / (way @ forward)
+        assert 0 < width / 2 + scale * (way @ right) < width - 340

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -68,6 +69,25 @@ def test_a_ball_is_thrown_at_the_point_nearest_to_a_place(session: Session):
     way = (end - start) / np.linalg.norm(end - start)
     beside = (hand - start) - (hand - start) @ way * way
     assert np.linalg.norm(beside) < 0.2
+
+
+def test_balls_at_a_box_are_thrown_at_all_of_it(session: Session, monkeypatch):
+    session.reset()
+    thrower = session._thrower
+    throws = dataclasses.replace(thrower.config, aim="box")
+    monkeypatch.setattr(thrower, "config", throws)
+
+    def target_of(number: float, throw: int) -> torch.Tensor:
+        thrower.wanted = Throw(target=number)
+        zero = torch.zeros(1, dtype=torch.int64)
+        return thrower.draw(0, zero, zero, zero + throw).target[0]
+
+    numbers = np.random.default_rng(0).uniform(size=200).tolist()
+    targets = torch.stack([target_of(number, 0) for number in numbers])
+    # In all parts of it.
+    assert len((4 * targets).long().unique(dim=0)) == 16
+    # Alike for another robot, whose episode began at another time.
+    assert torch.equal(targets[0], target_of(numbers[0], 3))
 
 
 def test_readings_are_what_the_policy_is_given(session: Session):
@@ -189,8 +209,6 @@ def test_only_sensors_that_the_policy_can_read_are_taken(session: Session):
     readings = np.stack([frame.reading for frame in play(session, 40)])
     assert set(np.unique(readings)) <= {0.0, 1.0}
     own = session.policy.env_config.sensor
-    import dataclasses
-
     with pytest.raises(ValueError, match="reads 64 numbers from its skin, but"):
         session.configure(dataclasses.replace(own, signal="localization"))
     assert session.config.sensor == sensor

@@ -18,6 +18,7 @@ from egoskin.robots.builtin import H1_2
 from egoskin.robots.config import read_robot
 from egoskin.viewer.web import skin_page
 from egoskin.viewer.web.skin_page import SkinPage, colour_directions, group_joints
+from visiting import Visitor
 
 
 @pytest.fixture(scope="module")
@@ -43,6 +44,30 @@ def test_a_joint_moves_the_links_below_it_alone(page: SkinPage):
     assert moved == ["left_wrist_roll_link"]
     page.reset()
     np.testing.assert_allclose(places()["left_wrist_roll_link"], before[moved[0]])
+
+
+def test_a_joint_stays_within_its_limits_while_a_position_is_typed(page: SkinPage):
+    slider = page._sliders[0]
+    visitor = Visitor(page.server.get_port())
+    try:
+        visitor.choose(slider, 99.0)
+        page._do(page._commands.get(timeout=20))
+    finally:
+        visitor.leave()
+    assert page.joint_pos[0] == slider.max
+    page.reset()
+
+
+def test_a_range_is_within_its_limits_while_it_is_typed(page: SkinPage, monkeypatch):
+    given = []
+    monkeypatch.setattr(
+        skin_page, "see_directions", lambda *args, **_: given.append(args)
+    )
+    monkeypatch.setattr(page, "show", lambda *_: page._end(""))
+    page._range.value = 0.0
+    look(page)
+    page._range.value = 0.5
+    assert [sensor.range for _, _, sensor, _ in given] == [0.1]
 
 
 def test_directions_are_shown_and_their_share_is_told(page: SkinPage):
@@ -154,6 +179,23 @@ def test_a_robot_of_ones_own_that_stands_fixed_is_shown(tmp_path):
         assert page.body.bounds()[1, 2] < top
         red = [p for p in page.body.parts() if p.rgba == (1, 0, 0, 1)]
         np.testing.assert_allclose(np.ptp(red[0].vertices[:, 2]), 0.4)
+    finally:
+        page.close()
+
+
+def test_a_robot_whose_shapes_are_all_left_out_is_shown(tmp_path):
+    path = tmp_path / "arm.urdf"
+    mesh = "<collision><geometry><mesh filename='no.stl'/></geometry></collision>"
+    path.write_text(
+        f"<robot name='arm'><link name='base'>{mesh}</link><link name='upper'>{mesh}"
+        "</link><joint name='lift' type='revolute'><parent link='base'/>"
+        "<child link='upper'/><origin xyz='0 0 0.4'/><axis xyz='0 1 0'/>"
+        "<limit lower='-1' upper='1' effort='1' velocity='1'/></joint></robot>"
+    )
+    page = SkinPage(read_robot(path), None)
+    try:
+        low, high = page.body.bounds()
+        assert 0.4 < high[2] - low[2] < 0.6
     finally:
         page.close()
 

@@ -18,6 +18,8 @@ from egoskin.sensors import Skin
 # hold collision geoms.
 _SHOWN_GROUPS = 3
 _SEGMENTS = 24
+# Half the size of a link in the bounds of a robot, if it has no shape there [m].
+_LINK_SIZE = 0.05
 _GREY = (0.5, 0.5, 0.5, 1.0)
 """MuJoCo's default colour of a geom."""
 
@@ -99,12 +101,17 @@ class Body:
     def bounds(self) -> np.ndarray:
         """Return a box in the world that contains all shapes of the robot [m].
 
+        It also contains the origins of the links: meshes of a URDF are left out, and
+        there may be no other shapes.
+
         Returns:
             Lower and upper corner, ``[2, 3]``; the box may be slightly too large.
         """
         shown = self.model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE
-        centre = self.data.geom_xpos[shown]
-        reach = self.model.geom_rbound[shown, None]
+        links = self.data.xpos[1:]
+        centre = np.concatenate((self.data.geom_xpos[shown], links))
+        reach = np.append(self.model.geom_rbound[shown], [_LINK_SIZE] * len(links))
+        reach = reach[:, None]
         return np.stack(((centre - reach).min(0), (centre + reach).max(0)))
 
     def hit(self, origin: np.ndarray, direction: np.ndarray) -> float:

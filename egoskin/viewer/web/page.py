@@ -20,7 +20,7 @@ import viser
 from egoskin.policies.policy import CHECKPOINT_NAME, policy_file, shipped_policies
 from egoskin.viewer.web.panel import EPISODES, MEMORY, Panel, Wishes
 from egoskin.viewer.web.scene import RobotScene, set_stage
-from egoskin.viewer.web.server import ServedPage
+from egoskin.viewer.web.server import ServedPage, slider_value
 from egoskin.viewer.web.session import Frame, Session, Throw
 
 _PAUSE_AFTER_END = 1.2
@@ -37,7 +37,7 @@ _FIELD_OF_VIEW = 0.75
 _HALF_WIDTH, _HALF_HEIGHT = 1.2, 1.75
 """Visible space beside the outer robots, and above and below their middle [m]."""
 _PANEL_WIDTH, _USUAL_SIZE = 340, (1440, 900)
-"""Width of the panel, and size of a usual window [px]."""
+"""Width of the panel, and size of a usual window [CSS px]."""
 _PICK_RADIUS = 0.035
 """A click this close to a sensor selects it [m]."""
 
@@ -143,7 +143,7 @@ class Page(ServedPage):
                 continue
             late = time.monotonic() - due
             self._do(partial(self.advance, late > 1 / self.hz))
-            due += self.panel.slowdown.value / self.hz
+            due += slider_value(self.panel.slowdown) / self.hz
             if late > _TOO_LATE:
                 due = time.monotonic()
             # Handle requests until the next step is due, at least all queued so far.
@@ -186,7 +186,7 @@ class Page(ServedPage):
         """Compute one control step of all robots; if this fails, stop until a reset."""
         self._has_failed = True
         self._since_throw += 1
-        tempo = self.panel.tempo.value
+        tempo = slider_value(self.panel.tempo)
         ended = [session.frame.ending is not None for session in self.sessions]
         # Not while an end is shown, which a throw would cut short.
         if tempo and self._since_throw >= 60 * self.hz / tempo and not any(ended):
@@ -229,10 +229,13 @@ class Page(ServedPage):
 
         Args:
             camera: The camera.
-            size: Width and height of its view [px].
+            size: Width and height of its view [device px].
         """
         width, height = size
-        free = max(1 - _PANEL_WIDTH / width, 0.4)
+        # The panel is as wide in CSS pixels, of which a view has fewer on a dense
+        # screen. Their number is not known: assume no higher window than a usual one.
+        density = max(height / _USUAL_SIZE[1], 1.0)
+        free = max(1 - _PANEL_WIDTH * density / width, 0.4)
         half = _HALF_WIDTH + _SPACING * (len(self.sessions) - 1) / 2
         # Half the visible height at a distance of 1 m [m].
         slope = math.tan(_FIELD_OF_VIEW / 2)
@@ -261,11 +264,16 @@ class Page(ServedPage):
         """Throw one ball at each robot."""
         self._since_throw = 0
         self._replayed.clear()
+        # A reset would discard the throw.
+        self._begin_episodes()
         for session in self.sessions:
-            # A reset would discard the throw.
+            session.throw(throw)
+
+    def _begin_episodes(self) -> None:
+        """Reset the robots whose episode has ended."""
+        for session in self.sessions:
             if session.frame.ending is not None:
                 session.reset()
-            session.throw(throw)
 
     def throw_from(self, bearing: float | None) -> None:
         """Throw a ball with the speed and height of the sliders.
@@ -290,8 +298,8 @@ class Page(ServedPage):
                 azimuth=azimuth,
                 distance=distance,
                 target=target,
-                speed=self.panel.speed.value,
-                height=self.panel.height.value,
+                speed=slider_value(self.panel.speed),
+                height=slider_value(self.panel.height),
             )
         )
 
@@ -324,11 +332,14 @@ class Page(ServedPage):
             session, local = self.sessions[i], origins[i]
             target = session.target_near(local + nearest * direction)
             distance = float(np.mean(session.distances))
+            # The throw is relative to the pose in which it begins.
+            self._begin_episodes()
             self._throw(session.azimuth_of(local), distance, target)
         elif direction[2] < 0:
             floor = [o - o[2] / direction[2] * direction for o in origins]
             i = int(np.argmin(np.linalg.norm(floor, axis=-1)))
             session, point = self.sessions[i], floor[i]
+            self._begin_episodes()
             self._throw(session.azimuth_of(point), session.distance_of(point))
 
     def mask(self, i: int, sensors: Collection[int]) -> None:
@@ -384,6 +395,8 @@ class Page(ServedPage):
             ValueError: If a policy cannot read such sensors.
         """
         changes = self.panel.sensor_changes(name)
+        if changes is None:
+            return
         wanted = []
         for session, scene in zip(self.sessions, self._scenes, strict=True):
             if session.skin is None:
@@ -428,7 +441,7 @@ class Page(ServedPage):
         now = time.monotonic()
         passed, done = now - self._panel_shown, self.steps - self._steps_shown
         self._panel_shown, self._steps_shown = now, self.steps
-        wanted = self.hz / self.panel.slowdown.value
+        wanted = self.hz / slider_value(self.panel.slowdown)
         is_slow = 0 < done < 0.9 * wanted * passed - 1
         self._speed = f"Slow: {done / passed:.0f} of {wanted:.0f} steps per second."
         if not is_slow:

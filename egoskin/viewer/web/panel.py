@@ -16,6 +16,7 @@ from viser import uplot
 
 from egoskin.sensors.config import SensorConfig
 from egoskin.viewer.web.scene import colour_of
+from egoskin.viewer.web.server import slider_value
 from egoskin.viewer.web.session import HEIGHTS, SPEEDS, Session
 
 SIDES = {"Front": 0.0, "Left": 90.0, "Behind": 180.0, "Right": -90.0}
@@ -206,13 +207,17 @@ class Panel:
 
     # --- requested settings ---------------------------------------------------
 
-    def sensor_changes(self, name: str) -> dict:
+    def sensor_changes(self, name: str) -> dict | None:
         """Return the fields of the sensor configuration that a setting selects.
+
+        None for a range outside the slider's limits: it is still being typed.
 
         Args:
             name: The setting: "kind", "signal", "range" or "corruption".
         """
         value = self._settings[name].value
+        if name == "range" and value != slider_value(self._range):
+            return None
         return _KINDS[value] if name == "kind" else {name: value}
 
     # --- display --------------------------------------------------------------

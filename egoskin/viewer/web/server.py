@@ -18,6 +18,14 @@ from typing import Any
 import viser
 
 
+def slider_value(slider: viser.GuiSliderHandle) -> float:
+    """Return the value of a slider, within its limits.
+
+    A number being typed in the box beside a slider arrives at every key, and unchecked.
+    """
+    return min(max(slider.value, slider.min), slider.max)
+
+
 class ServedPage:
     """An empty page with a queue of requests and a place for an error text.
 

@@ -98,7 +98,11 @@ class ThrownOnDemand(Thrower):
             if value is not None:
                 given[name] = torch.full(row.shape, float(value))
         if self.wanted.target is not None:
-            given["target"] = torch.full((len(row), 2), self.wanted.target)
+            # The second number, for the height in a box, is from digits that do not
+            # matter to the first: two equal numbers are on the diagonal of the box, and
+            # one drawn here differs between robots that receive the same throw.
+            pair = self.wanted.target, self.wanted.target * NUM_AIM_POINTS % 1
+            given["target"] = torch.tensor(pair).float().expand(len(row), 2)
         return dataclasses.replace(draw, **given)
 
 

@@ -23,7 +23,7 @@ from egoskin.sensors.pipeline import SensorPipeline
 from egoskin.shapes import Sphere
 from egoskin.viewer.web.body import Body
 from egoskin.viewer.web.scene import RobotScene, set_stage
-from egoskin.viewer.web.server import ServedPage
+from egoskin.viewer.web.server import ServedPage, slider_value
 from egoskin.viewer.web.session import Frame
 
 # Point size relative to the sphere's radius; slider limit of an unlimited joint [rad].
@@ -135,7 +135,7 @@ class SkinPage(ServedPage):
 
         def move(event: viser.GuiEvent) -> None:
             if event.client:
-                self._ask(self.move, i, event.target.value)
+                self._ask(self.move, i, slider_value(slider))
 
         slider.on_update(move)
         self._sliders[i] = slider
@@ -184,7 +184,8 @@ class SkinPage(ServedPage):
         self.show_error("")
         pose = dict(zip(self.robot.joints, self.joint_pos.tolist(), strict=True))
         robot = dataclasses.replace(self.robot, default_pose=pose)
-        sensor = SensorConfig(coverage=self._kind.value, range=self._range.value)
+        max_range = slider_value(self._range)
+        sensor = SensorConfig(coverage=self._kind.value, range=max_range)
         self._computing = threading.Thread(
             target=self._compute,
             args=(robot, self.skin, sensor, self.joint_pos.copy()),
