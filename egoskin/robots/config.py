@@ -215,6 +215,13 @@ class RobotConfig:
         """Hinges and slides below the base, in MuJoCo's order, as in `build_chain`."""
         return tuple(joint_name(self.model, joint) for joint in self._joint_ids)
 
+    @property
+    def floats(self) -> bool:
+        """Whether the base has a free joint."""
+        first = self.model.body_jntadr[self._bodies[0]]
+        free = mujoco.mjtJoint.mjJNT_FREE
+        return bool(first >= 0 and self.model.jnt_type[first] == free)
+
     def check_floating_base(self) -> None:
         """Raise ValueError unless the base floats, upright, and the rest are hinges."""
         model, kinds = self.model, self.model.jnt_type
