@@ -599,3 +599,20 @@ def test_settings_that_change_masses_act_on_the_robot_alone(setting, tmp_path):
         assert ball.mass == OBJECT_MASS
         radius = scene.geom("object_0").size[0]
         np.testing.assert_allclose(ball.inertia, 0.4 * OBJECT_MASS * radius**2)
+
+
+@pytest.mark.parametrize("fixed", ["trunk", "left_arm"])
+def test_links_on_fixed_joints_stay_and_weigh_once(fixed, tmp_path):
+    imu = (
+        '<body name="imu" pos="0 0 0.1">'
+        '<inertial pos="0 0 0" mass="3" diaginertia="1 1 1"/>'
+        '<body name="lens" pos="0 0 0.1"><geom size="0.01" mass="2"/></body></body>'
+    )
+    model = MODEL.replace("<compiler ", '<compiler fusestatic="true" ')
+    before, after = model.split(f'<body name="{fixed}"')
+    model = f'{before}<body name="{fixed}"{after.replace("<geom", f"{imu}<geom", 1)}'
+    before = read_folder(write_robot(tmp_path / "walker", model=model))
+    for robot in (before, portable(before)):
+        assert {"imu", "lens"} <= {*robot.links}
+        # 10 + 2 x (1 + 2 + 0.5) kg, and what is fixed.
+        assert robot.model.body_mass.sum() == pytest.approx(17 + 3 + 2)
