@@ -472,9 +472,19 @@ def _primitive(model: mujoco.MjModel, geom: int) -> tuple[str, np.ndarray]:
 def _extent(
     model: mujoco.MjModel, data: mujoco.MjData, geom: int
 ) -> tuple[float, float]:
-    """Return the height of the lowest and highest point of a primitive geom [m]."""
-    kind, size = _primitive(model, geom)
+    """Return the height of the lowest and highest point of a geom [m].
+
+    Raises:
+        ValueError: If the geom is neither a primitive nor a mesh.
+    """
     z_row = data.geom_xmat[geom].reshape(3, 3)[2]
+    if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
+        mesh = model.geom_dataid[geom]
+        first, number = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+        heights = model.mesh_vert[first : first + number] @ z_row
+        heights += data.geom_xpos[geom, 2]
+        return float(heights.min()), float(heights.max())
+    kind, size = _primitive(model, geom)
     if kind == "sphere":
         reach = size[0]
     elif kind == "capsule":

@@ -217,6 +217,27 @@ def test_a_picture_shows_a_robot_with_a_fixed_base(file: str, text: str):
         assert columns.max() < 635
 
 
+BRICK = """<mujoco><asset>
+  <mesh name="m" vertex="0 0 0  .4 0 0  0 .4 0  0 0 .4"/></asset><worldbody>
+  <body name="base" pos="0 0 1"><freejoint/><geom type="mesh" mesh="m"/></body>
+</worldbody></mujoco>"""
+
+
+def test_a_robot_that_collides_as_meshes_wears_a_skin_and_is_drawn():
+    pytest.importorskip("trimesh")
+    pytest.importorskip("embreex")
+    Path("brick.xml").write_text(BRICK)
+    robot = ("--robot", "brick.xml")
+    run(
+        *("place", *robot, "--meshes", "brick.xml", "--num-sensors", "10"),
+        *("--out", "skin.json"),
+    )
+    done = call("skin", "show", "skin.json", *robot, "--picture", "skin.png")
+    if "OpenGL" in done.stderr:
+        pytest.skip(done.stderr)
+    assert done.returncode == 0, done.stderr
+
+
 @pytest.mark.parametrize(
     ("args", "expected"),
     [
