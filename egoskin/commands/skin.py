@@ -55,14 +55,16 @@ def _pairs(values: Sequence[str], option: str) -> dict[str, str]:
 
 
 def _meshes(path: Path, robot: RobotConfig) -> Meshes:
-    """Return the meshes of a folder or of a MuJoCo model."""
+    """Return the meshes of a robot's links from a folder or a MuJoCo model."""
     try:
         if path.is_dir():
             return meshes_in_folder(path, robot.links)
-        return meshes_of_mjcf(path)
+        meshes = meshes_of_mjcf(path)
     except ImportError as error:
         # It names the missing package, which the user can install: not a bug.
         raise ValueError(f"--meshes: {error}") from error
+    # The world and other bodies may have meshes, too. With none left, it is an error.
+    return {k: v for k, v in meshes.items() if k in robot.links} or meshes
 
 
 @dataclass(frozen=True, kw_only=True)

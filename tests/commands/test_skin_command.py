@@ -238,6 +238,23 @@ def test_a_robot_that_collides_as_meshes_wears_a_skin_and_is_drawn():
     assert done.returncode == 0, done.stderr
 
 
+def test_meshes_that_are_not_the_robots_are_left_out():
+    pytest.importorskip("trimesh")
+    pytest.importorskip("embreex")
+    mesh = '<geom type="mesh" mesh="m"/>'
+    text = BRICK.replace("</worldbody>", f"{mesh}</worldbody>")
+    text = text.replace(mesh, f'{mesh}<body name="cap" pos="0 0 .5">{mesh}</body>', 1)
+    text = text.replace("<asset>", '<compiler fusestatic="true"/><asset>')
+    Path("brick.xml").write_text(text)
+    args = ("place", "--meshes", "brick.xml", "--num-sensors", "50")
+    run(*args, "--robot", "brick.xml", "--out", "skin.json")
+    assert set(Skin.load(Path("skin.json")).links) == {"base", "cap"}
+    # None is the robot's.
+    Path("other.xml").write_text(BRICK.replace('"base"', '"trunk"'))
+    told = fail("skin", *args, "--robot", "other.xml", "--out", "b.json")
+    assert "has no link 'world' for a mesh; its links are trunk" in told
+
+
 @pytest.mark.parametrize(
     ("args", "expected"),
     [
