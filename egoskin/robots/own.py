@@ -348,7 +348,8 @@ def portable(robot: RobotConfig) -> RobotConfig:
 
     Visual meshes, actuators, sensors, key frames, their defaults, and everything that
     is not below the base are left out; masses are kept. A cylinder becomes the capsule
-    inside it, of the same length and radius, or, if it is flat, a box. The base of a
+    inside it, of the same length and radius, or, if it is flat, a box; a primitive that
+    MuJoCo fits to a mesh becomes one with a size of its own. The base of a
     URDF floats. Margins of contacts are zero. If the file does not use this package's
     collision bits (see ``egoskin/assets/h1_2.xml``), self-collision stays as in the
     file, and balls and floor collide with all shapes.
@@ -380,6 +381,7 @@ def portable(robot: RobotConfig) -> RobotConfig:
     for body in list(spec.worldbody.bodies):
         if body.name not in keep:
             spec.delete(body)
+    _fit_primitives(spec)
     for geom in list(spec.geoms):
         touches = geom.contype or geom.conaffinity or geom.name in in_pairs
         if geom.parent.name == "world" or (
@@ -454,6 +456,9 @@ _PRIMITIVES = (
 )
 
 
+_QUAT = mujoco.mjtOrientation.mjORIENTATION_QUAT
+
+
 def _check_outermost(robot: RobotConfig, model: mujoco.MjModel) -> None:
     """Raise ValueError if the base is fixed to another body."""
     parent = model.body_parentid[body_id(model, robot.base)]
@@ -470,6 +475,20 @@ def _fix_inertia(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
     for body in spec.bodies:
         if body.name != "world" and not body.explicitinertial:
             set_inertia(body, model)
+
+
+def _fit_primitives(spec: mujoco.MjSpec) -> None:
+    """Give the primitives that MuJoCo fits to meshes sizes and poses of their own."""
+    mesh = mujoco.mjtGeom.mjGEOM_MESH
+    fitted = [geom for geom in spec.geoms if geom.meshname and geom.type != mesh]
+    if not fitted:
+        return
+    # It numbers the geoms, and fits them.
+    model = spec.compile()
+    for geom in fitted:
+        geom.size, geom.pos = model.geom_size[geom.id], model.geom_pos[geom.id]
+        geom.quat, geom.alt.type = model.geom_quat[geom.id], _QUAT
+        geom.meshname = ""
 
 
 def _round_off(geom: mujoco.MjsGeom) -> None:

@@ -616,3 +616,31 @@ def test_links_on_fixed_joints_stay_and_weigh_once(fixed, tmp_path):
         assert {"imu", "lens"} <= {*robot.links}
         # 10 + 2 x (1 + 2 + 0.5) kg, and what is fixed.
         assert robot.model.body_mass.sum() == pytest.approx(17 + 3 + 2)
+
+
+@pytest.mark.parametrize("kind", ["sphere", "capsule", "cylinder", "box"])
+@pytest.mark.parametrize("touches", [True, False])
+def test_a_primitive_fitted_to_a_mesh_is_a_primitive(kind, touches, tmp_path):
+    # A box whose centre is not the origin, as every mesh of a file, turned.
+    corners = [(x, y, z) for x in (0, 0.1) for y in (0, 0.2) for z in (0, 0.6)]
+    vertices = " ".join(str(v) for corner in corners for v in corner)
+    bits = f'contype="{int(touches)}" conaffinity="{int(touches)}"'
+    fitted = f'<geom name="fitted" type="{kind}" mesh="m" mass="1" {bits} '
+    fitted += 'pos="0 0 0.4" euler="0.3 0.2 0.1"/>'
+    model = MODEL.replace(
+        "<worldbody>",
+        f'<asset><mesh name="m" vertex="{vertices}"/></asset><worldbody>',
+    ).replace('<body name="left_arm"', f'{fitted}<body name="left_arm"')
+    before = read_folder(write_robot(tmp_path / "walker", model=model))
+    robot = portable(before)
+    own, expected = (r.model.geom("fitted") for r in (robot, before))
+    for name in ("pos", "quat"):
+        np.testing.assert_allclose(getattr(own, name), getattr(expected, name), 1e-5)
+    np.testing.assert_allclose(robot.model.body_mass, before.model.body_mass, 1e-5)
+    np.testing.assert_allclose(
+        robot.model.body_inertia, before.model.body_inertia, 1e-5
+    )
+    if touches:
+        for mine, theirs in zip(robot.primitives, before.primitives, strict=True):
+            assert (mine.link, mine.kind) == (theirs.link, theirs.kind)
+            np.testing.assert_allclose(mine.size, theirs.size, 1e-5)
