@@ -33,6 +33,7 @@ from typing import Annotated, Any
 from xml.etree import ElementTree
 
 import mujoco
+import numpy as np
 from tyro.constructors import PrimitiveConstructorSpec
 
 from egoskin.bounds import is_number
@@ -427,8 +428,15 @@ def portable(robot: RobotConfig) -> RobotConfig:
         text = " ".join(str(error).split())
         raise ValueError(f"{robot.name} cannot be stored as data: {text}") from error
     data = replace(robot, model_path=None, model_xml=_robot_only(spec.to_xml()))
-    # This raises for any other element that cannot be kept.
-    _ = data.model
+    try:
+        # This raises for any other element that cannot be kept.
+        _ = data.model
+    except ValueError:
+        # Or for a flat link. Other robots keep their very text.
+        if not _thicken(spec, model):
+            raise
+        data = replace(data, model_xml=_robot_only(spec.to_xml()))
+        _ = data.model
     return data
 
 
@@ -448,6 +456,8 @@ def _robot_only(text: str) -> str:
     return ElementTree.tostring(root, encoding="unicode") if surplus else text
 
 
+# An MJCF has six digits. Rounded, two inertias and their sum differ by less than this.
+_ROUNDING = 1.1e-5
 _PRIMITIVES = (
     mujoco.mjtGeom.mjGEOM_SPHERE,
     mujoco.mjtGeom.mjGEOM_CAPSULE,
@@ -475,6 +485,25 @@ def _fix_inertia(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
     for body in spec.bodies:
         if body.name != "world" and not body.explicitinertial:
             set_inertia(body, model)
+
+
+def _thicken(spec: mujoco.MjSpec, model: mujoco.MjModel) -> bool:
+    """Lower the largest inertia of flat links, so that it stays valid if rounded.
+
+    Returns:
+        Whether there are such links.
+    """
+    found = False
+    for body in spec.bodies:
+        inertia = np.sort(model.body_inertia[body_id(model, body.name)])
+        largest = (1 - _ROUNDING) * inertia[:2].sum()
+        if inertia[2] > largest:
+            found = True
+            set_inertia(body, model)
+            thick = np.array(body.inertia)
+            thick[thick.argmax()] = largest
+            body.inertia = thick
+    return found
 
 
 def _fit_primitives(spec: mujoco.MjSpec) -> None:

@@ -644,3 +644,29 @@ def test_a_primitive_fitted_to_a_mesh_is_a_primitive(kind, touches, tmp_path):
         for mine, theirs in zip(robot.primitives, before.primitives, strict=True):
             assert (mine.link, mine.kind) == (theirs.link, theirs.kind)
             np.testing.assert_allclose(mine.size, theirs.size, 1e-5)
+
+
+FLAT = {
+    "thin box": '<geom type="box" size="{a} {b} 5e-5" mass="1"/>',
+    "planar": '<inertial pos="0 0 0" mass="1" diaginertia="{a} {b} {c}"/>',
+    "tilt": '<inertial pos="0 0 0" euler="1 2 3" mass="1" diaginertia="{a} {b} {c}"/>',
+    "full": '<inertial pos="0 0 0" mass="1" fullinertia="{a} {b} {c} {d} 0 0"/>',
+}
+
+
+@pytest.mark.parametrize("kind", FLAT)
+def test_flat_links_are_kept(kind, tmp_path):
+    for seed in range(20):
+        a, b = np.random.default_rng(seed).uniform(0.01, 0.2, 2)
+        # In the plane, an inertia about its normal is the sum of the other two.
+        sizes = {"a": a, "b": b, "c": (a + b) * (1 - 1e-12), "d": 0.3 * min(a, b)}
+        flat = f'<body name="plate">{FLAT[kind].format(**sizes)}</body>'
+        model = MODEL.replace('<body name="left_arm"', f'{flat}<body name="left_arm"')
+        before = read_folder(write_robot(tmp_path / "walker", model=model))
+        after = portable(before)
+        own, expected = (r.model.body("plate") for r in (after, before))
+        np.testing.assert_allclose(own.inertia, expected.inertia, 2e-5)
+        assert own.mass == pytest.approx(expected.mass)
+        others = np.arange(before.model.nbody) != expected.id
+        values = (r.model.body_inertia[others] for r in (after, before))
+        np.testing.assert_allclose(*values, 1e-5)
