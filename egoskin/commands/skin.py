@@ -27,7 +27,6 @@ from egoskin.progress import counted
 from egoskin.robots.builtin import ROBOTS
 from egoskin.robots.config import RobotConfig
 from egoskin.robots.own import find_robot
-from egoskin.robots.surface import default_frames
 from egoskin.sensors import Skin
 from egoskin.sensors.skin.coverage import Coverage
 from egoskin.sensors.skin.gentact import load_gentact, save_gentact
@@ -56,14 +55,16 @@ def _pairs(values: Sequence[str], option: str) -> dict[str, str]:
 
 
 def _meshes(path: Path, robot: RobotConfig) -> Meshes:
-    """Return the meshes of a folder or of a MuJoCo model."""
+    """Return the meshes of a robot's links from a folder or a MuJoCo model."""
     try:
         if path.is_dir():
             return meshes_in_folder(path, robot.links)
-        return meshes_of_mjcf(path)
+        meshes = meshes_of_mjcf(path)
     except ImportError as error:
         # It names the missing package, which the user can install: not a bug.
         raise ValueError(f"--meshes: {error}") from error
+    # The world and other bodies may have meshes, too. With none left, it is an error.
+    return {k: v for k, v in meshes.items() if k in robot.links} or meshes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -265,29 +266,22 @@ def views(robot: RobotConfig, skin: Skin) -> np.ndarray:
     Returns:
         Front and back view side by side, ``[height, width, 3]`` uint8.
     """
-    joint_pos = torch.from_numpy(robot.default_joint_pos)
-    base = np.array([0.0, 0.0, robot.default_base_height])
+    height = robot.default_base_height
     state = TensorDict(
         {
-            "base_pose": torch.tensor([*base, 1.0, 0.0, 0.0, 0.0]),
-            "joint_pos": joint_pos,
+            "base_pose": torch.tensor([0.0, 0.0, height, 1.0, 0.0, 0.0, 0.0]),
+            "joint_pos": torch.from_numpy(robot.default_joint_pos),
             "object_pose": torch.zeros(0, 7),
             "object_active": torch.zeros(0, dtype=torch.bool),
         }
     )
-    position, rotation = default_frames(robot)
-    link = [robot.links.index(name) for name in skin.links]
-    turn, shift = rotation[link], base + position[link]
-    starts = shift + (turn @ skin.position[:, :, None])[..., 0]
-    ends = starts + _NORMAL_LENGTH * (turn @ skin.normal[:, :, None])[..., 0]
     images = []
     for azimuth in (0.0, 180.0):
         camera = CameraConfig(distance=3.4, azimuth_deg=azimuth, elevation_deg=12.0)
         painter = Painter(robot, skin, (), size=_VIEW_SIZE, camera=camera)
         with painter:
             painter.draw(state, time=0.0)
-            for start, end in zip(starts, ends, strict=True):
-                painter.draw_line(start, end, _NORMAL_RADIUS, _NORMAL_RGBA)
+            painter.draw_normals(_NORMAL_LENGTH, _NORMAL_RADIUS, _NORMAL_RGBA)
             images.append(painter.image())
     return np.concatenate(images, axis=1)
 

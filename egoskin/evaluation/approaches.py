@@ -47,6 +47,9 @@ class StandingRobot:
 
     Args:
         robot: The robot.
+
+    Raises:
+        ValueError: If the robot has no collision shapes, or not all are primitives.
     """
 
     def __init__(self, robot: RobotConfig) -> None:
@@ -67,6 +70,12 @@ class StandingRobot:
                     position=turn @ shape.position + shift,
                     rotation=turn @ shape.rotation,
                 )
+            )
+        if not self._shapes:
+            hint = " (collision meshes of a URDF are left out)" if robot.is_urdf else ""
+            raise ValueError(
+                f"{robot.name} has no collision shapes for balls to touch{hint}: add "
+                "spheres, capsules, boxes or cylinders"
             )
         # A capsule's end is at most its radius plus half length from its centre.
         self.reach = max(

@@ -215,6 +215,13 @@ class RobotConfig:
         """Hinges and slides below the base, in MuJoCo's order, as in `build_chain`."""
         return tuple(joint_name(self.model, joint) for joint in self._joint_ids)
 
+    @property
+    def floats(self) -> bool:
+        """Whether the base has a free joint."""
+        first = self.model.body_jntadr[self._bodies[0]]
+        free = mujoco.mjtJoint.mjJNT_FREE
+        return bool(first >= 0 and self.model.jnt_type[first] == free)
+
     def check_floating_base(self) -> None:
         """Raise ValueError unless the base floats, upright, and the rest are hinges."""
         model, kinds = self.model, self.model.jnt_type
@@ -465,9 +472,19 @@ def _primitive(model: mujoco.MjModel, geom: int) -> tuple[str, np.ndarray]:
 def _extent(
     model: mujoco.MjModel, data: mujoco.MjData, geom: int
 ) -> tuple[float, float]:
-    """Return the height of the lowest and highest point of a primitive geom [m]."""
-    kind, size = _primitive(model, geom)
+    """Return the height of the lowest and highest point of a geom [m].
+
+    Raises:
+        ValueError: If the geom is neither a primitive nor a mesh.
+    """
     z_row = data.geom_xmat[geom].reshape(3, 3)[2]
+    if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
+        mesh = model.geom_dataid[geom]
+        first, number = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+        heights = model.mesh_vert[first : first + number] @ z_row
+        heights += data.geom_xpos[geom, 2]
+        return float(heights.min()), float(heights.max())
+    kind, size = _primitive(model, geom)
     if kind == "sphere":
         reach = size[0]
     elif kind == "capsule":

@@ -33,6 +33,7 @@ from typing import Annotated, Any
 from xml.etree import ElementTree
 
 import mujoco
+import numpy as np
 from tyro.constructors import PrimitiveConstructorSpec
 
 from egoskin.bounds import is_number
@@ -348,7 +349,8 @@ def portable(robot: RobotConfig) -> RobotConfig:
 
     Visual meshes, actuators, sensors, key frames, their defaults, and everything that
     is not below the base are left out; masses are kept. A cylinder becomes the capsule
-    inside it, of the same length and radius, or, if it is flat, a box. The base of a
+    inside it, of the same length and radius, or, if it is flat, a box; a primitive that
+    MuJoCo fits to a mesh becomes one with a size of its own. The base of a
     URDF floats. Margins of contacts are zero. If the file does not use this package's
     collision bits (see ``egoskin/assets/h1_2.xml``), self-collision stays as in the
     file, and balls and floor collide with all shapes.
@@ -380,6 +382,7 @@ def portable(robot: RobotConfig) -> RobotConfig:
     for body in list(spec.worldbody.bodies):
         if body.name not in keep:
             spec.delete(body)
+    _fit_primitives(spec)
     for geom in list(spec.geoms):
         touches = geom.contype or geom.conaffinity or geom.name in in_pairs
         if geom.parent.name == "world" or (
@@ -425,8 +428,15 @@ def portable(robot: RobotConfig) -> RobotConfig:
         text = " ".join(str(error).split())
         raise ValueError(f"{robot.name} cannot be stored as data: {text}") from error
     data = replace(robot, model_path=None, model_xml=_robot_only(spec.to_xml()))
-    # This raises for any other element that cannot be kept.
-    _ = data.model
+    try:
+        # This raises for any other element that cannot be kept.
+        _ = data.model
+    except ValueError:
+        # Or for a flat link. Other robots keep their very text.
+        if not _thicken(spec, model):
+            raise
+        data = replace(data, model_xml=_robot_only(spec.to_xml()))
+        _ = data.model
     return data
 
 
@@ -446,12 +456,17 @@ def _robot_only(text: str) -> str:
     return ElementTree.tostring(root, encoding="unicode") if surplus else text
 
 
+# An MJCF has six digits. Rounded, two inertias and their sum differ by less than this.
+_ROUNDING = 1.1e-5
 _PRIMITIVES = (
     mujoco.mjtGeom.mjGEOM_SPHERE,
     mujoco.mjtGeom.mjGEOM_CAPSULE,
     mujoco.mjtGeom.mjGEOM_BOX,
     mujoco.mjtGeom.mjGEOM_CYLINDER,
 )
+
+
+_QUAT = mujoco.mjtOrientation.mjORIENTATION_QUAT
 
 
 def _check_outermost(robot: RobotConfig, model: mujoco.MjModel) -> None:
@@ -470,6 +485,39 @@ def _fix_inertia(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
     for body in spec.bodies:
         if body.name != "world" and not body.explicitinertial:
             set_inertia(body, model)
+
+
+def _thicken(spec: mujoco.MjSpec, model: mujoco.MjModel) -> bool:
+    """Lower the largest inertia of flat links, so that it stays valid if rounded.
+
+    Returns:
+        Whether there are such links.
+    """
+    found = False
+    for body in spec.bodies:
+        inertia = np.sort(model.body_inertia[body_id(model, body.name)])
+        largest = (1 - _ROUNDING) * inertia[:2].sum()
+        if inertia[2] > largest:
+            found = True
+            set_inertia(body, model)
+            thick = np.array(body.inertia)
+            thick[thick.argmax()] = largest
+            body.inertia = thick
+    return found
+
+
+def _fit_primitives(spec: mujoco.MjSpec) -> None:
+    """Give the primitives that MuJoCo fits to meshes sizes and poses of their own."""
+    mesh = mujoco.mjtGeom.mjGEOM_MESH
+    fitted = [geom for geom in spec.geoms if geom.meshname and geom.type != mesh]
+    if not fitted:
+        return
+    # It numbers the geoms, and fits them.
+    model = spec.compile()
+    for geom in fitted:
+        geom.size, geom.pos = model.geom_size[geom.id], model.geom_pos[geom.id]
+        geom.quat, geom.alt.type = model.geom_quat[geom.id], _QUAT
+        geom.meshname = ""
 
 
 def _round_off(geom: mujoco.MjsGeom) -> None:

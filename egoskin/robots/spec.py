@@ -27,7 +27,7 @@ _LEAST = 1e-6
 def load_spec(source: Path | str, what: str) -> mujoco.MjSpec:
     """Return the editable specification of a robot.
 
-    In a URDF, links on fixed joints are kept, meshes are left out, and masses may be.
+    Links on fixed joints are kept. In a URDF, meshes are left out, and masses may be.
     Unnamed bodies and joints get the names that the robot's chain uses.
 
     Args:
@@ -44,6 +44,8 @@ def load_spec(source: Path | str, what: str) -> mujoco.MjSpec:
             spec = mujoco.MjSpec.from_file(str(source))
         else:
             spec = mujoco.MjSpec.from_string(source)
+        # Else the links on fixed joints would be merged with those that carry them.
+        spec.compiler.fusestatic = False
         if urdf:
             _prepare_urdf(spec)
         _name_all(spec)
@@ -105,11 +107,10 @@ def _unreadable(what: str, error: ValueError) -> ValueError:
 
 
 def _prepare_urdf(spec: mujoco.MjSpec) -> None:
-    """Leave out meshes, keep links on fixed joints, and permit links without mass."""
+    """Leave out meshes, and permit links without mass."""
     meshes = [g for g in spec.geoms if g.type == mujoco.mjtGeom.mjGEOM_MESH]
     for element in (*meshes, *spec.meshes):
         spec.delete(element)
-    spec.compiler.fusestatic = False
     # A URDF may leave out masses, but MuJoCo requires them for moving bodies.
     spec.compiler.boundmass = spec.compiler.boundinertia = _LEAST
     spec.compiler.balanceinertia = True

@@ -20,6 +20,9 @@ from egoskin.shapes import shape_of
 
 # A sampled point is inside another primitive if it is deeper than this [m].
 _INSIDE = 1e-6
+# Two surfaces in one place touch flush if the cosine between their normals is below the
+# negative of this.
+_OPPOSED = 0.99
 # Sampling fails if this many rounds find no outer surface.
 _MAX_ROUNDS = 1000
 
@@ -273,7 +276,8 @@ def outside_primitives(
         shapes: Primitives of the robot.
 
     Returns:
-        The ``side`` of `Surface`: 1 outside all of the shapes, else 0.
+        The ``side`` of `Surface`: 1 outside all of the shapes, else 0. What another
+        shape touches flush is not outside.
     """
     shift, turn = default_frames(robot)
     frames = [robot.links.index(shape.link) for shape in shapes]
@@ -292,7 +296,15 @@ def outside_primitives(
                 reach = shape.size.sum()
                 near = np.flatnonzero(np.einsum("ij,ij->i", away, away) < reach**2)
                 local = (at[near] - shift[i]) @ turn[i]
-                outside[near] *= distance_to(shape, local) > -_INSIDE
+                distance = distance_to(shape, local)
+                outside[near] *= distance > -_INSIDE
+                # A shape that touches flush, from outside, covers the point, too.
+                here = np.abs(distance) <= _INSIDE
+                if height or not here.any():
+                    continue
+                above = local[here] + _INSIDE * normals[near[here]] @ turn[i]
+                rise = distance_to(shape, above) - distance[here]
+                outside[near[here]] *= rise > -_OPPOSED * _INSIDE
         return outside
 
     return side

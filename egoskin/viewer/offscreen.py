@@ -54,7 +54,7 @@ class CameraConfig:
 
     distance: float = 3.4
     """Distance to a robot as tall as the H1-2 (1.78 m) [m]; it is scaled with the
-    robot's height."""
+    robot's height, or with its length if its base is fixed."""
     azimuth_deg: float = 30.0
     """Azimuth of the camera, relative to the robot's initial heading [deg]."""
     elevation_deg: float = 10.0
@@ -129,6 +129,22 @@ class Painter:
         self._camera = mujoco.MjvCamera()
         self._last_time: float | None = None
         model = self._model
+        joints = [model.joint(name).id for name in robot.joints]
+        self._joints = model.jnt_qposadr[joints]
+        # Where the base is in the positions, and where to look if it is fixed.
+        self._base: slice | None = None
+        self._centre: np.ndarray | None = None
+        if robot.floats:
+            start = model.jnt_qposadr[model.body(robot.base).jntadr[0]]
+            self._base = slice(start, start + 7)
+        else:
+            self._data.qpos[self._joints] = robot.default_joint_pos
+            mujoco.mj_kinematics(model, self._data)
+            low, high = _bounds(model, self._data, robot.links)
+            self._centre = (low + high) / 2
+            self._size = float(np.linalg.norm(high - low)) / _REFERENCE_HEIGHT or 1.0
+        base = self._data.body(robot.base)
+        self._base_pose = np.concatenate((base.xpos, base.xquat))
         self._link_of_sensor = [
             model.body(name).id for name in (skin.links if skin else ())
         ]
@@ -159,8 +175,8 @@ class Painter:
         """Return the picture of a state.
 
         Args:
-            state: One row with ``base_pose [7]``, ``joint_pos [J]``,
-                ``object_pose [O, 7]`` and ``object_active [O]``.
+            state: One row with ``base_pose [7]`` (ignored if the base is fixed),
+                ``joint_pos [J]``, ``object_pose [O, 7]`` and ``object_active [O]``.
             detecting: Whether each sensor detects something, ``[S]`` bool.
             time: Age of the episode [s]; the camera follows the base over time and is
                 reset when time decreases.
@@ -168,7 +184,9 @@ class Painter:
             ending: Why the episode ends here, for the frame.
         """
         active = np.asarray(state["object_active"])
-        self._follow(np.asarray(state["base_pose"], float), time)
+        if self._base is not None:
+            self._base_pose = np.asarray(state["base_pose"], float)
+        self._follow(time)
         self._place(state, active)
         self._renderer.update_scene(self._data, self._camera)
         if self._skin is None:
@@ -203,13 +221,30 @@ class Painter:
         geom = self._add(kind, rgba, glows=True)
         mujoco.mjv_connector(geom, kind, radius, start, end)
 
+    def draw_normals(self, length: float, radius: float, rgba: Sequence[float]) -> None:
+        """Add the sensors' normals to the state drawn last, as `draw_line` does.
+
+        Args:
+            length: Length of the lines [m].
+            radius: Radius of the lines [m].
+            rgba: Colour and opacity.
+        """
+        if self._skin is None:
+            return
+        starts = self._in_world(self._skin.position)
+        ends = self._in_world(self._skin.position + length * self._skin.normal)
+        for start, end in zip(starts, ends, strict=True):
+            self.draw_line(start, end, radius, rgba)
+
     def image(self) -> np.ndarray:
         """Return the picture of the state drawn last, ``[H, W, 3]`` uint8."""
         return self._renderer.render()
 
     def _place(self, state: TensorDictBase, active: np.ndarray) -> None:
         """Move the robot and the balls of the visual model to the poses of a state."""
-        self._data.qpos[:] = np.concatenate((state["base_pose"], state["joint_pos"]))
+        if self._base is not None:
+            self._data.qpos[self._base] = self._base_pose
+        self._data.qpos[self._joints] = state["joint_pos"]
         pose = np.asarray(state["object_pose"], float)
         lamp = np.array([*self._camera.lookat[:2], 0.0])
         half = math.radians(self._camera.azimuth) / 2
@@ -222,12 +257,14 @@ class Painter:
         mujoco.mj_comPos(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
 
-    def _follow(self, base_pose: np.ndarray, time: float) -> None:
-        """Move the camera's look-at point towards the base."""
+    def _follow(self, time: float) -> None:
+        """Move the look-at point towards the base, or look at a fixed robot."""
         camera, config = self._camera, self._camera_config
-        goal = np.array([*base_pose[:2], self._size * _LOOK_HEIGHT])
+        goal = self._centre
+        if goal is None:
+            goal = np.array([*self._base_pose[:2], self._size * _LOOK_HEIGHT])
         if self._last_time is None or time < self._last_time:
-            w, _, _, z = base_pose[3:]
+            w, _, _, z = self._base_pose[3:]
             # The heading of an upright base is twice the angle of (w, z).
             heading = math.degrees(2 * math.atan2(z, w))
             camera.lookat[:] = goal
@@ -245,9 +282,7 @@ class Painter:
     ) -> None:
         """Add the sensors, and a line from each that detects to the nearest ball."""
         assert self._skin is not None
-        rotation = self._data.xmat[self._link_of_sensor].reshape(-1, 3, 3)
-        offset = (rotation @ self._skin.position[:, :, None])[..., 0]
-        points = self._data.xpos[self._link_of_sensor] + offset
+        points = self._in_world(self._skin.position)
         for point, is_lit in zip(points, detecting, strict=True):
             radius = _LIT_RADIUS if is_lit else _IDLE_RADIUS
             rgba = _LIT_RGBA if is_lit else _IDLE_RGBA
@@ -267,6 +302,12 @@ class Painter:
             fade = max(1 - length[nearest[i], i] / _FADE_LENGTH, _FAINTEST)
             end, rgba = ends[nearest[i], i], (*colours[i], fade)
             self.draw_line(point, end, _LINE_RADIUS, rgba)
+
+    def _in_world(self, points: np.ndarray) -> np.ndarray:
+        """Return one point of each sensor's link in the world [m], ``[S, 3]``."""
+        rotation = self._data.xmat[self._link_of_sensor].reshape(-1, 3, 3)
+        offset = (rotation @ points[:, :, None])[..., 0]
+        return self._data.xpos[self._link_of_sensor] + offset
 
     def _add(
         self, kind: mujoco.mjtGeom, rgba: Sequence[float], *, glows: bool
@@ -313,12 +354,37 @@ def closest_point(shape: Shape, pose: np.ndarray, points: np.ndarray) -> np.ndar
     return closest @ rotation.T + pose[:3]
 
 
+def _bounds(
+    model: mujoco.MjModel, data: mujoco.MjData, links: Sequence[str]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners of a box around links and their shapes [m], ``[3]`` each.
+
+    The box may be slightly too large.
+    """
+    bodies = [model.body(name).id for name in links]
+    geoms = np.isin(model.geom_bodyid, bodies)
+    centre = np.concatenate((data.xpos[bodies], data.geom_xpos[geoms]))
+    reach = np.append(np.zeros(len(bodies)), model.geom_rbound[geoms])[:, None]
+    return (centre - reach).min(0), (centre + reach).max(0)
+
+
 def _build_model(
     robot: RobotConfig, objects: Sequence[Shape], size: tuple[int, int]
 ) -> mujoco.MjModel:
-    """Return a model of the robot with tiled floor, sky, light and mocap balls."""
+    """Return a model of the robot with tiled floor, sky, light and mocap balls.
+
+    The floor is at height 0, or lower if a fixed robot reaches lower.
+    """
     spec = robot.spec()
+    # A URDF would lose materials: those of the floor, too.
+    spec.compiler.discardvisual = False
     world = spec.worldbody
+    ground = 0.0
+    if not robot.floats:
+        data = mujoco.MjData(robot.model)
+        mujoco.mj_kinematics(robot.model, data)
+        lowest = data.body(robot.base).xpos[2] - robot.default_base_height
+        ground = min(ground, float(lowest))
     spec.visual.global_.offwidth, spec.visual.global_.offheight = size
     spec.visual.headlight.ambient = [0.38, 0.38, 0.4]
     spec.visual.headlight.diffuse = [0.35, 0.35, 0.35]
@@ -358,6 +424,7 @@ def _build_model(
         default=plain.default,
         type=mujoco.mjtGeom.mjGEOM_PLANE,
         size=[0, 0, 0.05],
+        pos=[0, 0, ground],
         material="tiles",
     )
     for i, shape in enumerate(objects):

@@ -189,6 +189,72 @@ def test_a_picture_shows_sensors_and_normals_from_both_sides(mixed):
     assert back.sum() == 0
 
 
+# Fixed far from the origin, tilted.
+ARM = """<mujoco><worldbody>
+  <body name="stand" pos="4 0 2" euler="90 0 0"><geom type="box" size=".1 .1 .5"/>
+    <body name="boom" pos="0 0 .5"><joint axis="0 1 0"/>
+      <geom type="capsule" size=".1" fromto="0 0 0 1 0 0"/></body></body>
+</worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize(("file", "text"), [("crane.urdf", CRANE), ("arm.xml", ARM)])
+def test_a_picture_shows_a_robot_with_a_fixed_base(file: str, text: str):
+    Path(file).write_text(text)
+    robot, links = ("--robot", file), ("--links", "boom")
+    run("place", *robot, *links, "--num-sensors", "40", "--out", "skin.json")
+    done = call("skin", "show", "skin.json", *robot, "--picture", "skin.png")
+    if "OpenGL" in done.stderr:
+        pytest.skip(done.stderr)
+    assert done.returncode == 0, done.stderr
+    red, green, blue = np.moveaxis(np.asarray(Image.open("skin.png"), int), -1, 0)
+    normals = (green - red > 100) & (blue - red > 100)
+    for view in (normals[:, :640], normals[:, 640:]):
+        # The whole boom is seen, and from near.
+        rows, columns = np.nonzero(view)
+        assert len(rows) > 50
+        assert max(np.ptp(rows), np.ptp(columns)) > 50
+        assert columns.min() > 5
+        assert columns.max() < 635
+
+
+BRICK = """<mujoco><asset>
+  <mesh name="m" vertex="0 0 0  .4 0 0  0 .4 0  0 0 .4"/></asset><worldbody>
+  <body name="base" pos="0 0 1"><freejoint/><geom type="mesh" mesh="m"/></body>
+</worldbody></mujoco>"""
+
+
+def test_a_robot_that_collides_as_meshes_wears_a_skin_and_is_drawn():
+    pytest.importorskip("trimesh")
+    pytest.importorskip("embreex")
+    Path("brick.xml").write_text(BRICK)
+    robot = ("--robot", "brick.xml")
+    run(
+        *("place", *robot, "--meshes", "brick.xml", "--num-sensors", "10"),
+        *("--out", "skin.json"),
+    )
+    done = call("skin", "show", "skin.json", *robot, "--picture", "skin.png")
+    if "OpenGL" in done.stderr:
+        pytest.skip(done.stderr)
+    assert done.returncode == 0, done.stderr
+
+
+def test_meshes_that_are_not_the_robots_are_left_out():
+    pytest.importorskip("trimesh")
+    pytest.importorskip("embreex")
+    mesh = '<geom type="mesh" mesh="m"/>'
+    text = BRICK.replace("</worldbody>", f"{mesh}</worldbody>")
+    text = text.replace(mesh, f'{mesh}<body name="cap" pos="0 0 .5">{mesh}</body>', 1)
+    text = text.replace("<asset>", '<compiler fusestatic="true"/><asset>')
+    Path("brick.xml").write_text(text)
+    args = ("place", "--meshes", "brick.xml", "--num-sensors", "50")
+    run(*args, "--robot", "brick.xml", "--out", "skin.json")
+    assert set(Skin.load(Path("skin.json")).links) == {"base", "cap"}
+    # None is the robot's.
+    Path("other.xml").write_text(BRICK.replace('"base"', '"trunk"'))
+    told = fail("skin", *args, "--robot", "other.xml", "--out", "b.json")
+    assert "has no link 'world' for a mesh; its links are trunk" in told
+
+
 @pytest.mark.parametrize(
     ("args", "expected"),
     [

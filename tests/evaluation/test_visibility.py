@@ -28,6 +28,7 @@ from egoskin.evaluation.approaches import (
 )
 from egoskin.evaluation.visibility import Analysis, Cell, analyse, see_directions
 from egoskin.robots.builtin import H1_2
+from egoskin.robots.config import read_robot
 from egoskin.sensors import Field, Ray, Skin
 from egoskin.sensors.config import SensorConfig
 from egoskin.shapes import Sphere
@@ -91,6 +92,18 @@ def test_distances_to_the_body_are_those_of_mujoco():
     assert (bounded[near] == body.distance(points)[near]).all()
     assert (bounded[~near] > 0.3).all()
     assert (bounded <= body.distance(points)).all()
+
+
+def test_a_robot_that_balls_cannot_touch_is_refused(small_robot, tmp_path):
+    with pytest.raises(ValueError, match="small has no collision shapes for balls to"):
+        StandingRobot(small_robot(""))
+    path = tmp_path / "crane.urdf"
+    path.write_text(
+        '<robot name="crane"><link name="base"><collision><geometry>'
+        '<mesh filename="base.stl"/></geometry></collision></link></robot>'
+    )
+    with pytest.raises(ValueError, match=r"meshes of a URDF are left out\): add sph"):
+        StandingRobot(read_robot(path))
 
 
 def test_throws_fly_and_hit_as_they_do_in_the_simulation():

@@ -599,3 +599,74 @@ def test_settings_that_change_masses_act_on_the_robot_alone(setting, tmp_path):
         assert ball.mass == OBJECT_MASS
         radius = scene.geom("object_0").size[0]
         np.testing.assert_allclose(ball.inertia, 0.4 * OBJECT_MASS * radius**2)
+
+
+@pytest.mark.parametrize("fixed", ["trunk", "left_arm"])
+def test_links_on_fixed_joints_stay_and_weigh_once(fixed, tmp_path):
+    imu = (
+        '<body name="imu" pos="0 0 0.1">'
+        '<inertial pos="0 0 0" mass="3" diaginertia="1 1 1"/>'
+        '<body name="lens" pos="0 0 0.1"><geom size="0.01" mass="2"/></body></body>'
+    )
+    model = MODEL.replace("<compiler ", '<compiler fusestatic="true" ')
+    before, after = model.split(f'<body name="{fixed}"')
+    model = f'{before}<body name="{fixed}"{after.replace("<geom", f"{imu}<geom", 1)}'
+    before = read_folder(write_robot(tmp_path / "walker", model=model))
+    for robot in (before, portable(before)):
+        assert {"imu", "lens"} <= {*robot.links}
+        # 10 + 2 x (1 + 2 + 0.5) kg, and what is fixed.
+        assert robot.model.body_mass.sum() == pytest.approx(17 + 3 + 2)
+
+
+@pytest.mark.parametrize("kind", ["sphere", "capsule", "cylinder", "box"])
+@pytest.mark.parametrize("touches", [True, False])
+def test_a_primitive_fitted_to_a_mesh_is_a_primitive(kind, touches, tmp_path):
+    # A box whose centre is not the origin, as every mesh of a file, turned.
+    corners = [(x, y, z) for x in (0, 0.1) for y in (0, 0.2) for z in (0, 0.6)]
+    vertices = " ".join(str(v) for corner in corners for v in corner)
+    bits = f'contype="{int(touches)}" conaffinity="{int(touches)}"'
+    fitted = f'<geom name="fitted" type="{kind}" mesh="m" mass="1" {bits} '
+    fitted += 'pos="0 0 0.4" euler="0.3 0.2 0.1"/>'
+    model = MODEL.replace(
+        "<worldbody>",
+        f'<asset><mesh name="m" vertex="{vertices}"/></asset><worldbody>',
+    ).replace('<body name="left_arm"', f'{fitted}<body name="left_arm"')
+    before = read_folder(write_robot(tmp_path / "walker", model=model))
+    robot = portable(before)
+    own, expected = (r.model.geom("fitted") for r in (robot, before))
+    for name in ("pos", "quat"):
+        np.testing.assert_allclose(getattr(own, name), getattr(expected, name), 1e-5)
+    np.testing.assert_allclose(robot.model.body_mass, before.model.body_mass, 1e-5)
+    np.testing.assert_allclose(
+        robot.model.body_inertia, before.model.body_inertia, 1e-5
+    )
+    if touches:
+        for mine, theirs in zip(robot.primitives, before.primitives, strict=True):
+            assert (mine.link, mine.kind) == (theirs.link, theirs.kind)
+            np.testing.assert_allclose(mine.size, theirs.size, 1e-5)
+
+
+FLAT = {
+    "thin box": '<geom type="box" size="{a} {b} 5e-5" mass="1"/>',
+    "planar": '<inertial pos="0 0 0" mass="1" diaginertia="{a} {b} {c}"/>',
+    "tilt": '<inertial pos="0 0 0" euler="1 2 3" mass="1" diaginertia="{a} {b} {c}"/>',
+    "full": '<inertial pos="0 0 0" mass="1" fullinertia="{a} {b} {c} {d} 0 0"/>',
+}
+
+
+@pytest.mark.parametrize("kind", FLAT)
+def test_flat_links_are_kept(kind, tmp_path):
+    for seed in range(20):
+        a, b = np.random.default_rng(seed).uniform(0.01, 0.2, 2)
+        # In the plane, an inertia about its normal is the sum of the other two.
+        sizes = {"a": a, "b": b, "c": (a + b) * (1 - 1e-12), "d": 0.3 * min(a, b)}
+        flat = f'<body name="plate">{FLAT[kind].format(**sizes)}</body>'
+        model = MODEL.replace('<body name="left_arm"', f'{flat}<body name="left_arm"')
+        before = read_folder(write_robot(tmp_path / "walker", model=model))
+        after = portable(before)
+        own, expected = (r.model.body("plate") for r in (after, before))
+        np.testing.assert_allclose(own.inertia, expected.inertia, 2e-5)
+        assert own.mass == pytest.approx(expected.mass)
+        others = np.arange(before.model.nbody) != expected.id
+        values = (r.model.body_inertia[others] for r in (after, before))
+        np.testing.assert_allclose(*values, 1e-5)

@@ -163,6 +163,20 @@ def test_a_cylinder_is_the_capsule_inside_it_or_if_flat_a_box(small_robot):
     assert len(place_sensors(robot, 20)) == 20
 
 
+def test_the_height_of_a_robot_is_also_that_of_its_meshes(tmp_path):
+    path = tmp_path / "mesh.xml"
+    # A corner of a cube with edges of 0.1 m, standing on its tip.
+    path.write_text(
+        "<mujoco><asset><mesh name='m' vertex='0 0 0  .1 0 0  0 .1 0  0 0 .1'/>"
+        "</asset><worldbody><body name='base' pos='0 0 1'><freejoint/>"
+        "<geom type='mesh' mesh='m' euler='45 -35.26439 0' pos='0 0 -.2'/>"
+        "<geom size='.1'/></body></worldbody></mujoco>"
+    )
+    robot = read_robot(path)
+    assert robot.default_base_height == pytest.approx(0.2)
+    assert robot.standing_height == pytest.approx(0.3)
+
+
 def test_gains_are_positive_numbers():
     for kp, kd in ((-60, 2), (0, 2), (60, -1), ("60", 2), (60, float("nan"))):
         with pytest.raises(ValueError, match="a gain must have numbers kp > 0"):

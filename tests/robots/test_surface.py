@@ -10,7 +10,12 @@ from hypothesis import strategies as st
 
 from egoskin.robots.builtin import H1_2
 from egoskin.robots.config import Primitive
-from egoskin.robots.surface import area, distance_to, sample_surface
+from egoskin.robots.surface import (
+    area,
+    distance_to,
+    primitive_surface,
+    sample_surface,
+)
 
 
 def by_link(points) -> list[tuple[str, np.ndarray, np.ndarray]]:
@@ -196,6 +201,25 @@ def test_what_another_shape_covers_gets_no_points(small_robot):
     assert small.mean() == pytest.approx(1 / 7, abs=share_error(1 / 7))
     assert points.position[~small, 0].max() <= 0.875 + 1e-5
     assert (points.position[small, 0] + 1).min() >= 0.875 - 1e-5
+
+
+@pytest.mark.parametrize("stand_off", [0.0, 0.01])
+def test_where_shapes_touch_flush_there_is_no_outer_surface(small_robot, stand_off):
+    robot = small_robot(
+        "<geom type='box' size='.1 .1 .1'/>"
+        "<body name='b' pos='0 0 .2'><geom type='box' size='.1 .1 .1'/>"
+        "<geom type='box' size='.05 .05 .05' pos='.15 0 0'/></body>"
+    )
+    surface = primitive_surface(robot, robot.links)
+    points = surface.sample(N, 4, stand_off=stand_off)
+    at = surface.points_b(points.link, points.position)
+    x, y, z = at.T
+    above = (np.abs(z - 0.1) < 1e-6) & (np.abs([x, y]).max(0) < 0.099)
+    beside = (np.abs(x - 0.1) < 1e-6) & (np.abs([y, z - 0.2]).max(0) < 0.049)
+    assert not (above | beside).any()
+    # Hidden: two of twelve faces of .04 m^2, one of six of .01 and the place of it.
+    visible = 10 * 0.04 - 0.01 + 5 * 0.01
+    assert sum(points.area.values()) == pytest.approx(visible, rel=0.03)
 
 
 def test_only_the_links_asked_for_get_points():

@@ -125,7 +125,10 @@ def meshes_of_mjcf(path: Path, group: int | None = None) -> dict[str, list[Trime
     trimesh = _trimesh()
     check_regular(path)
     try:
-        model = mujoco.MjModel.from_xml_path(str(path))
+        spec = mujoco.MjSpec.from_file(str(path))
+        # As `load_spec` does: the bodies are those of the robot.
+        spec.compiler.fusestatic = False
+        model = spec.compile()
     except ValueError as error:
         text = " ".join(str(error).split())
         raise ValueError(f"MuJoCo cannot load {path}: {text}") from error
