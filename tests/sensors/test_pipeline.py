@@ -73,15 +73,15 @@ def test_a_mixed_skin_signals_sensor_by_sensor(mixed, random_state, kind, option
 @pytest.mark.parametrize(
     ("options", "size"),
     [
-        ({"range": 1.25}, 12),
-        ({"range": 1.25, "coverage": "ray"}, 12 * 64),
-        ({"range": 1.25, "coverage": "ray", "reduce": "min"}, 12),
+        ({}, 12),
+        ({"coverage": "ray"}, 12 * 64),
+        ({"coverage": "ray", "reduce": "min"}, 12),
         ({"coverage": "ray", "signal": "localization", "keep_last": True}, 3),
         ({"coverage": "none"}, 0),
     ],
 )
 def test_a_skin_is_resolved_once_on_its_way_to_the_kernel(options, size, monkeypatch):
-    config = EnvConfig(task=TASK, sensor=SensorConfig(**options))
+    config = EnvConfig(task=TASK, sensor=SensorConfig(range=1.25, **options))
     skin, resolved, calls = place_sensors(H1_2, 12, seed=0), Skin.resolved, []
 
     def counting(self, *args):
@@ -90,11 +90,10 @@ def test_a_skin_is_resolved_once_on_its_way_to_the_kernel(options, size, monkeyp
 
     monkeypatch.setattr(Skin, "resolved", counting)
     env = make_worker_env(config, skin, num_envs=2, seed=0)
-    reach = config.sensor.range
-    assert calls == [(config.sensor.default_coverage, reach)]
+    assert calls == [(config.sensor.default_coverage, 1.25)]
     pipeline = config.pipeline(skin)
     assert pipeline.signal_size == size
-    assert (pipeline.skin.range == reach).all()
+    assert (pipeline.skin.range == 1.25).all()
     if size:
         assert env.observation_spec["signal"].shape == (2, size)
     else:

@@ -464,7 +464,7 @@ def test_machine_settings_may_change_at_a_resume_and_change_nothing(
     [
         (["--device", "cuda"], "device"),
         (["--num-envs", "8"], "num_envs"),
-        (["--seed", "1", "--history", "2"], "history, seed"),
+        (["--seed", "1", "--sensor.range", "1"], "sensor.range, seed"),
     ],
 )
 def test_what_changes_results_may_not(args: list[str], names: str, run: Path):
