@@ -100,12 +100,17 @@ class SensorConfig:
         """Raise ValueError for a range out of bounds or options without effect."""
         check_bounds(self)
         if not self.uses_skin:
-            for name in ("signal", "range", "reduce", "occlusion", "corruption"):
-                value = getattr(self, name)
-                if value != getattr(SensorConfig, name):
+            ignored = {
+                "reduce": self.reduce != "none",
+                "occlusion": self.occlusion,
+                "corruption": self.corruption != "none",
+                "signal=localization": self.signal == "localization",
+            }
+            for name, given in ignored.items():
+                if given:
                     raise ValueError(
-                        f"{name}={value} has no effect with coverage={self.coverage}, "
-                        "which has no skin"
+                        f"{name} has no effect with coverage={self.coverage}, which "
+                        "has no skin"
                     )
         for name, default in (("field", Field()), ("ray", Ray())):
             if name != self.coverage and getattr(self, name) != default:

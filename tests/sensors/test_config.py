@@ -12,15 +12,13 @@ from egoskin.sensors.config import SensorConfig
     ("options", "message"),
     [
         *(
-            ({"coverage": coverage, name: value}, f"{name}={value} has no effect with")
+            ({"coverage": coverage, name: value}, f"{text} has no effect with cov")
             for coverage in ("none", "oracle")
-            for name, value in (
-                ("corruption", "acoustic"),
-                ("occlusion", True),
-                ("reduce", "min"),
-                ("signal", "localization"),
-                ("signal", "binary"),
-                ("range", 1.0),
+            for name, value, text in (
+                ("corruption", "acoustic", "corruption"),
+                ("occlusion", True, "occlusion"),
+                ("reduce", "min", "reduce"),
+                ("signal", "localization", "signal=localization"),
             )
         ),
         ({"ray": Ray(grid=(4, 4))}, "ray options need coverage=ray, not field"),
