@@ -464,8 +464,6 @@ _PRIMITIVES = (
     mujoco.mjtGeom.mjGEOM_BOX,
     mujoco.mjtGeom.mjGEOM_CYLINDER,
 )
-
-
 _QUAT = mujoco.mjtOrientation.mjORIENTATION_QUAT
 
 

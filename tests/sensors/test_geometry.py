@@ -104,7 +104,7 @@ def test_gradients_are_those_of_finite_differences(skin, random_state, kind, sha
     assert all(x.grad is not None and x.grad.isfinite().all() for x in poses)
 
 
-@pytest.mark.parametrize("kind", [FieldSensor, RaySensor])
+@every_kind
 def test_a_sensor_used_in_inference_mode_has_gradients_later(skin, random_state, kind):
     sensor = kind(skin, H1_2.chain, Sphere(radius=0.15), 5.0, compile=False)
     state = random_state(8, objects=1)
