@@ -225,8 +225,7 @@ class RobotConfig:
     def check_floating_base(self) -> None:
         """Raise ValueError unless the base floats, upright, and the rest are hinges."""
         model, kinds = self.model, self.model.jnt_type
-        free = model.njnt > 0 and kinds[0] == mujoco.mjtJoint.mjJNT_FREE
-        if not free or model.jnt_bodyid[0] != self._bodies[0]:
+        if not self.floats or model.jnt_bodyid[0] != self._bodies[0]:
             raise ValueError(
                 f"{self.name}: the first joint must be the free joint of its base "
                 f"{self.base!r} (required to throw balls, not to place sensors)"

@@ -16,9 +16,11 @@ from egoskin.sensors import Skin
 from egoskin.viewer.film import Frame
 from egoskin.viewer.offscreen import Painter
 
-_READ = ("base_pose", "joint_pos", "object_pose", "object_active", "balls_avoided")
-_ENDS = ("truncated", "hit", "fallen", "diverged", "terminated")
-"""Keys that a film and `ending_of` read, besides the distances."""
+# Keys that a film and `ending_of` read, besides the distances.
+_READ = (
+    *("base_pose", "joint_pos", "object_pose", "object_active", "balls_avoided"),
+    *("truncated", "hit", "fallen", "diverged", "terminated"),
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +68,7 @@ def record_episodes(
     keys: list[str] | None = None
     if longest:
         distances = (f"distance{g.suffix}" for g in config.pipeline(skin).groups)
-        keys = [*_READ, *_ENDS, *distances]
+        keys = [*_READ, *distances]
     # Episodes that are recorded, and their states after each step: in one tensordict,
     # as those of single states need more memory than their content.
     kept, history = torch.arange(episodes), list[TensorDictBase]()

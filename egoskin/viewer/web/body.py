@@ -52,8 +52,7 @@ class Body:
         self._bodies = {body_name(model, i): i for i in range(1, model.nbody)}
         joints = {joint_name(model, i): i for i in range(model.njnt)}
         self._joint = model.jnt_qposadr[[joints[name] for name in robot.joints]]
-        free = mujoco.mjtJoint.mjJNT_FREE
-        self.floats = bool(model.njnt and model.jnt_type[0] == free)
+        self.floats = robot.floats
         """Whether its base is free to move."""
         self.place(self.standing(robot.default_joint_pos))
 
