@@ -54,7 +54,7 @@ TOP = "commands"
 MUJOCO = {
     "robots.chains",
     "robots.config",
-    "robots.own",
+    "robots.portable",
     "robots.spec",
     "shapes",
     "envs.physics.model",

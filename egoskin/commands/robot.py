@@ -26,7 +26,8 @@ from egoskin.progress import counted
 from egoskin.robots.builtin import ROBOTS
 from egoskin.robots.checks import Finding, check_model, names_of
 from egoskin.robots.config import RobotConfig
-from egoskin.robots.own import find_robot, portable
+from egoskin.robots.own import find_robot
+from egoskin.robots.portable import portable
 from egoskin.robots.spec import links_with_meshes
 from egoskin.sensors.config import SkinConfig
 from egoskin.storage.files import check_output

@@ -125,7 +125,7 @@ class RobotConfig:
     fixed joints are kept, and meshes, whose paths are seldom valid, are left out."""
     model_xml: str | None = None
     """Instead of a path, an MJCF as text that refers to no other file, as saved with
-    policies and runs (`egoskin.robots.own.portable`)."""
+    policies and runs (`egoskin.robots.portable.portable`)."""
     base: str
     """Root of `chain`, the *robot's centre frame*: the body with the free joint or, for
     a fixed-base robot, a body welded to the world or ``"world"``."""

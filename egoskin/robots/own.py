@@ -1,4 +1,4 @@
-"""Your own robots: from a folder, from a Python file, or as self-contained data.
+"""Your own robots: from a folder or from a Python file.
 
 A folder holds an MJCF or URDF and ``robot.toml``::
 
@@ -15,8 +15,7 @@ A folder holds an MJCF or URDF and ``robot.toml``::
     [gains.soft]                           # N m/rad, N m s/rad; the first set is used
     "*" = { kp = 100, kd = 5 }
 
-Names may be patterns (``*``, ``?``, ``[ab]``). Contract: the result of `portable`
-refers to no file and is the same robot wherever it is loaded.
+Names may be patterns (``*``, ``?``, ``[ab]``).
 """
 
 from __future__ import annotations
@@ -25,23 +24,19 @@ import fnmatch
 import re
 import runpy
 import sys
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from traceback import extract_tb
 from typing import Annotated, Any
-from xml.etree import ElementTree
 
-import mujoco
-import numpy as np
 from tyro.constructors import PrimitiveConstructorSpec
 
 from egoskin.bounds import is_number
 from egoskin.hints import did_you_mean
 from egoskin.robots.builtin import ROBOTS
-from egoskin.robots.chains import body_id, body_name
-from egoskin.robots.config import Gain, RobotConfig, read_robot, round_off
-from egoskin.robots.spec import set_inertia
+from egoskin.robots.config import Gain, RobotConfig, read_robot
+from egoskin.robots.portable import portable
 from egoskin.storage.files import read_regular
 
 if sys.version_info >= (3, 11):
@@ -55,8 +50,6 @@ _LISTS = ("feet", "skin_links", "untargeted_links")
 _TABLES = ("default_pose", "gains")
 _KEYS = ("name", "model", "base", *_LISTS, *_TABLES)
 _NEEDED = ("model", "base", "feet", "skin_links", "gains")
-# Collision bits of balls and floor; a robot's own bits are above them.
-_WORLD_BITS, _NUM_WORLD_BITS = 3, 2
 
 
 def find_robot(name: str) -> RobotConfig:
@@ -135,13 +128,13 @@ def robot_of(robot: str | RobotConfig) -> RobotConfig:
         if robot not in ROBOTS:
             raise ValueError(
                 f"no robot {robot!r}: it must be one of {', '.join(ROBOTS)}, or data "
-                "from egoskin.robots.own.portable(find_robot(PATH))"
+                "from egoskin.robots.portable.portable(find_robot(PATH))"
             )
         return ROBOTS[robot]
     if robot.model_path is not None:
         raise ValueError(
             f"robot {robot.name!r} refers to a file, {robot.model_path}, but must be "
-            "self-contained: use egoskin.robots.own.portable(robot)"
+            "self-contained: use egoskin.robots.portable.portable(robot)"
         )
     return robot
 
@@ -342,199 +335,3 @@ def _links(toml: _Toml, key: str, links: tuple[str, ...]) -> tuple[str, ...]:
 def _no_match(pattern: str, names: Sequence[str], what: str) -> str:
     hint = did_you_mean(pattern, names)
     return f"no {what} {pattern!r}{hint} ({what}s: {', '.join(names)})"
-
-
-def portable(robot: RobotConfig) -> RobotConfig:
-    """Return a robot as self-contained data: an MJCF of primitives, as text.
-
-    Visual meshes, actuators, sensors, key frames, their defaults, and everything that
-    is not below the base are left out; masses are kept. A cylinder becomes the capsule
-    inside it, of the same length and radius, or, if it is flat, a box; a primitive that
-    MuJoCo fits to a mesh becomes one with a size of its own. The base of a
-    URDF floats. Margins of contacts are zero. If the file does not use this package's
-    collision bits (see ``egoskin/assets/h1_2.xml``), self-collision stays as in the
-    file, and balls and floor collide with all shapes.
-
-    Args:
-        robot: A robot of the task; `RobotConfig.model_path` is read.
-
-    Raises:
-        ValueError: If a collision shape is not a sphere, capsule, box or cylinder, or
-            the model contains other elements that cannot be kept as data.
-    """
-    if robot.model_xml is not None:
-        return robot
-    spec, model = robot.spec(), robot.model
-    keep = set(robot.links)
-    _check_outermost(robot, model)
-    for kind, elements in {
-        "tendons": spec.tendons,
-        "equality constraints (in a URDF: mimic)": spec.equalities,
-    }.items():
-        if elements:
-            raise ValueError(
-                f"{robot.name}: {kind} are not supported: remove them, or fix the "
-                "joints that they move"
-            )
-    _fix_inertia(spec, model)
-    in_pairs = {pair.geomname1 for pair in spec.pairs}
-    in_pairs |= {pair.geomname2 for pair in spec.pairs}
-    for body in list(spec.worldbody.bodies):
-        if body.name not in keep:
-            spec.delete(body)
-    _fit_primitives(spec)
-    for geom in list(spec.geoms):
-        touches = geom.contype or geom.conaffinity or geom.name in in_pairs
-        if geom.parent.name == "world" or (
-            not touches and geom.type not in _PRIMITIVES
-        ):
-            spec.delete(geom)
-        elif geom.type == mujoco.mjtGeom.mjGEOM_CYLINDER:
-            _round_off(geom)
-        elif geom.type not in _PRIMITIVES:
-            raise ValueError(
-                f"{robot.name}: link {geom.parent.name!r} has a collision shape, "
-                f"{geom.name or 'unnamed'}, of kind "
-                f"{geom.type.name.removeprefix('mjGEOM_').lower()}; a robot stored as "
-                "data may have spheres, capsules, boxes and cylinders: replace it, or "
-                'make it visual only (contype="0" conaffinity="0")'
-            )
-    for each in (*spec.geoms, *spec.pairs):
-        # A ball within the margin would count as a touch.
-        each.margin = each.gap = 0.0
-    geoms, bodies = ({each.name for each in x} for x in (spec.geoms, spec.bodies))
-    for pair in list(spec.pairs):
-        if not {pair.geomname1, pair.geomname2} <= geoms:
-            spec.delete(pair)
-    for exclude in list(spec.excludes):
-        if not {exclude.bodyname1, exclude.bodyname2} <= bodies:
-            spec.delete(exclude)
-    _set_bits(spec, in_pairs)
-    for elements in (
-        *(spec.actuators, spec.sensors, spec.keys, spec.cameras, spec.lights),
-        *(spec.meshes, spec.textures, spec.hfields, spec.skins),
-        *(spec.texts, spec.numerics, spec.tuples),
-    ):
-        for element in list(elements):
-            spec.delete(element)
-    for material in spec.materials:
-        material.textures = [""] * len(material.textures)
-    base = spec.body(robot.base)
-    if robot.is_urdf and not base.joints:
-        base.add_freejoint(name="floating_base")
-    try:
-        spec.compile()
-    except ValueError as error:
-        text = " ".join(str(error).split())
-        raise ValueError(f"{robot.name} cannot be stored as data: {text}") from error
-    data = replace(robot, model_path=None, model_xml=_robot_only(spec.to_xml()))
-    try:
-        # This raises for any other element that cannot be kept.
-        _ = data.model
-    except ValueError:
-        # Or for a flat link. Other robots keep their very text.
-        if not _thicken(spec, model):
-            raise
-        data = replace(data, model_xml=_robot_only(spec.to_xml()))
-        _ = data.model
-    return data
-
-
-# Elements of a default class that apply to what is kept.
-_KEPT_DEFAULTS = ("default", "joint", "geom", "site", "material", "pair")
-
-
-def _robot_only(text: str) -> str:
-    """Return an MJCF without the settings of elements that have been left out."""
-    root = ElementTree.fromstring(text)
-    surplus = [(root, e) for e in root if e.tag in ("size", "statistic", "visual")]
-    for default in root.iter("default"):
-        surplus += [(default, e) for e in default if e.tag not in _KEPT_DEFAULTS]
-    for parent, element in surplus:
-        parent.remove(element)
-    # Otherwise the very text, to which stored robots are compared.
-    return ElementTree.tostring(root, encoding="unicode") if surplus else text
-
-
-# An MJCF has six digits. Rounded, two inertias and their sum differ by less than this.
-_ROUNDING = 1.1e-5
-_PRIMITIVES = (
-    mujoco.mjtGeom.mjGEOM_SPHERE,
-    mujoco.mjtGeom.mjGEOM_CAPSULE,
-    mujoco.mjtGeom.mjGEOM_BOX,
-    mujoco.mjtGeom.mjGEOM_CYLINDER,
-)
-_QUAT = mujoco.mjtOrientation.mjORIENTATION_QUAT
-
-
-def _check_outermost(robot: RobotConfig, model: mujoco.MjModel) -> None:
-    """Raise ValueError if the base is fixed to another body."""
-    parent = model.body_parentid[body_id(model, robot.base)]
-    if parent:
-        raise ValueError(
-            f"{robot.name}: the base {robot.base!r} is fixed to "
-            f"{body_name(model, parent)!r}, but must be attached to the world itself: "
-            "take the outermost body as base, or remove what is above it"
-        )
-
-
-def _fix_inertia(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
-    """Set the inertia of each link, which may come from shapes that are left out."""
-    for body in spec.bodies:
-        if body.name != "world" and not body.explicitinertial:
-            set_inertia(body, model)
-
-
-def _thicken(spec: mujoco.MjSpec, model: mujoco.MjModel) -> bool:
-    """Lower the largest inertia of flat links, so that it stays valid if rounded.
-
-    Returns:
-        Whether there are such links.
-    """
-    found = False
-    for body in spec.bodies:
-        inertia = np.sort(model.body_inertia[body_id(model, body.name)])
-        largest = (1 - _ROUNDING) * inertia[:2].sum()
-        if inertia[2] > largest:
-            found = True
-            set_inertia(body, model)
-            thick = np.array(body.inertia)
-            thick[thick.argmax()] = largest
-            body.inertia = thick
-    return found
-
-
-def _fit_primitives(spec: mujoco.MjSpec) -> None:
-    """Give the primitives that MuJoCo fits to meshes sizes and poses of their own."""
-    mesh = mujoco.mjtGeom.mjGEOM_MESH
-    fitted = [geom for geom in spec.geoms if geom.meshname and geom.type != mesh]
-    if not fitted:
-        return
-    # It numbers the geoms, and fits them.
-    model = spec.compile()
-    for geom in fitted:
-        geom.size, geom.pos = model.geom_size[geom.id], model.geom_pos[geom.id]
-        geom.quat, geom.alt.type = model.geom_quat[geom.id], _QUAT
-        geom.meshname = ""
-
-
-def _round_off(geom: mujoco.MjsGeom) -> None:
-    """Turn a cylinder into a capsule or, if it is flat, into a box."""
-    kind, geom.size = round_off(float(geom.size[0]), float(geom.size[1]))
-    geom.type = getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")
-
-
-def _set_bits(spec: mujoco.MjSpec, in_pairs: Collection[str]) -> None:
-    """Make balls and floor collide with all collision shapes, if they do not yet."""
-    touching = [
-        g for g in spec.geoms if g.contype or g.conaffinity or g.name in in_pairs
-    ]
-    if all(
-        g.conaffinity & _WORLD_BITS == _WORLD_BITS and not g.contype & _WORLD_BITS
-        for g in touching
-    ):
-        return
-    for geom in touching:
-        own = (1 << (31 - _NUM_WORLD_BITS)) - 1
-        geom.contype = (geom.contype & own) << _NUM_WORLD_BITS
-        geom.conaffinity = (geom.conaffinity & own) << _NUM_WORLD_BITS | _WORLD_BITS

@@ -24,7 +24,8 @@ from egoskin.make import EnvConfig
 from egoskin.robots.builtin import G1, H1_2
 from egoskin.robots.checks import check_trainable
 from egoskin.robots.config import RobotConfig
-from egoskin.robots.own import find_robot, portable, read_folder, robot_of
+from egoskin.robots.own import find_robot, read_folder, robot_of
+from egoskin.robots.portable import portable
 from egoskin.storage.formats import read_sealed
 from egoskin.storage.serialization import from_plain, to_plain
 from egoskin.storage.tensor_file import load_tensors, save_tensors

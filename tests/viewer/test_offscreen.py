@@ -13,7 +13,7 @@ from tensordict import TensorDict
 from egoskin.evaluation.throw_set import play_throws, throw_seed
 from egoskin.make import EnvConfig, make_worker_env
 from egoskin.robots.config import RobotConfig
-from egoskin.robots.own import portable
+from egoskin.robots.portable import portable
 from egoskin.sensors import Skin
 from egoskin.sensors.config import SensorConfig
 from egoskin.shapes import Sphere
