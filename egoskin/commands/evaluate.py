@@ -115,10 +115,15 @@ def share(value: float | None) -> str:
     return "     -" if value is None else f"{100 * value:6.2f} %"
 
 
+def _later(task: DodgeballConfig) -> float:
+    """Return the second age at which success counts [s]."""
+    return min(LATER, task.episode_length_s)
+
+
 def table(result: Evaluation, title: str, task: DodgeballConfig) -> str:
     """Return the results on a task as text."""
     age, end = task.success_age_s, task.episode_length_s
-    later = min(LATER, end)
+    later = _later(task)
 
     def interval(value: Estimate, scale: float, unit: str) -> str:
         mean, low, high = (scale * v for v in (value.mean, value.low, value.high))
@@ -143,6 +148,11 @@ def table(result: Evaluation, title: str, task: DodgeballConfig) -> str:
     return "\n".join([title, *lines, "  (95 % intervals in brackets)"])
 
 
+def _number(value: float | None, form: str) -> str:
+    """Return a number as text, a dash for None."""
+    return f"{'-':>7}" if value is None else format(value, form)
+
+
 def _metres(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f} m"
 
@@ -164,8 +174,8 @@ def behaviour_table(result: Behaviour) -> str:
         lines += [
             "",
             "  before the first throw, from 0.5 s on",
-            f"    base speed       {waiting.base_speed:7.3f} m/s",
-            f"    mechanical power {waiting.power:7.1f} W",
+            f"    base speed       {_number(waiting.base_speed, '7.3f')} m/s",
+            f"    mechanical power {_number(waiting.power, '7.1f')} W",
             f"    fallen           {share(waiting.fallen)}",
         ]
     lines += ["", "  distance from start    mean   90th percentile  base height     of"]
@@ -200,11 +210,12 @@ def _slip(motion: Motion) -> float | None:
     return None if motion.foot_slip is None else 100 * motion.foot_slip
 
 
-def perturbed_table(rows: list[Perturbed], age: float) -> str:
+def perturbed_table(rows: list[Perturbed], task: DodgeballConfig) -> str:
     """Return success under each perturbation as text; success as in `table`."""
+    age, later = task.success_age_s, _later(task)
     lines = [
         f"\n  {'perturbed by':<26} {f'{age:g} s':>8}  {'(95 % interval)':<16} "
-        f"{'5 s':>8}  ended by a fall"
+        f"{f'{later:g} s':>8}  ended by a fall"
     ]
     for row in rows:
         low, high = (100 * x for x in (row.success.low, row.success.high))
@@ -308,12 +319,18 @@ def main(args: list[str]) -> None:
     if config.perturbed:
         rows = perturb(*subject, **quarter, on_point=counting("perturbed"))
         line.finish()
-        print(perturbed_table(rows, task.success_age_s))
+        print(perturbed_table(rows, task))
         content["perturbed"] = [dataclasses.asdict(row) for row in rows]
     if config.map is not None:
-        lines = operating_map(*subject, **quarter, on_point=counting("map"))
+        lines = operating_map(
+            *subject,
+            **quarter,
+            trained=policy.env_config.task.throws,
+            on_point=counting("map"),
+        )
         line.finish()
-        draw_map(config.map, lines, title.removesuffix(", physics at "))
+        what = title.removesuffix(", physics at ")
+        draw_map(config.map, lines, what, task.success_age_s)
         content["map"] = [dataclasses.asdict(line) for line in lines]
         print(f"\n{config.map}: success against speed, tempo, height and direction")
     if config.json is not None:

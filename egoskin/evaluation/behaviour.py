@@ -97,11 +97,14 @@ class Motion:
 
 @dataclass(frozen=True, kw_only=True)
 class Waiting:
-    """Motion before the first throw: means over all steps from 0.5 s on."""
+    """Motion before the first throw: means over all steps from 0.5 s on.
 
-    base_speed: float
+    They are None if no robot has such a step.
+    """
+
+    base_speed: float | None
     """Planar speed of the base [m/s]."""
-    power: float
+    power: float | None
     """Mechanical power of the joints [W]."""
     fallen: float
     """Share of the episodes that end before the first throw."""
@@ -198,6 +201,7 @@ class Watcher:
         self._failed = torch.zeros(episodes, dtype=torch.bool)
         # Distance and height at each age, of the episodes that last, [2, n].
         self._base: dict[float, list[Tensor]] = {moment: [] for moment in _AGES}
+        self._waits = task.max_first_throw_step > 0
         self._waited = self._fallen_waiting = 0
         self._waiting_speed = self._waiting_power = 0.0
         self._feet = Feet(robot)
@@ -242,12 +246,13 @@ class Watcher:
         self._waiting_power += float(after["power"].double().sum())
 
     def waiting(self) -> Waiting | None:
-        """Return the motion before the first throw; None if there was no such step."""
-        if not self._waited:
+        """Return the motion before the first throw; None if that is at the start."""
+        if not self._waits:
             return None
+        steps = self._waited
         return Waiting(
-            base_speed=self._waiting_speed / self._waited,
-            power=self._waiting_power / self._waited,
+            base_speed=self._waiting_speed / steps if steps else None,
+            power=self._waiting_power / steps if steps else None,
             fallen=self._fallen_waiting / len(self._failed),
         )
 

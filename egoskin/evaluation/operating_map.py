@@ -148,6 +148,7 @@ def operating_map(
     episodes: int,
     num_workers: int | None = None,
     mask: Sequence[str] = (),
+    trained: ThrowConfig | None = None,
     on_point: Callable[[int, int], None] | None = None,
 ) -> list[Line]:
     """Return the results of a policy on throws within and beyond its training range.
@@ -160,6 +161,7 @@ def operating_map(
         episodes: Episodes per point.
         num_workers: Processes; the result does not depend on it.
         mask: Links whose sensors detect nothing, or `egoskin.sensors.MASK_ALL`.
+        trained: Throws of the training, for `Line.trained`; None: those of ``config``.
         on_point: Called with (points done, total points).
 
     Returns:
@@ -169,6 +171,7 @@ def operating_map(
         ValueError: If the policy's observation depends on the number of balls.
     """
     check_map(config)
+    trained = trained or config.task.throws
     grids = [_grid(properties) for properties in _MAPS]
     total, done = sum(map(len, grids)), 0
     lines = []
@@ -203,7 +206,7 @@ def operating_map(
         lines.append(
             Line(
                 names=tuple(what.name for what in properties),
-                trained=tuple(what.trained(config.task.throws) for what in properties),
+                trained=tuple(what.trained(trained) for what in properties),
                 points=points,
             )
         )
@@ -218,13 +221,16 @@ def _grid(properties: Sequence[_Property]) -> list[tuple[float, ...]]:
     return grid
 
 
-def draw_map(path: Path, lines: Sequence[Line], title: str) -> None:
+def draw_map(
+    path: Path, lines: Sequence[Line], title: str, success_age_s: float
+) -> None:
     """Draw an operating map; needs matplotlib.
 
     Args:
         path: Picture to write.
         lines: Result of `operating_map`.
         title: Title of the figure.
+        success_age_s: Age at which the success counts [s].
     """
     from matplotlib.figure import Figure
 
@@ -233,7 +239,7 @@ def draw_map(path: Path, lines: Sequence[Line], title: str) -> None:
     axes = figure.subplots(2, 3).flatten()
     for axis, line in zip(axes, lines, strict=False):
         if len(line.names) == 1:
-            _draw_line(axis, line)
+            _draw_line(axis, line, success_age_s)
         else:
             _draw_grid(axis, line)
     for axis in axes[len(lines) :]:
@@ -243,7 +249,7 @@ def draw_map(path: Path, lines: Sequence[Line], title: str) -> None:
     figure.savefig(path, dpi=110)
 
 
-def _draw_line(axis: Axes, line: Line) -> None:
+def _draw_line(axis: Axes, line: Line, age: float) -> None:
     x = [point.values[0] for point in line.points]
     success = [point.success for point in line.points]
     if line.trained[0] is not None:
@@ -262,7 +268,7 @@ def _draw_line(axis: Axes, line: Line) -> None:
         [100 * s.mean for s in success],
         "o-",
         color="#0072b2",
-        label="success (untouched for 3 s)",
+        label=f"success (untouched for {age:g} s)",
     )
     axis.plot(
         x,

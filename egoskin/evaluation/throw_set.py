@@ -266,11 +266,20 @@ def standard_task(
         config: The configuration.
         version: The standard; "run" keeps the throws and ends of the configuration and
             only switches its randomisation off.
+
+    Raises:
+        ValueError: If an oracle, which observes each ball, would have other balls.
     """
     if version == "run":
         task = dataclasses.replace(config.task, randomization=RandomizationConfig())
     else:
         task = evaluation_task(version, config.task)
+        own, balls = config.task.throws.num_balls, task.throws.num_balls
+        if config.sensor.coverage == "oracle" and own != balls:
+            raise ValueError(
+                f"an oracle of {own} balls cannot play standard {version}, which has "
+                f"{balls}; only standard run, the throws of its training"
+            )
     return dataclasses.replace(config, task=task)
 
 

@@ -7,6 +7,7 @@ do is at least this.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Annotated, cast
@@ -17,7 +18,9 @@ from torch import Tensor
 from torchrl.envs import Compose, TransformedEnv
 
 from egoskin.bounds import COUNT, POSITIVE, Interval, check_bounds
+from egoskin.envs.balls import PASSED_DISTANCE
 from egoskin.envs.dodgeball import DodgeballEnv
+from egoskin.envs.throws import ThrowConfig
 from egoskin.evaluation.throw_set import throw_seed
 from egoskin.make import EnvConfig, make_worker_env
 from egoskin.parallel import default_num_workers
@@ -36,6 +39,8 @@ _ELITE, _KEPT = 0.1, 0.25
 _FIRST_SPREAD, _LEAST_SPREAD = 1.2, 0.1
 # Cost of a plan's size: of two plans with the same outcome, the smaller is better.
 _SIZE_COST = 1e-3
+# Distance from a sensor to the base [m], at most.
+_SENSOR_TO_BASE = 1.0
 # A step that no episode reaches.
 _NEVER = 2**31
 
@@ -50,8 +55,8 @@ class SearchConfig:
     """Maximum number of iterations; the search ends when all balls are avoided and the
     robot still stands."""
     stand_s: Annotated[float, POSITIVE] = 1.25
-    """Time simulated from the start of a plan [s]: longer than the ball takes to pass;
-    the robot must not fall."""
+    """Least time simulated from the start of a plan [s], in which the robot must not
+    fall; it is longer where the ball needs more to pass."""
     seed: int = 0
     """Seed of the random plans."""
 
@@ -65,9 +70,9 @@ class Outcome:
     """Outcomes of throws, ``[N]`` bool each."""
 
     avoided: Tensor
-    """The ball does not touch the robot within `SearchConfig.stand_s`."""
+    """The ball passes the robot without touching it."""
     stood: Tensor
-    """Nor does the robot fall in that time."""
+    """Nor does the robot fall in the time simulated."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,8 +139,8 @@ def find_upper_bound(
         Outcomes for the balls that came within reach before the episode ended.
 
     Raises:
-        ValueError: If no ball comes within reach, ``stand_s`` is below a control step,
-            or the sensors are corrupted (each copy of a throw would have other ones).
+        ValueError: If no ball comes within reach, or the sensors are corrupted (each
+            copy of a throw would have other ones).
     """
     if config.sensor.corruption != "none":
         raise ValueError(
@@ -143,13 +148,11 @@ def find_upper_bound(
             f"corruption={config.sensor.corruption}"
         )
     hz, seed = config.task.physics.control_hz, throw_seed(config, throw_set)
-    if (steps := round(search.stand_s * hz)) < 1:
-        raise ValueError(
-            f"stand_s must be at least one control step, got {search.stand_s}"
-        )
-    # The time limit must not cut a plan short.
     task = config.task
-    length = task.episode_length_s + search.stand_s
+    duration = max(search.stand_s, _time_to_pass(task.throws, reach))
+    steps = math.ceil(duration * hz)
+    # The time limit must not cut a plan short.
+    length = task.episode_length_s + duration
     longer = replace(config, task=replace(task, episode_length_s=length))
 
     def make(rows: int, config: EnvConfig) -> TransformedEnv:
@@ -183,7 +186,7 @@ def find_upper_bound(
         untouched, avoided, age = (
             x.reshape(n, samples) for x in _play(env, policy, starts, plan, steps, ball)
         )
-        stood = untouched & (age == steps)
+        stood = avoided & (age == steps)
         cost = torch.where(untouched, 1.0 - age / steps, 2.0)
         cost += _SIZE_COST * plans.square().mean((2, 3))
         if iteration == 1:
@@ -209,6 +212,13 @@ def find_upper_bound(
         thrower.draw(seed, start.throw, zero, zero + ball - 1)
     )
     return UpperBound(height=height, policy=own, best=best)
+
+
+def _time_to_pass(throws: ThrowConfig, reach: float) -> float:
+    """Return how long the slowest ball needs until it has passed [s]."""
+    flight = math.hypot(throws.distance[1], throws.height[1])
+    way = min(reach + _SENSOR_TO_BASE, flight) + PASSED_DISTANCE
+    return way / throws.speed[0]
 
 
 def _until_in_reach(
@@ -271,14 +281,13 @@ def _play(
     """Play from the start states with plans ``[M, T, J]`` added to the actions.
 
     Returns:
-        Whether no ball hit; whether the given ball did not, which a fall before it has
-        passed leaves open and counts as no, ``[M]`` bool each; and number of steps
-        survived, ``[M]``.
+        Whether no ball hit; whether the given ball has passed without a hit, ``[M]``
+        bool each; and number of steps survived, ``[M]``.
     """
     _task(env).load_simulation_state(start.simulation)
     root = start.root.clone()
     running = torch.ones(len(root), dtype=torch.bool)
-    untouched, avoided = running.clone(), running.clone()
+    untouched, passed = running.clone(), ~running
     age = torch.full((len(root),), steps)
     for number in range(steps):
         action = policy(root)["action"]
@@ -288,10 +297,10 @@ def _play(
         after = cast(TensorDictBase, step["next"])
         ended = running & after["done"][:, 0]
         untouched &= ~(ended & after["hit"][:, 0])
-        avoided &= ~(ended & (after["balls_avoided"].sum(-1) < ball))
+        passed |= running & (after["balls_avoided"].sum(-1) >= ball)
         age[ended] = number
         running &= ~ended
-    return untouched, untouched & avoided, age
+    return untouched, untouched & passed, age
 
 
 def _task(env: TransformedEnv) -> DodgeballEnv:

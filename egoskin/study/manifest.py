@@ -23,6 +23,7 @@ from typing import Annotated, Any
 
 from egoskin.bounds import COUNT, check_bounds
 from egoskin.envs.standards import Standard, training_task
+from egoskin.evaluation.throw_set import standard_task
 from egoskin.hints import did_you_mean
 from egoskin.make import EnvConfig
 from egoskin.policies.policy import load_networks
@@ -368,8 +369,9 @@ def resolve(study: Study) -> Manifest:
                 skin = config.env.skin.build(config.env.robot_config)
                 skins[key] = skin, content_hash(skin.to_dict())
             skin, digest = skins[key]
-            # Raises for sensors that do not fit each other.
+            # These raise for sensors that do not fit each other, or the evaluation.
             config.env.pipeline(skin)
+            standard_task(config.env, study.evaluation.standard)
             init = None
             if config.init_from is not None:
                 init = content_hash({}, load_networks(config.init_from)[0])

@@ -11,7 +11,7 @@ from tensordict import TensorDict
 
 from egoskin.envs.dodgeball import DodgeballConfig
 from egoskin.envs.throws import Thrower
-from egoskin.evaluation.behaviour import Group, Watcher, behave
+from egoskin.evaluation.behaviour import Group, Waiting, Watcher, behave
 from egoskin.evaluation.feet import Feet
 from egoskin.evaluation.throw_set import Episodes, evaluate, play_throws
 from egoskin.make import EnvConfig
@@ -237,6 +237,15 @@ def test_waiting_by_hand():
 
 def test_nobody_waits_for_a_ball_that_is_thrown_at_the_start(rigid):
     assert rigid[0].waiting() is None
+
+
+def test_robots_that_fall_at_once_are_counted_before_the_first_throw():
+    throws = replace(AT_ONCE, first_delay=(0.0, 1.0))
+    watcher = Watcher(make(throws=throws), 0, 4)
+    ends = torch.tensor([[True], [True], [True], [False]])
+    after = state(4, first_throw_step=torch.full((4, 1), 20), terminated=ends)
+    watcher(state(4), after, torch.ones(4, dtype=torch.bool))
+    assert watcher.waiting() == Waiting(base_speed=None, power=None, fallen=0.75)
 
 
 def test_success_is_counted_from_the_first_throw():

@@ -111,6 +111,8 @@ def test_an_operating_map_is_the_success_on_each_throw(monkeypatch):
     speed, tempo = maps._speed((4.0, 9.0)), maps._interval((1.0, 2.5))
     monkeypatch.setattr(maps, "_MAPS", ((speed,), (speed, tempo)))
     config = replace(CONFIG, task=replace(CONFIG.task, success_s=1.0))
+    # What is played may be another task than that of the training.
+    trained = replace(config.task.throws, speed=(2.0, 12.0))
     done = []
     lines = operating_map(
         None,
@@ -119,12 +121,13 @@ def test_an_operating_map_is_the_success_on_each_throw(monkeypatch):
         throw_set=5,
         episodes=16,
         mask=MASK_ALL,
+        trained=trained,
         on_point=lambda *counts: done.append(counts),
     )
     assert done == [(i, 6) for i in range(1, 7)]
     alone, both = lines
-    assert alone.trained == ((4.0, 8.0),)
-    assert both.trained == ((4.0, 8.0), (1.0, 2.0))
+    assert alone.trained == ((2.0, 12.0),)
+    assert both.trained == ((2.0, 12.0), (1.0, 2.0))
     assert [p.values for p in alone.points] == [(4.0,), (9.0,)]
     assert [p.values for p in both.points] == [
         (4.0, 1.0),
@@ -182,15 +185,23 @@ def test_a_map_is_drawn_with_its_numbers(suffix, tmp_path):
         ),
     ]
     path = tmp_path / f"map{suffix}"
-    draw_map(path, lines, "a policy")
+    draw_map(path, lines, "a policy", 2.0)
     assert path.stat().st_size > 1000
     if suffix == ".svg":
         import matplotlib as mpl
 
         with mpl.rc_context({"svg.fonttype": "none"}):
-            draw_map(path, lines, "a policy")
+            draw_map(path, lines, "a policy", 2.0)
         text = path.read_text()
-        for shown in ("a policy", ">37<", ">41<", ">13<", ">29<", "trained on"):
+        for shown in (
+            "a policy",
+            ">37<",
+            ">41<",
+            ">13<",
+            ">29<",
+            "trained on",
+            "for 2 s",
+        ):
             assert shown in text, shown
 
 

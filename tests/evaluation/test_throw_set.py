@@ -36,6 +36,18 @@ def test_the_throws_of_the_training_are_played_without_its_randomisation():
     assert standard_task(config).task.throws.first_delay == (0.0, 0.0)
 
 
+def test_an_oracle_plays_no_standard_with_other_balls():
+    throws = dataclasses.replace(TASK.throws, num_balls=3)
+    task = dataclasses.replace(TASK, throws=throws)
+    oracle = EnvConfig(task=task, sensor=SensorConfig(coverage="oracle"))
+    with pytest.raises(ValueError, match="oracle of 3 balls cannot play standard 2"):
+        standard_task(oracle)
+    assert standard_task(oracle, "run").task.throws.num_balls == 3
+    # A skin does not see how many there are.
+    field = dataclasses.replace(oracle, sensor=SensorConfig())
+    assert standard_task(field).task.throws.num_balls == 2
+
+
 def test_wilson_interval_by_hand():
     # n = 100, p = 0.1, z = 1.96: centre 0.1148, half-width 0.0596 (a table's values).
     estimate = wilson(10, 100)

@@ -168,13 +168,57 @@ def test_a_ball_that_comes_after_a_fall_does_not_count_as_avoided(policy: Policy
     assert not avoided.any()
 
 
-def test_a_search_ends_when_nothing_is_left_to_improve(policy: Policy):
+def test_a_ball_that_still_flies_does_not_count_as_avoided(policy: Policy):
+    config = task(policy)
+    env = make(policy, config, THROWS)
+    start = _until_in_reach(env, policy, config, reach=math.inf)
+    empty = torch.zeros(THROWS, 0, len(config.robot_config.joints))
+    untouched, avoided, _ = _play(env, policy, start, empty, steps=6, ball=1)
+    assert untouched.all()
+    assert not avoided.any()
+
+
+def test_every_ball_passes_in_the_time_simulated(
+    policy: Policy, monkeypatch: pytest.MonkeyPatch
+):
+    config = task(policy)
+    throws = replace(config.task.throws, speed=(4.0, 4.0), distance=(6.0, 6.0))
+    config = replace(config, task=replace(config.task, throws=throws))
+    played = []
+
+    def play(env, policy, start, plan, steps, ball) -> tuple[torch.Tensor, ...]:
+        result = _play(env, policy, start, plan, steps, ball)
+        played.append(result)
+        return result
+
+    monkeypatch.setattr(upper_bound, "_play", play)
+    search = SearchConfig(samples=4, iterations=1, stand_s=0.1)
+    which = {"throw_set": 0, "throws": THROWS}
+    near = find_upper_bound(policy, config, search, reach=2.0, **which)
+    far = find_upper_bound(policy, config, search, reach=math.inf, **which)
+    # The policy's own outcome does not depend on where its plans would begin.
+    assert torch.equal(near.policy.avoided, far.policy.avoided)
+    assert 0 < int(far.policy.avoided.sum()) < THROWS
+    for untouched, avoided, age in played:
+        # Who neither falls nor is hit has been passed.
+        standing = untouched & (age == age.max())
+        assert standing.any()
+        assert avoided[standing].all()
+
+
+def test_a_search_ends_when_nothing_is_left_to_improve(
+    policy: Policy, monkeypatch: pytest.MonkeyPatch
+):
+    def play(env, policy, start, plan, steps, ball) -> tuple[torch.Tensor, ...]:
+        whole = torch.ones(len(plan), dtype=torch.bool)
+        return whole, whole, torch.full((len(plan),), steps)
+
+    monkeypatch.setattr(upper_bound, "_play", play)
     iterations = []
     bound = find_upper_bound(
         policy,
         task(policy),
-        # After a control step no ball has arrived yet.
-        SearchConfig(samples=4, iterations=3, stand_s=1 / 60),
+        SearchConfig(samples=4, iterations=3),
         throw_set=0,
         throws=2,
         reach=2.0,
@@ -237,12 +281,6 @@ def test_balls_that_never_come_into_reach_are_an_error(policy: Policy):
         find_upper_bound(
             policy, task(policy), SEARCH, throw_set=0, throws=4, reach=2.0, ball=50
         )
-
-
-def test_a_plan_lasts_a_control_step_at_least(policy: Policy):
-    short = SearchConfig(stand_s=0.001)
-    with pytest.raises(ValueError, match="stand_s must be at least one control step"):
-        find_upper_bound(policy, task(policy), short, throw_set=0, throws=1, reach=2.0)
 
 
 @pytest.mark.parametrize(
