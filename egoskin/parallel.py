@@ -439,6 +439,10 @@ class WorkerPool(ParallelEnv):
                 time.sleep(_POLL)
 
         self._wait(workers, lambda worker: bool(flags[worker]), sleep)
+        # Bytes of workers that had set their flags before the parent looked: left in
+        # the pipe, they would add up until it is full and blocks the workers.
+        while computing > 0 and wait([self._bell.fileno()], 0):
+            computing -= len(self._bell.read(computing))
         for worker in workers:
             flags[worker] = 0
 

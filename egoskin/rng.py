@@ -1,9 +1,9 @@
 """Counter-based random numbers, independent of the order of draws.
 
-Every draw of the project is a pure function of (seed, row, episode, counter,
-stream), computed by the generator Philox4x32-10. A worker that simulates rows 2048 to
-4095 draws the same numbers for them as a single process would. Results therefore do not
-depend on the number of workers or threads, or on the order of resets.
+Every draw of environments and sensors is a pure function of (seed, row, episode,
+counter, stream), computed by the generator Philox4x32-10. A worker that simulates rows
+2048 to 4095 draws the same numbers for them as a single process would. Results
+therefore do not depend on the number of workers or threads, or on the order of resets.
 
 Source: Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011.
 """

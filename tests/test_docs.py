@@ -351,6 +351,12 @@ def test_links_lead_somewhere(page):
         assert not anchor or anchor in anchors(target), link
 
 
+@pytest.mark.parametrize("page", [*PAGES, DOCS.parent / "README.md"], ids=str)
+def test_nothing_is_installed_from_where_it_is_not(page):
+    # Only a clone can be: the package is not on PyPI.
+    assert not re.search(r"pip install '?egoskin", page.read_text())
+
+
 def test_every_page_is_in_the_contents():
     index = (DOCS / "index.md").read_text()
     listed = re.findall(r"^(?:.*<)?([\w-]+)>?$", index, re.MULTILINE)

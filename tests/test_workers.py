@@ -5,13 +5,17 @@ from __future__ import annotations
 import ctypes
 import os
 import signal
+import struct
 import subprocess
 import sys
 import tempfile
 import threading
 import time
+from fcntl import ioctl
 from functools import partial
 from pathlib import Path
+from termios import FIONREAD
+from typing import Any
 
 import pytest
 import torch
@@ -62,6 +66,25 @@ def steps(pool: WorkerPool, root, count: int, seed: int):
         data, root = pool.step_and_maybe_reset(root)
         seen.append(data["next"].reshape(-1))
     return torch.stack(seen), root
+
+
+def test_a_parent_that_comes_late_leaves_nothing_in_the_pipe(skin, monkeypatch):
+    pool = make_pool(skin, 2)
+    wait = WorkerPool._wait
+
+    def late(self, *args: Any) -> None:
+        # Long enough that all have set their flags before the first look at them.
+        time.sleep(0.3)
+        wait(self, *args)
+
+    try:
+        root = pool.reset()
+        monkeypatch.setattr(WorkerPool, "_wait", late)
+        steps(pool, root, 3, seed=0)
+        left = struct.unpack("i", ioctl(pool._bell, FIONREAD, bytes(4)))
+        assert left == (0,)
+    finally:
+        pool.close()
 
 
 def test_results_do_not_depend_on_the_number_of_workers(skin):

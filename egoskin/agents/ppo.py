@@ -60,7 +60,7 @@ class PPOConfig:
     ppo_epochs: Annotated[int, Interval(ge=1, le=1000)] = 5
     """Passes over a rollout."""
     num_mini_batches: Annotated[int, COUNT] = 4
-    """Minibatches in each pass."""
+    """Minibatches in each pass (fewer if a rollout's frames cannot be divided so)."""
     gamma: Annotated[float, SHARE] = 0.995
     """Discount per control step."""
     gae_lambda: Annotated[float, SHARE] = 0.8

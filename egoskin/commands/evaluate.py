@@ -69,7 +69,7 @@ class EvaluateConfig:
     """Evaluate again with this many physics steps per control step, and report the loss
     of success (8: 480 Hz)."""
     map: Path | None = None
-    """Picture to write: success against speed, tempo, height and direction of the
+    """Picture to write: success against speed, interval, height and direction of the
     throws, within and beyond those of training (a quarter of the episodes each)."""
     perturbed: bool = False
     """Also evaluate on perturbed robots: other masses, friction, gains and torque
@@ -332,6 +332,6 @@ def main(args: list[str]) -> None:
         what = title.removesuffix(", physics at ")
         draw_map(config.map, lines, what, task.success_age_s)
         content["map"] = [dataclasses.asdict(line) for line in lines]
-        print(f"\n{config.map}: success against speed, tempo, height and direction")
+        print(f"\n{config.map}: success against speed, interval, height and direction")
     if config.json is not None:
         config.json.write_text(json.dumps(content, indent=2) + "\n")

@@ -47,7 +47,7 @@ Evaluate a policy on a fixed set of held-out throws.
   --mask [LINK ...]       links whose sensors detect nothing; alone: all sensors
   --behaviour             also hits by kind of throw, displacement, effort
   --perturbed             also with other masses, friction, gains, delays, pushes
-  --map PATH              picture of success against speed, tempo, height, direction
+  --map PATH              picture of success against speed, interval, height, direction
   --check-substeps INT    also with finer physics (8: 480 Hz)
   --json PATH             JSON file to write the results to
 
@@ -216,12 +216,24 @@ WITH_SUBCOMMANDS = ("skin", "robot", "study", "bench")
 """Commands whose first argument is a subcommand."""
 
 
+ARGUMENTS = {
+    "evaluate": "POLICY",
+    "view": "[POLICY ...]",
+    "film": "[POLICY]",
+    "upper-bound": "POLICY",
+    "replay": "FILE",
+    "export": "POLICY --out PATH",
+}
+"""Positional and required arguments by command."""
+
+
 def page(name: str) -> str:
     """Return the short help page of a command."""
     if name in WITH_SUBCOMMANDS:
         return f"usage: egoskin {name} COMMAND [OPTIONS]\n\n{PAGES[name].rstrip()}"
+    words = " ".join(filter(None, (name, ARGUMENTS.get(name), "[OPTIONS]")))
     return (
-        f"usage: egoskin {name} [OPTIONS]\n\n{PAGES[name]}\n"
+        f"usage: egoskin {words}\n\n{PAGES[name]}\n"
         f"All options: egoskin {name} --help-all"
     )
 

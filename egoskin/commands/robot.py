@@ -44,7 +44,7 @@ class Check:
     """Check a robot for problems in training, and draw it with its skin."""
 
     robot: Annotated[str, tyro.conf.Positional]
-    """Its folder (with robot.toml), my_robot.py:ROBOT, or a name."""
+    """Its folder (with robot.toml), my_robot.py:ROBOT, an MJCF or URDF, or a name."""
     skin: SkinConfig = field(default_factory=SkinConfig)
     """Placement of the sensors."""
     out: Path | None = None

@@ -460,9 +460,21 @@ def policy_file(path: str | Path) -> Path:
         path = _SHIPPED / f"{path}.safetensors"
     if path.is_dir():
         if not (path / CHECKPOINT_NAME).is_file():
-            raise ValueError(f"{path} is not a run folder: it has no {CHECKPOINT_NAME}")
+            raise ValueError(_no_checkpoint(path))
         path = path / CHECKPOINT_NAME
     return path
+
+
+def _no_checkpoint(folder: Path) -> str:
+    """Return why a folder has no checkpoint, as the text of an error."""
+    if policies := sorted((folder / "policies").glob("*.safetensors")):
+        return f"{folder} has no checkpoint; its latest policy is {policies[-1]}"
+    if (folder / "config.json").is_file():
+        return (
+            f"{folder} has no checkpoint yet: its training is starting, or was stopped "
+            f"before the first (continue with: egoskin train --resume {folder})"
+        )
+    return f"{folder} is not a run folder: it has no {CHECKPOINT_NAME}"
 
 
 def _load_agent(path: Path) -> tuple[Agent, PolicySpec, bool]:

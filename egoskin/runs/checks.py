@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import reduce
 
 import torch
 from torch import Tensor
@@ -18,7 +19,7 @@ from egoskin.policies.policy import (
 from egoskin.robots.checks import check_trainable
 from egoskin.runs.config import INIT_HASH, SKIN_HASH, TrainConfig, read_config
 from egoskin.sensors import Skin
-from egoskin.storage.serialization import to_plain
+from egoskin.storage.serialization import changed_fields, to_plain
 
 
 def check_repeats(config: TrainConfig, hashes: Mapping[str, str]) -> None:
@@ -86,6 +87,15 @@ def check_fits(
         check_env_memory(one, config.num_envs, others)
 
 
+def _other_options(spec: PolicySpec, other: PolicySpec) -> str:
+    """Return what the other policy was trained with, as text; "" if nothing differs."""
+    before, now = (to_plain(s.env) for s in (other, spec))
+    names = [n for n in changed_fields(before, now) if not n.startswith("task.")]
+    values = (reduce(dict.__getitem__, name.split("."), before) for name in names)
+    listed = ", ".join(f"{n} {v}" for n, v in zip(names, values, strict=True))
+    return f"; it was trained with {listed}" if listed else ""
+
+
 def _check_init(
     agent: Agent,
     spec: PolicySpec,
@@ -107,9 +117,11 @@ def _check_init(
             f"{path} was trained with ppo.network.normalize="
             f"{other.network.normalize}, not {spec.network.normalize}"
         )
-    for key, size in spec.sizes.items():
-        if (given := other.sizes.get(key, 0)) != size:
+    for key in {**spec.sizes, **other.sizes}:
+        here, theirs = (s.sizes.get(key, 0) for s in (spec, other))
+        if here != theirs:
             raise ValueError(
-                f"{path} reads {given} values of {key!r}, but here there are {size}"
+                f"{path} reads {theirs} values of {key!r}, but here there are {here}"
+                + _other_options(spec, other)
             )
     check_agent_tensors(agent_tensors(agent), tensors, path)

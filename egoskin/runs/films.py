@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 from types import TracebackType
 
-_SIZE, _FPS = ("480", "270"), "20"
+_SIZE, _FPS = ("480", "270"), 20.0
 # A film shows the first seconds of the longest of this many episodes, which is more
 # informative than a random one.
 _EPISODES, _SECONDS = "4", "5"
@@ -22,10 +22,12 @@ class FilmMaker:
 
     Args:
         folder: The run folder.
+        control_hz: Rate of the steps [Hz], which a film cannot exceed.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, control_hz: float) -> None:
         self._folder = folder / "films"
+        self._fps = min(_FPS, control_hz)
         self._process: subprocess.Popen[str] | None = None
         self._film = Path()
 
@@ -51,8 +53,9 @@ class FilmMaker:
         self._folder.mkdir(exist_ok=True)
         self._film = self._folder / f"{policy.stem}.mp4"
         command = [sys.executable, "-m", "egoskin", "film", str(policy)]
-        command += ["--out", str(self._film), "--standard", "run", "--fps", _FPS]
-        command += ["--size", *_SIZE, "--longest-of", _EPISODES, "--seconds", _SECONDS]
+        command += ["--out", str(self._film), "--standard", "run"]
+        command += ["--fps", f"{self._fps:g}", "--size", *_SIZE]
+        command += ["--longest-of", _EPISODES, "--seconds", _SECONDS]
         # The package may be imported from a clone, in any working directory.
         path = [str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH")]
         self._process = subprocess.Popen(

@@ -89,7 +89,7 @@ class Run:
         # Tensors to start from, once they are read.
         self._initial: dict[str, Tensor] | None = None
         # The logs so far: a line for each rollout, an entry for each start.
-        self._metrics = ""
+        self._metrics: list[str] = []
         self._starts: list[dict[str, Any]] = []
 
     @classmethod
@@ -314,7 +314,7 @@ class Run:
         self, tensors: Mapping[str, Tensor], header: Mapping[str, Any]
     ) -> None:
         """Replace the checkpoint, including all logs so far and the training setup."""
-        log = np.frombuffer(self._metrics.encode(), np.uint8).copy()
+        log = np.frombuffer("".join(self._metrics).encode(), np.uint8).copy()
         save_tensors(
             self.checkpoint_path,
             {**tensors, _METRICS: torch.from_numpy(log)},
@@ -337,9 +337,10 @@ class Run:
             self._check_trained_with(config)
         self._starts = _checked_type(list, header.pop("starts", []), "starts", what)
         if _METRICS in tensors:
-            self._metrics = _text(tensors.pop(_METRICS), what)
+            metrics = _text(tensors.pop(_METRICS), what)
         else:
-            self._metrics = _whole_rows(self._metrics_path, header.get("frames", 0))
+            metrics = _whole_rows(self._metrics_path, header.get("frames", 0))
+        self._metrics = metrics.splitlines(keepends=True)
         return tensors, header
 
     def metrics(self) -> str:
@@ -375,7 +376,7 @@ class Run:
 
         The log of metrics is created again if it was removed, edited or damaged.
         """
-        path, text = self._metrics_path, self._metrics.encode()
+        path, text = self._metrics_path, "".join(self._metrics).encode()
         try:
             if not read_regular(path, sys.maxsize).startswith(text):
                 raise ValueError(f"{path} is damaged or was edited")
@@ -400,17 +401,18 @@ class Run:
         """
         assert self._events is not None, "call start_metrics first"
         first, line = not self._metrics, io.StringIO()
-        columns = metrics if first else next(csv.reader(self._metrics.splitlines()))
+        columns = metrics if first else next(csv.reader(self._metrics[:1]))
         writer = csv.DictWriter(line, list(columns))
         if first:
             writer.writeheader()
         writer.writerow(dict(metrics))
-        self._metrics += line.getvalue()
+        added = line.getvalue().splitlines(keepends=True)
+        self._metrics += added
         try:
-            append(self._metrics_path, line.getvalue().encode())
+            append(self._metrics_path, "".join(added).encode())
         except FileNotFoundError:
             # This is the first line, or the file was removed.
-            write_file(self._metrics_path, self._metrics.encode())
+            write_file(self._metrics_path, "".join(self._metrics).encode())
         self._events.log(metrics)
         if self._wandb is not None:
             self._wandb.log(metrics)

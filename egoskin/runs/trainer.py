@@ -373,7 +373,8 @@ def train(
     """
     config, run = trainer.config, trainer.run
     saved_at = time.monotonic()
-    with FilmMaker(run.path) as films:
+    control_hz = config.env.task.physics.control_hz
+    with FilmMaker(run.path, control_hz) as films:
         while trainer.frames < config.total_frames and not stop():
             start = time.monotonic()
             before = trainer.frames

@@ -78,8 +78,8 @@ class SensorConfig:
     """Spherical field, grid of beams, none (a blind robot), or oracle: the true
     position and velocity of every ball instead of sensors, for comparison."""
     signal: Literal["localization", "proximity", "closeness", "binary"] = "proximity"
-    """localization: position of the nearest detected ball; proximity: distance / range;
-    closeness: 1 - distance / range; binary: 1 if in range."""
+    """localization: position of the nearest detected ball; proximity: distance / range
+    (d / (d + 1 m) with range inf); closeness: 1 - proximity; binary: 1 if in range."""
     range: Annotated[float, Interval(ge=1e-3, le=math.inf)] = 2.0
     """Detection range [m], to the ball's surface; "inf" is allowed."""
     field: Field = dataclasses.field(default_factory=Field)

@@ -20,7 +20,7 @@ from setuptools.config.pyprojecttoml import read_configuration
 from calling import SCRIPTS, fail, succeed
 from egoskin import __version__, commands
 from egoskin.commands import COMMANDS
-from egoskin.commands.pages import PAGES, WITH_SUBCOMMANDS, page
+from egoskin.commands.pages import ARGUMENTS, PAGES, WITH_SUBCOMMANDS, page
 from egoskin.commands.train import main as train
 
 ROOT = SCRIPTS.parent
@@ -104,6 +104,12 @@ def test_the_first_page_says_what_the_options_are(name):
     """Names, choices and defaults are the same as in the parser."""
     usage, options = re.split(r"\boptions  *[-─ ]", described(name), maxsplit=1)
     assert usage.startswith(f"usage: egoskin {name} ")
+    # Of the parser's usage: positionals, in brackets if optional; required options.
+    parsed = " ".join(usage.split("\n\n")[0].split()[3:])
+    parsed = re.sub(r"\[(-h|OPTIONS|--[^]]*)\] ?", "", parsed)
+    own = ARGUMENTS.get(name, "")
+    assert (own[:1] == "[", bool(own)) == (parsed[:1] == "[", bool(parsed)), parsed
+    assert re.findall(r"--\S+", own) == re.findall(r"--\S+", parsed)
     whole = " ".join(options.replace("│", " ").split())
     first = re.split(r"\n  (?=--)", PAGES[name].split("\n\n  egoskin")[0])[1:]
     assert len(first) <= 10

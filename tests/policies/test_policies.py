@@ -355,6 +355,23 @@ def test_a_file_that_is_there_comes_before_a_name(tmp_path, monkeypatch):
         egoskin.load_policy("localization")
 
 
+def test_a_folder_without_a_checkpoint_is_explained(tmp_path):
+    def told() -> str:
+        with pytest.raises(ValueError, match="checkpoint") as error:
+            egoskin.load_policy(tmp_path)
+        return str(error.value).removeprefix(f"{tmp_path} ")
+
+    assert told() == "is not a run folder: it has no checkpoint.safetensors"
+    (tmp_path / "config.json").touch()
+    assert told().startswith("has no checkpoint yet: its training is starting, or was")
+    assert told().endswith(f"egoskin train --resume {tmp_path})")
+    (tmp_path / "policies").mkdir()
+    for frames in ("000000000000", "000065536000"):
+        (tmp_path / "policies" / f"{frames}.safetensors").touch()
+    latest = tmp_path / "policies" / "000065536000.safetensors"
+    assert told() == f"has no checkpoint; its latest policy is {latest}"
+
+
 @pytest.mark.parametrize(
     "name", ["localisation", "../localization", "localization.safetensors"]
 )

@@ -133,7 +133,18 @@ def test_other_networks_than_those_of_the_run_are_refused(
     [
         (["--ppo.network.hidden", "16"], r"has layers of \[32, 32\], not of \[16\]"),
         (["--robot", "g1"], "is a policy for h1_2, not for g1"),
-        (["--history", "2"], "reads 48 values of 'observation', but here there are 96"),
+        (
+            ["--history", "2"],
+            "reads 48 values of 'observation', but here there are 96; it was trained "
+            "with history 1$",
+        ),
+        (
+            ["--init-from", "localization", "--sensor.range", "1"],
+            "reads 3 values of 'signal', but here there are 64; it was trained with "
+            "sensor.range 2.0, sensor.signal localization$",
+        ),
+        # It reads what the new one does not have.
+        (["--sensor.coverage", "none"], "64 values of 'signal', but here there are 0"),
         (["--privileged", "velocity"], "reads 50 values of 'privileged_observation'"),
         (["--init-from", "nowhere"], "no policy nowhere"),
     ],

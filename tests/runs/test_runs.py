@@ -13,6 +13,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -222,7 +223,7 @@ def test_films_are_made_of_policies_on_the_way(config: TrainConfig, capfd):
 @pytest.mark.slow
 def test_a_film_that_cannot_be_made_is_told_of(tmp_path, capfd):
     (tmp_path / "config.json").write_text("{}")
-    with FilmMaker(tmp_path) as maker:
+    with FilmMaker(tmp_path, 60.0) as maker:
         maker.start(tmp_path / "config.json")
     waiting, line = capfd.readouterr().err.splitlines()
     assert waiting.startswith("waiting for the film ")
@@ -231,13 +232,57 @@ def test_a_film_that_cannot_be_made_is_told_of(tmp_path, capfd):
     assert "config.json" in line
 
 
+@pytest.mark.parametrize(("control_hz", "fps"), [(60.0, "20"), (10.0, "10")])
+def test_a_film_has_no_more_frames_than_the_run_has_steps(
+    control_hz, fps, tmp_path, monkeypatch
+):
+    commands = []
+
+    class Done:
+        returncode = 0
+
+        def __init__(self, command: list[str], **kwargs: Any) -> None:
+            commands.append(command)
+
+        def poll(self) -> int:
+            return 0
+
+        def communicate(self) -> tuple[None, str]:
+            return None, ""
+
+    monkeypatch.setattr(subprocess, "Popen", Done)
+    with FilmMaker(tmp_path, control_hz) as maker:
+        maker.start(tmp_path / "policy.safetensors")
+    (command,) = commands
+    assert command[command.index("--fps") + 1] == fps
+    assert command[command.index("--size") + 1 :][:3] == ["480", "270", "--longest-of"]
+
+
+def test_a_long_log_does_not_slow_its_next_line(config: TrainConfig):
+    def seconds(lines: int) -> float:
+        run = Run.create(replace(config, run_dir=config.run_dir / str(lines)))
+        run.record_start()
+        row = {"frames": 1.0, **{f"value_{i}": i / 3 for i in range(30)}}
+        run.start_metrics(0)
+        run.log(row)
+        run._metrics += run._metrics[1:] * lines
+        began = time.process_time()
+        for _ in range(20):
+            run.log(row)
+        ended = time.process_time()
+        run.close()
+        return ended - began
+
+    assert min(seconds(50_000 + i) for i in range(3)) < 10 * seconds(1)
+
+
 def test_a_killed_film_is_told_of_and_one_that_training_ends_is_not(tmp_path, capfd):
-    with FilmMaker(tmp_path) as maker:
+    with FilmMaker(tmp_path, 60.0) as maker:
         maker.start(tmp_path / "policy.safetensors")
         assert maker._process is not None
         maker._process.kill()
     assert "policy.mp4 failed: exit status -9" in capfd.readouterr().err
-    with suppress(OSError), FilmMaker(tmp_path) as maker:
+    with suppress(OSError), FilmMaker(tmp_path, 60.0) as maker:
         maker.start(tmp_path / "policy.safetensors")
         raise OSError("full")
     assert capfd.readouterr().err == ""
