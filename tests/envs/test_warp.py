@@ -30,6 +30,7 @@ from egoskin.envs.physics import (
     Variation,
     engine_of,
 )
+from egoskin.envs.randomization import Randomization, RandomizationConfig
 from egoskin.envs.throws import Thrower
 from egoskin.evaluation.throw_set import play_throws, standard_task
 from egoskin.make import EnvConfig, make_worker_env
@@ -46,6 +47,7 @@ from throwing import TASK
 pytestmark = [pytest.mark.slow, pytest.mark.warp]
 if find_spec("mujoco_warp") is None:
     pytest.skip("mujoco-warp is not installed (extra gpu)", allow_module_level=True)
+wp = pytest.importorskip("warp")
 
 DEFAULT = torch.from_numpy(H1_2.default_joint_pos).float()
 J = len(DEFAULT)
@@ -237,6 +239,31 @@ def test_robots_that_differ_do_so_as_with_mujoco():
     assert largest_gaps(plain.read(), both[0].read())["joint_pos"] > 5e-2
 
 
+def test_what_masses_determine_is_computed_only_if_they_vary(monkeypatch):
+    n, launches = 2, []
+    launch = wp.launch
+
+    def count(kernel, *args, **kwargs):
+        launches.append(kernel)
+        return launch(kernel, *args, **kwargs)
+
+    physics = engine_of("warp")(scene(), n)
+    monkeypatch.setattr(wp, "launch", count)
+    rows = torch.arange(n)
+    for config, least, most in (
+        (RandomizationConfig(friction=(0.5, 0.9)), 0, 0),
+        (RandomizationConfig(link_mass=(1.1, 1.2)), 100, 2000),
+    ):
+        sizes = (len(H1_2.links), J, 60.0)
+        random = Randomization(config, n, *sizes, torch.device("cpu"))
+        variation = random.variation(0, rows, torch.zeros_like(rows))
+        for _ in range(2):
+            launches.clear()
+            physics.vary(rows, variation)
+        print(f"launches of {variation.varies_mass=}: {len(launches)}")
+        assert least <= len(launches) <= most
+
+
 def test_a_policy_dodges_as_well_as_with_mujoco():
     throws, policy = 256, load_policy("field_proximity")
     config = standard_task(policy.env_config)
@@ -370,10 +397,15 @@ def test_a_gpu_trains_and_its_policy_plays_on_both_engines(tmp_path: Path):
     size = ("--num-envs", 64, "--ppo.num-mini-batches", 2)
     succeed("train", *on_gpu, *size, "--run-dir", folder, "--total-frames", 2048)
     succeed("train", "--resume", folder, "--total-frames", 4096)
-    env = make_worker_env(EnvConfig(), num_envs=4, seed=0, engine="warp", device="cuda")
+    random = RandomizationConfig(link_mass=(0.9, 1.1))
+    config = EnvConfig(task=replace(TASK, randomization=random))
+    env = make_worker_env(config, num_envs=4, seed=0, engine="warp", device="cuda")
+    env.reset()
     env.rollout(3)
-    # The second step was captured.
-    assert env.base_env.physics._graph is not None
+    # The second step and the second variation of masses were captured.
+    graphs = env.base_env.physics._graphs
+    assert len(graphs) == 2
+    assert None not in graphs.values()
     for engine in (on_gpu, ()):
         succeed("evaluate", folder, "--episodes", 8, *engine)
 
