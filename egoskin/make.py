@@ -340,7 +340,12 @@ def device_of(name: str) -> torch.device:
     """
     valid = ["cpu", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]
     if name not in valid and not (name == "cuda" and len(valid) > 1):
-        raise ValueError(f"no device {name!r}; available: {', '.join(valid)}")
+        why = ""
+        if name.startswith("cuda") and len(valid) == 1:
+            why = ": PyTorch finds no GPU, or no driver for it (see nvidia-smi)"
+            if not torch.backends.cuda.is_built():
+                why = ": this PyTorch is built for the CPU, install one with CUDA"
+        raise ValueError(f"no device {name!r}{why}; available: {', '.join(valid)}")
     return torch.device(name)
 
 

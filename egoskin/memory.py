@@ -22,6 +22,9 @@ _OUT_OF_MEMORY = (
     "not enough memory",
     "unable to allocate shared memory",
     "can't start new thread",
+    # Warp, and CUDA's own text in other errors.
+    "Failed to allocate",
+    "CUDA error: out of memory",
 )
 
 

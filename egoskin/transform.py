@@ -1,8 +1,9 @@
 """Base classes of the project's TorchRL transforms, with and without state.
 
 Contract: a row of the result depends only on the same row of the inputs and of the
-state. On a partial reset only the rows that reset are computed; the environment fills
-in the others.
+state. On a partial reset the environment takes only the rows that reset. On the CPU the
+others are not computed; a GPU computes all, if they have no state, because it would
+otherwise wait until the host has counted the rows.
 """
 
 from __future__ import annotations
@@ -123,6 +124,10 @@ def _on_device_of(spec: Composite, own: TensorSpec) -> TensorSpec:
     return own if spec.device is None else own.to(spec.device)
 
 
+def _on_gpu(tensordict: TensorDictBase) -> bool:
+    return tensordict.device is not None and tensordict.device.type != "cpu"
+
+
 def _spread(values: Tensor, rows: Tensor, total: int) -> Tensor:
     """Scatter padded values of some rows ``[n, ...]`` into zeros ``[total, ...]``."""
     full = values.new_zeros(total, *values.shape[1:])
@@ -174,6 +179,8 @@ class RowTransform(_KeyedTransform):
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
+        if _on_gpu(tensordict_reset):
+            return self._call(tensordict_reset)
         total = tensordict_reset.batch_size.numel()
         partial = self._rows_to_reset(tensordict, total)
         if partial is None:

@@ -163,7 +163,8 @@ def assert_same_bits_in_any_batch(sensor, state) -> None:
 
 
 def use_warp_kernels(monkeypatch) -> None:
-    """Let all sensors with kernels use those of a GPU, on Warp's CPU device."""
+    """Let sensors and draws use the kernels of a GPU, on Warp's CPU device."""
+    monkeypatch.setattr("egoskin.rng._on_gpu", lambda x: True)
     here = torch.device("cpu")
     monkeypatch.setattr(Kernels, "can", lambda self, *_: True)
     for name in ("measure", "hits"):

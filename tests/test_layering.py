@@ -19,6 +19,7 @@ TOOLS = [
     "bounds",
     "memory",
     "rounding",
+    "warp_philox",
     "rng",
     "sparse",
     "progress",

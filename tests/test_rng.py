@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+
 import pytest
 import torch
 from hypothesis import given
@@ -9,6 +11,7 @@ from hypothesis import strategies as st
 
 from egoskin.rng import (
     Stream,
+    _warp_philox,
     check_seed,
     halfwords,
     held_out,
@@ -16,6 +19,7 @@ from egoskin.rng import (
     philox,
     random_words,
     standard_normal,
+    stream_key,
     uniform,
 )
 
@@ -245,3 +249,24 @@ def test_a_normal_number_does_not_depend_on_its_batch(halves):
     batch = standard_normal(torch.tensor(halves))
     for half, z in zip(halves, batch, strict=True):
         assert torch.equal(standard_normal(torch.tensor(half)), z)
+
+
+@pytest.mark.slow
+@pytest.mark.warp
+@pytest.mark.skipif(find_spec("mujoco_warp") is None, reason="needs mujoco-warp")
+def test_the_kernel_of_a_gpu_gives_the_same_bits():
+    draw = torch.Generator().manual_seed(0)
+    counter = torch.randint(2**32, (4, 40_000), generator=draw)
+    edges = torch.tensor([0, 1, 2**31 - 1, 2**31, 2**32 - 1])
+    counter = torch.cat((counter, torch.cartesian_prod(*[edges] * 4).t()), 1)
+    shapes = (counter, counter[:, :48].reshape(4, 3, 16), counter[:, 0], counter[:, :0])
+    keys = [
+        stream_key(seed, stream)
+        for seed in (0, 2**31, 2**32 - 1, held_out(7))
+        for stream in Stream
+    ]
+    kernel = _warp_philox()
+    assert kernel is not None
+    for key in keys:
+        for x in shapes:
+            assert torch.equal(kernel(x, key), philox(x, key))

@@ -489,6 +489,26 @@ def test_signals_are_those_of_the_state_under_staggered_resets(signal, content):
     assert ((per_step > 0) & (per_step < 6)).sum() >= 3  # partial resets happened
 
 
+@every_transform
+def test_a_reset_gives_its_rows_what_all_rows_give_them(build, full_state):
+    transform, state = build(), full_state(50)
+    state = select(state, transform.in_keys)
+    whole = transform(state.clone())
+    mask = torch.arange(50)[:, None] % 7 == 3
+    reset = TensorDict({"_reset": mask}, [50])
+    part = transform._reset(reset, state.clone())
+    for key in transform.out_keys:
+        assert torch.equal(part[key][mask[:, 0]], whole[key][mask[:, 0]])
+
+
+def test_a_reset_on_another_device_waits_for_nothing(full_state):
+    # Nothing can be read on the meta device.
+    state = full_state(8).to("meta")
+    reset = TensorDict({"_reset": torch.ones(8, 1, dtype=torch.bool)}, [8]).to("meta")
+    out = BUILDERS["proprioception"]().to("meta")._reset(reset, state)
+    assert out["observation"].shape == (8, 6 + 2 * JOINTS)
+
+
 def test_the_actor_observes_its_previous_action_only_if_asked():
     plain, told = (
         make_worker_env(config, SKIN, num_envs=6, seed=0, keep_raw=True)

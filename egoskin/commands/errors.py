@@ -88,6 +88,8 @@ def clear_errors() -> Iterator[None]:
     except Exception as error:
         if is_out_of_memory(error):
             first, *_ = str(error).splitlines() or ["out of memory"]
+            if "cuda" in first.lower():
+                first += "; for fewer robots: --num-envs, --episodes or --worlds"
             print(f"error: too little memory: {first}", file=sys.stderr)
             raise SystemExit(2) from None
         if not isinstance(error, (ValueError, OSError, OverflowError, RecursionError)):

@@ -300,8 +300,10 @@ class DodgeballEnv(EnvBase):
         arrived = self.balls.state["passed"].clone()
 
         due = self.balls.due(counters["step"]) & ~terminated & ~truncated
-        if due.any():
-            self._throw(due.nonzero()[:, 0])
+        # Their number is all that is read by the host.
+        throwing = due.nonzero()[:, 0]
+        if len(throwing):
+            self._throw(throwing)
             state = self.physics.read()
 
         out = self._state_td(state)

@@ -110,6 +110,7 @@ class Randomization:
             friction=between(config.friction, friction[:, 0]),
             gains=between(config.gains, gains),
             torque_limit=between(config.torque_limit, limit),
+            varies_mass=config.link_mass != _NONE,
         )
 
     def start(

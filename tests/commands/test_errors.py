@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from egoskin.commands.errors import clear_errors
+from egoskin.make import device_of
 from egoskin.parallel import WorkerError
 from egoskin.runs.config import parse_config
 from egoskin.storage.files import check_output
@@ -80,6 +81,7 @@ def test_a_number_out_of_bounds_is_named_with_its_option(args, message, capsys):
     [
         (MemoryError(), "too little memory: out of memory"),
         (RuntimeError("can't start new thread"), "too little memory: can't start new"),
+        (RuntimeError("Failed to allocate 9 bytes on device 'cpu'"), "too little mem"),
         (OverflowError("int too large to convert"), "int too large to convert"),
         (RecursionError("maximum recursion depth"), "maximum recursion depth"),
     ],
@@ -89,6 +91,35 @@ def test_what_is_too_much_for_the_machine_is_one_line(error, text, capsys):
         raise error
     assert ended.value.code == 2
     assert capsys.readouterr().err.startswith(f"error: {text}")
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        RuntimeError("Failed to allocate 85899345920 bytes on device 'cuda:0'"),
+        RuntimeError("CUDA error: out of memory\nCompile with TORCH_USE_CUDA_DSA"),
+        torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 80.00 GiB."),
+    ],
+)
+def test_too_little_memory_of_a_gpu_is_one_line_with_the_cure(error, capsys):
+    with pytest.raises(SystemExit) as ended, clear_errors():
+        raise error
+    assert ended.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: too little memory: ")
+    assert "--num-envs" in line
+
+
+@pytest.mark.parametrize(
+    ("built", "why"), [(True, "finds no GPU, or no driver"), (False, "for the CPU")]
+)
+def test_why_there_is_no_gpu_is_told(built, why, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
+    monkeypatch.setattr(torch.backends.cuda, "is_built", lambda: built)
+    with pytest.raises(ValueError, match=f"no device 'cuda': .*{why}.*available: cpu"):
+        device_of("cuda")
+    with pytest.raises(ValueError, match="no device 'gpu'; available: cpu"):
+        device_of("gpu")
 
 
 def test_more_than_torch_can_allocate_is_one_line(capsys):

@@ -11,6 +11,7 @@ import math
 from dataclasses import fields, replace
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -30,7 +31,8 @@ from egoskin.envs.physics import (
     Variation,
     engine_of,
 )
-from egoskin.envs.throws import Thrower
+from egoskin.envs.randomization import Randomization, RandomizationConfig
+from egoskin.envs.throws import ThrowConfig, Thrower
 from egoskin.evaluation.throw_set import play_throws, standard_task
 from egoskin.make import EnvConfig, make_worker_env
 from egoskin.policies.policy import PolicySpec, load_policy
@@ -46,6 +48,7 @@ from throwing import TASK
 pytestmark = [pytest.mark.slow, pytest.mark.warp]
 if find_spec("mujoco_warp") is None:
     pytest.skip("mujoco-warp is not installed (extra gpu)", allow_module_level=True)
+wp = pytest.importorskip("warp")
 
 DEFAULT = torch.from_numpy(H1_2.default_joint_pos).float()
 J = len(DEFAULT)
@@ -237,6 +240,31 @@ def test_robots_that_differ_do_so_as_with_mujoco():
     assert largest_gaps(plain.read(), both[0].read())["joint_pos"] > 5e-2
 
 
+def test_what_masses_determine_is_computed_only_if_they_vary(monkeypatch):
+    n, launches = 2, []
+    launch = wp.launch
+
+    def count(kernel, *args, **kwargs):
+        launches.append(kernel)
+        return launch(kernel, *args, **kwargs)
+
+    physics = engine_of("warp")(scene(), n)
+    monkeypatch.setattr(wp, "launch", count)
+    rows = torch.arange(n)
+    for config, least, most in (
+        (RandomizationConfig(friction=(0.5, 0.9)), 0, 0),
+        (RandomizationConfig(link_mass=(1.1, 1.2)), 100, 2000),
+    ):
+        sizes = (len(H1_2.links), J, 60.0)
+        random = Randomization(config, n, *sizes, torch.device("cpu"))
+        variation = random.variation(0, rows, torch.zeros_like(rows))
+        for _ in range(2):
+            launches.clear()
+            physics.vary(rows, variation)
+        print(f"launches of {variation.varies_mass=}: {len(launches)}")
+        assert least <= len(launches) <= most
+
+
 def test_a_policy_dodges_as_well_as_with_mujoco():
     throws, policy = 256, load_policy("field_proximity")
     config = standard_task(policy.env_config)
@@ -370,10 +398,15 @@ def test_a_gpu_trains_and_its_policy_plays_on_both_engines(tmp_path: Path):
     size = ("--num-envs", 64, "--ppo.num-mini-batches", 2)
     succeed("train", *on_gpu, *size, "--run-dir", folder, "--total-frames", 2048)
     succeed("train", "--resume", folder, "--total-frames", 4096)
-    env = make_worker_env(EnvConfig(), num_envs=4, seed=0, engine="warp", device="cuda")
+    random = RandomizationConfig(link_mass=(0.9, 1.1))
+    config = EnvConfig(task=replace(TASK, randomization=random))
+    env = make_worker_env(config, num_envs=4, seed=0, engine="warp", device="cuda")
+    env.reset()
     env.rollout(3)
-    # The second step was captured.
-    assert env.base_env.physics._graph is not None
+    # The second step and the second variation of masses were captured.
+    graphs = env.base_env.physics._graphs
+    assert len(graphs) == 2
+    assert None not in graphs.values()
     for engine in (on_gpu, ()):
         succeed("evaluate", folder, "--episodes", 8, *engine)
 
@@ -409,6 +442,12 @@ class Reads(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
 
+def as_on_a_gpu(monkeypatch) -> None:
+    """Let the loop take the paths of a GPU."""
+    use_warp_kernels(monkeypatch)
+    monkeypatch.setattr("egoskin.transform._on_gpu", lambda tensordict: True)
+
+
 def refuse(self: torch.Tensor, *args: object) -> None:
     raise AssertionError("a tensor is read by the host")
 
@@ -425,10 +464,13 @@ def test_a_rollout_reads_nothing_but_a_few_numbers_for_each_step(monkeypatch):
         root = env.reset()
         with monkeypatch.context() as patch, Reads() as collecting:
             if fast:
-                use_warp_kernels(patch)
+                as_on_a_gpu(patch)
             for name in ("numpy", "tolist", "cpu"):
                 patch.setattr(torch.Tensor, name, refuse)
             rollout, _, _ = collect(env, agent, root, 16, METRIC_KEYS)
+        # As on a GPU; and threads of a pool would not be counted.
+        ppo.shares = 1
+        monkeypatch.setattr(ppo, "_pool", SimpleNamespace(map=map))
         with Reads() as learning:
             ppo.update(rollout)
         counts.append((collecting.numbers, collecting.indices, learning.numbers))
@@ -439,8 +481,48 @@ def test_a_rollout_reads_nothing_but_a_few_numbers_for_each_step(monkeypatch):
     for numbers, indices, learned in counts[:2]:
         assert numbers <= 16 * 4
         assert indices <= 16 * 5
-        assert learned <= 3 * 20 + 20
+        assert 3 * 20 < learned <= 4 * 20 + 20
     assert operations[1] < operations[2] - 150
+
+
+def test_throws_and_resets_wait_as_often_for_any_number_of_robots(monkeypatch):
+    frame = 1 / 60
+    throws = {
+        "neither": ThrowConfig(first_delay=(2.0, 2.0)),
+        "throws": ThrowConfig(first_delay=(0.0, 0.0), interval=(frame, frame)),
+        "resets": ThrowConfig(first_delay=(2 * frame, 6 * frame)),
+    }
+    most: dict[tuple[str, int, bool], list[int]] = {}
+    as_on_a_gpu(monkeypatch)
+    for name, n in (("neither", 16), ("throws", 16), ("resets", 4), ("resets", 16)):
+        ends = {"episode_length_s": frame} if name == "resets" else {}
+        config = EnvConfig(task=replace(TASK, throws=throws[name], **ends))
+        env = make_worker_env(config, num_envs=n, seed=0, engine="warp")
+        root = env.reset()
+        # The points to aim at are found once.
+        _ = env.base_env.thrower._aim_points
+        for _ in range(12 if ends else 3):
+            root["action"] = env.action_spec.zero()
+            with Reads() as reads:
+                step, root = env.step_and_maybe_reset(root)
+            kind = name, n, bool(step["next", "done"].any())
+            found = reads.numbers, reads.indices, reads.operations
+            most[kind] = [*map(max, found, most.get(kind, found))]
+    for (name, n, reset), (numbers, indices, operations) in most.items():
+        print(
+            f"{name}, {n} robots, reset {reset}: numbers {numbers}, index lists "
+            f"{indices}, operations {operations}"
+        )
+    numbers, indices, operations = most["neither", 16, False]
+    thrown, ended = most["throws", 16, False], most["resets", 16, True]
+    assert most["resets", 4, True][:2] == ended[:2]
+    # One list of robots is empty without throws.
+    assert thrown[:2] == [numbers, indices]
+    assert thrown[2] < operations + 330
+    assert ended[0] <= numbers + 4
+    assert ended[1] <= indices + 2
+    # Other robots are thrown at meanwhile.
+    assert ended[2] < thrown[2] + 200
 
 
 def test_bench_engine_gives_its_rows(tmp_path: Path):

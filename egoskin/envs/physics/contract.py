@@ -95,6 +95,9 @@ class Variation:
     """For kp and kd of each joint, ``[n, J]``."""
     torque_limit: Tensor
     """For the torque limit of each joint, ``[n, J]``."""
+    varies_mass: bool = True
+    """Whether ``link_mass`` can be other than 1, at any time: what MuJoCo derives from
+    masses must then be computed again."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,7 @@ Warp's CPU device runs the same computation slowly; it is meant for tests.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -43,12 +43,12 @@ _LOST = (
     | mjw.OverflowType.CCD
     | mjw.OverflowType.CONTACT_MATCH
 )
-# Model fields that a variation sets per row, and those that MuJoCo derives from them.
+# Model fields that a variation sets per row, and those that MuJoCo derives from masses.
 _VARIED = (
     *("body_mass", "body_inertia", "geom_friction", "jnt_actfrcrange"),
     *("actuator_gainprm", "actuator_biasprm", "actuator_forcerange"),
-    *("body_subtreemass", "body_invweight0", "dof_invweight0", "actuator_acc0"),
 )
+_DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0", "actuator_acc0")
 
 
 class WarpPhysics(Physics):
@@ -103,8 +103,10 @@ class WarpPhysics(Physics):
         self._overflow = wp.to_torch(data.overflow)
         self._torque_limit = wp.to_torch(self._model.actuator_forcerange)[..., 1]
         self._overflowed = torch.zeros((), dtype=torch.bool, device=self.device)
-        # A CUDA graph of a physics step; captured after a step that loaded the kernels.
-        self._graph, self._loaded = None, False
+        # CUDA graphs by function; None: its kernels are loaded.
+        self._graphs: dict[Callable[..., None], Any] = {}
+        # Of each varied field: a view, the entries that vary, and their own values.
+        self._varied: dict[str, tuple[Tensor, Tensor, Tensor]] = {}
         num_joints = len(robot.joints)
         kp, kd = robot.joint_gains(config.gains)
         self._kd_over_kp = torch.from_numpy(kd / kp).float().to(self.device)
@@ -144,20 +146,25 @@ class WarpPhysics(Physics):
             with wp.ScopedStream(wp.stream_from_torch(stream), sync_enter=False):
                 yield
 
-    def _substep(self) -> None:
-        """Advance one physics step; on a GPU as one CUDA graph, if possible."""
+    def _run(self, function: Callable[[mjw.Model, mjw.Data], None]) -> None:
+        """Call a function of MuJoCo Warp; on a GPU as one CUDA graph, if possible.
+
+        It is captured at the second call, because the first one loads the kernels.
+        """
         device = wp.device_from_torch(self.device)
-        if self._graph is None and self._loaded and device.is_mempool_enabled:
+        graph = self._graphs.get(function)
+        if graph is None and function in self._graphs and device.is_mempool_enabled:
             torch.cuda.synchronize(self.device)
             with wp.ScopedDevice(device), wp.ScopedCapture() as capture:
-                mjw.step(self._model, self._data)
-            self._graph = capture.graph
+                function(self._model, self._data)
+            graph = self._graphs[function] = capture.graph
         with self._in_order():
-            if self._graph is None:
-                mjw.step(self._model, self._data)
-                self._loaded = device.is_cuda
-            else:
-                wp.capture_launch(self._graph, wp.get_stream())
+            if graph is not None:
+                wp.capture_launch(graph, wp.get_stream())
+                return
+            function(self._model, self._data)
+            if device.is_cuda:
+                self._graphs[function] = None
 
     def step(self, target: Tensor, active: Tensor) -> StepResult:
         """Advance every row by one control step; see `Physics.step`."""
@@ -174,7 +181,7 @@ class WarpPhysics(Physics):
         floor = active.shape[1] + 1
         links = floor + 1 + len(self.scene.robot.feet)
         for _ in range(self.config.substeps):
-            self._substep()
+            self._run(mjw.step)
             counts = self._counts
             found |= counts > 0
             # Fallen: the floor has more contacts with the robot than with its feet.
@@ -217,7 +224,7 @@ class WarpPhysics(Physics):
     def step_raw(self) -> None:
         """Advance one control step without reading results, to time physics alone."""
         for _ in range(self.config.substeps):
-            self._substep()
+            self._run(mjw.step)
 
     def note(self) -> str | None:
         """Report contacts that did not fit; see `Physics.note`."""
@@ -250,32 +257,43 @@ class WarpPhysics(Physics):
 
     def vary(self, rows: Tensor, variation: Variation) -> None:
         """Scale model fields per row; see `Physics.vary`."""
+        if not self._varied:
+            self._expand()
+
+        def scale(name: str, factor: Tensor) -> None:
+            values, places, own = self._varied[name]
+            factor = factor.reshape(*factor.shape, *[1] * (own.ndim - 1))
+            values[rows[:, None], places] = factor * own
+
+        scale("geom_friction", variation.friction[:, None])
+        scale("actuator_gainprm", variation.gains)
+        scale("actuator_biasprm", variation.gains)
+        scale("actuator_forcerange", variation.torque_limit)
+        # The joints clip the actuator torque again.
+        scale("jnt_actfrcrange", variation.torque_limit)
+        if variation.varies_mass:
+            scale("body_mass", variation.link_mass)
+            scale("body_inertia", variation.link_mass)
+            self._run(mjw.set_const)
+
+    def _expand(self) -> None:
+        """Give each row its own values of the fields that a variation scales."""
         model, n = self._mujoco, self.num_envs
+        links = [body_id(model, link) for link in self.scene.robot.links]
+        joints = model.actuator_trnid[:, 0].tolist()
+        some = {"body_mass": links, "body_inertia": links, "jnt_actfrcrange": joints}
         with self._in_order():
-            if len(self._model.body_mass) < n:
-                self._model = self._put_model(batch_sizes=dict.fromkeys(_VARIED, n))
-                self._graph, self._loaded = None, False
-                ranges = wp.to_torch(self._model.actuator_forcerange)
-                self._torque_limit = ranges[..., 1]
-            links = [body_id(model, link) for link in self.scene.robot.links]
-            joints = model.actuator_trnid[:, 0]
-
-            def scale(name: str, factor: Tensor, which: Any = slice(None)) -> None:
-                own = torch.from_numpy(getattr(model, name)[which]).to(factor)
-                factor = factor.reshape(*factor.shape, *[1] * (own.ndim - 1))
-                values = wp.to_torch(getattr(self._model, name))
-                places = torch.arange(values.shape[1], device=values.device)[which]
-                values[rows[:, None], places] = factor * own
-
-            scale("body_mass", variation.link_mass, links)
-            scale("body_inertia", variation.link_mass, links)
-            scale("geom_friction", variation.friction[:, None].expand(-1, model.ngeom))
-            scale("actuator_gainprm", variation.gains)
-            scale("actuator_biasprm", variation.gains)
-            scale("actuator_forcerange", variation.torque_limit)
-            # The joints clip the actuator torque again.
-            scale("jnt_actfrcrange", variation.torque_limit, joints)
-            mjw.set_const(self._model, self._data)
+            self._model = self._put_model(
+                batch_sizes=dict.fromkeys((*_VARIED, *_DERIVED), n)
+            )
+        self._graphs.clear()
+        for name in _VARIED:
+            values = wp.to_torch(getattr(self._model, name))
+            which = some.get(name, [*range(values.shape[1])])
+            own = torch.from_numpy(getattr(model, name)[which])
+            places = torch.tensor(which, device=values.device)
+            self._varied[name] = values, places, own.to(values)
+        self._torque_limit = self._varied["actuator_forcerange"][0][..., 1]
 
     def push(self, rows: Tensor, velocity: Tensor) -> None:
         """Change the velocity of the base of some rows; see `Physics.push`."""

@@ -380,7 +380,7 @@ class Corruption(StatefulTransform):
             (*where, f"{name}_{n}") if where else f"{name}_{n}" for n in names
         ]
         super().__init__(in_keys or needed, [out, *state_keys], state_keys)
-        self._masked: list[int] = []
+        self.register_buffer("_masked", torch.empty(0, dtype=torch.int64), False)
 
     def restart(self, seed: int | None = None) -> None:
         """Start again at episode 0, from the next reset of all rows.
@@ -405,7 +405,9 @@ class Corruption(StatefulTransform):
         Args:
             sensors: Indices of the masked sensors, or ``[S]`` bool.
         """
-        self._masked = indices(sensors)
+        self._masked = torch.tensor(
+            indices(sensors), dtype=torch.int64, device=self._masked.device
+        )
 
     def _moment(self, rows: Tensor, clock: Tensor, joint_vel: list[Tensor]) -> Moment:
         """Return the moment of some rows, from their clocks ``[B, 2]``."""
@@ -443,9 +445,8 @@ class Corruption(StatefulTransform):
             before,
             self._moment(rows, clock, joint_vel),
         )
-        if self._masked:
-            masked = torch.tensor(self._masked, device=reading.device)
-            reading = reading.index_fill(1, masked, torch.inf)
+        if len(self._masked):
+            reading = reading.index_fill(1, self._masked, torch.inf)
         values = [after[i][name] for i, name in self._states]
         return [reading.reshape(distance.shape), clock, *values]
 
@@ -465,7 +466,8 @@ class Corruption(StatefulTransform):
     ) -> list[Tensor]:
         """Return the next reading, the clock and the models' states."""
         clock, *remembered = state
-        return self._run(rows, inputs, clock + clock.new_tensor([0, 1]), remembered)
+        clock = torch.stack((clock[:, 0], clock[:, 1] + 1), -1)
+        return self._run(rows, inputs, clock, remembered)
 
     def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
         """Return the specs of the reading, the clock and the models' states."""

@@ -450,6 +450,23 @@ def test_a_restart_repeats_all_readings():
         corruption.restart(seed=-1)
 
 
+def test_a_step_makes_no_tensor_from_numbers(monkeypatch):
+    # Each would be copied to a GPU.
+    corruption = Corruption([Noise(constant=0.1)], dt=DT, seed=0)
+    corruption.mask([1])
+    rows, inputs = torch.arange(2), [torch.ones(2, 4, 1)]
+    _, *state = corruption.start(rows, inputs, None)
+
+    def refuse(*args, **kwargs):
+        raise AssertionError("a tensor is made from numbers")
+
+    monkeypatch.setattr(torch, "tensor", refuse)
+    monkeypatch.setattr(torch.Tensor, "new_tensor", refuse)
+    reading, clock, *_ = corruption.advance(rows, inputs, state)
+    assert reading.isinf()[..., 0].tolist() == [[False, True, False, False]] * 2
+    assert clock.tolist() == [[0, 1]] * 2
+
+
 def test_episode_and_step_are_counted_from_reset_to_reset():
     corruption = Corruption([Noise(constant=0.1)], dt=DT, seed=0)
     done = torch.tensor([0, 0, 1, 0, 0, 0, 1, 0], dtype=torch.bool)[None, :, None]
