@@ -7,14 +7,18 @@ import math
 import statistics
 import tempfile
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from pathlib import Path
 
+from egoskin.agents.ppo import NonFiniteError
+from egoskin.parallel import WorkerError
 from egoskin.progress import counted
 from egoskin.runs.config import TrainConfig
 from egoskin.runs.run import Run
 from egoskin.runs.trainer import open_trainer
+from egoskin.study.children import end_with_parent, sheltered
 from egoskin.study.manifest import Manifest, PlannedRun
 
 # Rollouts measured, after one warm-up rollout.
@@ -92,6 +96,9 @@ def measure_all(manifest: Manifest, run: PlannedRun, cores: int) -> list[Speed]:
         manifest: The study; all its runs can use these numbers of cores.
         run: The run to measure.
         cores: Number of cores to use.
+
+    Raises:
+        ValueError, OSError, WorkerError: As `measure`.
     """
     agents = math.gcd(*(cell.config.num_envs for cell in manifest.cells))
     choices = [2**k for k in range(cores.bit_length()) if cores % 2**k == 0]
@@ -105,23 +112,50 @@ def measure(run: PlannedRun, cores_per_run: int = 1, parallel: int = 1) -> Speed
         run: The run, the same in each process.
         cores_per_run: Workers and learner threads of each run.
         parallel: Number of parallel runs, each in its own process.
+
+    Raises:
+        ValueError: If it cannot be trained.
+        OSError: If a file cannot be read or written.
+        WorkerError: If a process ends.
     """
     runs, each = counted(parallel, "run"), counted(cores_per_run, "core")
     print(f"measuring {runs} of {run.cell.name} on {each} each ...", flush=True)
     config = dataclasses.replace(
         run.config, num_workers=cores_per_run, learner_threads=cores_per_run
     )
-    with ProcessPoolExecutor(parallel, get_context("spawn")) as processes:
-        speeds = list(processes.map(_train, [config] * parallel))
+    others = set(active_children())
+    with (
+        tempfile.TemporaryDirectory(prefix="egoskin-") as folder,
+        ProcessPoolExecutor(
+            parallel, get_context("spawn"), end_with_parent, (folder,)
+        ) as processes,
+    ):
+        try:
+            with sheltered():
+                jobs = [
+                    processes.submit(_train, config, Path(folder) / str(i))
+                    for i in range(parallel)
+                ]
+            speeds = [job.result() for job in jobs]
+        except BaseException as error:
+            # Also on Ctrl-C: they would train on.
+            for process in set(active_children()) - others:
+                process.kill()
+            if not isinstance(error, BrokenProcessPool):
+                raise
+            raise WorkerError("a process of the measurement was killed") from None
     return Speed(cores_per_run=cores_per_run, parallel=parallel, per_s=sum(speeds))
 
 
-def _train(config: TrainConfig) -> float:
-    """Train for some seconds in a temporary folder; return the steps per second."""
-    with tempfile.TemporaryDirectory(prefix="egoskin-") as folder:
-        config = dataclasses.replace(config, run_dir=Path(folder) / "run")
+def _train(config: TrainConfig, folder: Path) -> float:
+    """Train for some seconds in a new folder; return the steps per second."""
+    config = dataclasses.replace(config, run_dir=folder)
+    try:
         with open_trainer(Run.create(config)) as trainer:
             speeds = [
                 trainer.iterate()["time/steps_per_s"] for _ in range(_ROLLOUTS + 1)
             ]
+    except (ValueError, NonFiniteError) as error:
+        # Some of these cannot be sent to another process.
+        raise ValueError(str(error)) from None
     return statistics.median(speeds[1:])

@@ -15,7 +15,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -474,6 +474,71 @@ def test_only_numbers_of_cores_that_all_cells_can_use_are_measured(
     cells = ({"num_envs": 16}, {"num_envs": 6})
     manifest = resolve(dataclasses.replace(SHORT, cells=cells))
     assert measure_all(manifest, manifest.runs[0], 4) == [(1, 4), (2, 2)]
+
+
+MEASURING = """
+import os, sys, time
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+
+@dataclass
+class Config:
+    num_workers: int = 1
+    learner_threads: int = 1
+
+def wait(*args):
+    Path(sys.argv[2], str(os.getpid())).touch()
+    time.sleep(600)
+
+if __name__ == sys.argv[1]:
+    wait()
+if __name__ == "__main__":
+    from egoskin.commands.errors import clear_errors
+    from egoskin.study import cost
+
+    cost._train = wait
+    with clear_errors():
+        cell = SimpleNamespace(name="x")
+        cost.measure(SimpleNamespace(cell=cell, config=Config()), parallel=2)
+"""
+
+
+@pytest.mark.parametrize(
+    ("number", "where"),
+    [
+        # While the processes import, and while they train.
+        (signal.SIGINT, "__mp_main__"),
+        (signal.SIGKILL, ""),
+    ],
+)
+def test_a_measurement_that_is_ended_leaves_nothing(number, where, tmp_path: Path):
+    script, temporary, begun = (tmp_path / x for x in ("m.py", "tmp", "begun"))
+    script.write_text(MEASURING)
+    temporary.mkdir()
+    begun.mkdir()
+    with subprocess.Popen(
+        [sys.executable, str(script), where, str(begun)],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        env={**os.environ, "TMPDIR": str(temporary)},
+    ) as process:
+        try:
+            wait_for(lambda: len(list(begun.iterdir())) == 2)
+            # Ctrl-C reaches the whole group.
+            (os.killpg if number == signal.SIGINT else os.kill)(process.pid, number)
+            # A child that lives keeps the pipe open.
+            _, errors = process.communicate(timeout=60)
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+    killed = number == signal.SIGKILL
+    assert process.returncode == (-number if killed else 128 + number)
+    # Python itself tells of the semaphores of a process that is killed.
+    assert killed or errors == "stopped\n"
+    assert not list(temporary.iterdir())
 
 
 @pytest.mark.slow
