@@ -29,7 +29,7 @@ from egoskin.parallel import available_cores
 from egoskin.progress import counted, duration
 from egoskin.storage.files import write_file
 from egoskin.storage.serialization import to_plain
-from egoskin.study.claims import owner
+from egoskin.study.claims import is_claimed, owner
 from egoskin.study.cost import Speed, cost, measure_all
 from egoskin.study.fields import settings
 from egoskin.study.manifest import Manifest, load_study, resolve
@@ -326,14 +326,22 @@ def print_status(
         row = "".join(f"{entries[cell.name, seed]:<{wide}}" for seed in manifest.seeds)
         print(f"{cell.name:{width}}  {row.rstrip()}")
     for each in status:
-        if each.state == "running" and (where := owner(folder.claims, each.run.name)):
-            print(f"{each.run.name}: running on {where}")
+        if each.state == "running":
+            print(f"{each.run.name}: running {where(folder, each.run.name)}")
         if each.failure is not None:
             print(
                 f"{each.run.name}: failed {counted(each.failure.tries, 'time')}, "
                 f"last: {each.failure.error}"
             )
     print(Progress.of(status))
+
+
+def where(folder: StudyFolder, name: str) -> str:
+    """Return the host and process that work on a run, in a few words."""
+    if not is_claimed(folder.claims, name):
+        # A job that was killed leaves its name.
+        return "outside the study"
+    return f"on {owner(folder.claims, name) or 'an unknown host'}"
 
 
 def entry(status: RunStatus) -> str:

@@ -449,6 +449,19 @@ def test_status_says_where_a_run_is_running(folder: StudyFolder, capsys):
     assert "running on" not in capsys.readouterr().out
 
 
+def test_a_job_that_is_dead_is_not_said_to_run(folder: StudyFolder, capsys):
+    shutil.rmtree(folder.result_path(NAME))
+    manifest = folder.manifest()
+    with claimed(folder.claims, NAME):
+        (owner,) = folder.claims.glob("*.owner.*")
+        content = owner.read_text()
+    # It was killed, and its run is trained by hand.
+    owner.write_text(content)
+    with Run.open(folder.run_path(NAME)).locked():
+        print_status(folder, manifest, folder.status(manifest.runs))
+    assert f"{NAME}: running outside the study\n" in capsys.readouterr().out
+
+
 def test_a_failure_that_is_forgotten_meanwhile_is_none(folder: StudyFolder):
     # Another runner's job finishes the run while this one reads.
     folder.note_failure(NAME, "error")
