@@ -21,6 +21,8 @@ from egoskin.runs.trainer import open_trainer
 from egoskin.study.children import end_with_parent, sheltered
 from egoskin.study.manifest import Manifest, PlannedRun
 
+WORTH_MEASURING = 50_000_000
+"""Environment steps of a study that is long enough to measure its best settings."""
 # Rollouts measured, after one warm-up rollout.
 _ROLLOUTS = 3
 # Size of a policy, of a line of metrics with its events, and of a checkpoint per
@@ -47,9 +49,16 @@ class Cost:
         return self.frames / self.per_s
 
     def wall_s(self, cores: int) -> float:
-        """Return the wall time on a number of cores [s], with one run per core."""
-        one = self.core_s / self.runs
-        return -(-self.runs // cores) * one
+        """Return the wall time on a number of cores [s].
+
+        Each run has one core or, in a long study with fewer runs than cores, as many as
+        `measure_all` would find if its speed grew with them.
+        """
+        each = 1
+        if self.frames >= WORTH_MEASURING:
+            each = max((n for n in shares(cores) if n * self.runs <= cores), default=1)
+        rounds = -(-self.runs // (cores // each))
+        return rounds * self.core_s / self.runs / each
 
 
 def cost(manifest: Manifest, per_s: float) -> Cost:
@@ -79,12 +88,21 @@ class Speed:
     per_s: float
     """Environment steps per second of all runs together, learning included."""
 
+    def of(self, runs: int) -> float:
+        """Return the environment steps per second if only some runs are left."""
+        return self.per_s * min(1.0, runs / self.parallel)
+
     def __str__(self) -> str:
         """Return a line of text."""
         return (
             f"{counted(self.parallel, 'run')} side by side on "
             f"{counted(self.cores_per_run, 'core')} each: {self.per_s:,.0f} steps/s"
         )
+
+
+def shares(cores: int) -> list[int]:
+    """Return the numbers of cores per run that are tried: 1, 2, 4, ..."""
+    return [2**k for k in range(cores.bit_length()) if cores % 2**k == 0]
 
 
 def measure_all(manifest: Manifest, run: PlannedRun, cores: int) -> list[Speed]:
@@ -101,8 +119,7 @@ def measure_all(manifest: Manifest, run: PlannedRun, cores: int) -> list[Speed]:
         ValueError, OSError, WorkerError: As `measure`.
     """
     agents = math.gcd(*(cell.config.num_envs for cell in manifest.cells))
-    choices = [2**k for k in range(cores.bit_length()) if cores % 2**k == 0]
-    return [measure(run, n, cores // n) for n in choices if agents % n == 0]
+    return [measure(run, n, cores // n) for n in shares(cores) if agents % n == 0]
 
 
 def measure(run: PlannedRun, cores_per_run: int = 1, parallel: int = 1) -> Speed:

@@ -21,6 +21,8 @@ from pathlib import Path
 import pytest
 
 from calling import call, hide, limit_file_size, succeed, wait_for
+from egoskin.commands import study as command
+from egoskin.commands.study import Run as RunStudy
 from egoskin.commands.study import print_status, show
 from egoskin.evaluation.throw_set import evaluate, standard_task
 from egoskin.make import EnvConfig
@@ -32,7 +34,7 @@ from egoskin.storage.tensor_file import load_tensors, save_tensors
 from egoskin.study import cost as cost_module
 from egoskin.study import evaluation, job, store
 from egoskin.study.claims import claimed
-from egoskin.study.cost import cost, measure, measure_all
+from egoskin.study.cost import Cost, Speed, cost, measure, measure_all
 from egoskin.study.job import CLAIMED, STOPPED, Stop, work
 from egoskin.study.manifest import EvaluationPlan, Manifest, PlannedRun, Study, resolve
 from egoskin.study.metrics import runs_csv
@@ -487,6 +489,78 @@ def test_only_numbers_of_cores_that_all_cells_can_use_are_measured(
     cells = ({"num_envs": 16}, {"num_envs": 6})
     manifest = resolve(dataclasses.replace(SHORT, cells=cells))
     assert measure_all(manifest, manifest.runs[0], 4) == [(1, 4), (2, 2)]
+
+
+def test_a_long_study_with_fewer_runs_than_cores_uses_them_all():
+    total = Cost(runs=3, frames=60_000_000, per_s=1000, disk=0.0)
+    # On 16 cores each run has 4, on 2 cores the third has to wait.
+    assert total.wall_s(16) == pytest.approx(20_000 / 4)
+    assert total.wall_s(2) == pytest.approx(2 * 20_000)
+    short = dataclasses.replace(total, frames=30_000_000)
+    assert short.wall_s(16) == pytest.approx(10_000)
+
+
+LONG = dataclasses.replace(STUDY, frames=65_536_000, seeds=(0,))
+"""A study that is long enough to be measured."""
+
+
+def speeds(cores: int) -> list[Speed]:
+    """Speeds on a machine where a run hardly gains from more cores than eight."""
+    per_s = {1: 160e3, 2: 158e3, 4: 155e3, 8: 120e3, 16: 80e3}
+    return [
+        Speed(cores_per_run=n, parallel=cores // n, per_s=x) for n, x in per_s.items()
+    ]
+
+
+@pytest.mark.parametrize(("runs", "cores"), [(16, 1), (8, 2), (4, 4), (3, 8), (1, 16)])
+def test_runs_that_are_fewer_than_the_cores_have_several_each(
+    runs: int, cores: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    monkeypatch.setattr(command, "available_cores", lambda: 16)
+    monkeypatch.setattr(command, "measure_all", lambda *args: speeds(args[2]))
+    cells, seeds = STUDY.cells[:1], tuple(range(runs))
+    manifest = resolve(dataclasses.replace(LONG, cells=cells, seeds=seeds))
+    status = [RunStatus(run=run, state="missing") for run in manifest.runs]
+    assert RunStudy(dir=tmp_path)._cores_per_run(manifest, status) == cores
+
+
+def test_a_run_that_cannot_be_measured_is_told_and_another_is(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys
+):
+    manifest = resolve(dataclasses.replace(LONG, seeds=(0, 1)))
+    one, other = (cell.name for cell in manifest.cells)
+    tried = []
+
+    def measure_all(manifest: Manifest, run: PlannedRun, cores: int) -> list[Speed]:
+        tried.append(run.name)
+        if run.cell.name in broken:
+            raise ValueError("no skin")
+        return speeds(cores)
+
+    monkeypatch.setattr(command, "available_cores", lambda: 16)
+    monkeypatch.setattr(command, "measure_all", measure_all)
+    run = RunStudy(dir=tmp_path)
+    status = [RunStatus(run=run, state="missing") for run in manifest.runs]
+    broken = {one}
+    assert run._cores_per_run(manifest, status) == 4
+    assert tried == [f"{one}-seed0", f"{other}-seed0"]
+    note = f"note: {one}-seed0 cannot be measured: no skin\n"
+    assert capsys.readouterr().err == note
+    broken = {one, other}
+    assert run._cores_per_run(manifest, status) == 1
+    # A run that has used up its tries is not measured.
+    tried.clear()
+    lost = Failure(tries=3, error="no skin")
+    failed = [
+        dataclasses.replace(s, state="failed", failure=lost)
+        if s.run.cell.name == one
+        else s
+        for s in status
+    ]
+    run._cores_per_run(manifest, failed)
+    assert tried == [f"{other}-seed0"]
+    assert run._cores_per_run(manifest, failed[::2]) == 1
+    assert tried == [f"{other}-seed0"]
 
 
 MEASURING = """
