@@ -169,6 +169,16 @@ class Plan:
             f"minutes per run\n"
             f"  {total.disk / 1e9:,.2f} GB of disk"
         )
+        if self.dir is not None:
+            status = StudyFolder(self.dir).status(manifest.runs)
+            left = [each for each in status if each.state != "done"]
+            if len(left) < len(status):
+                frames = sum(each.run.end - each.frames for each in left)
+                print(
+                    f"  {len(status) - len(left)} of these runs are done; left: "
+                    f"{counted(len(left), 'run')}, {frames / per_s / 3600:,.1f} "
+                    "core-hours"
+                )
         if self.visibility:
             seen = what_is_seen(manifest)
             if seen and self.dir is not None:
@@ -288,6 +298,9 @@ class Run:
         ).run()
         print("\r\x1b[K" * sys.stdout.isatty(), end="")
         print_status(folder, manifest, folder.status(manifest.runs))
+        if any(each.state == "failed" for each in status):
+            again = f"egoskin study run --dir {self.dir} --again"
+            print(f"not tried again; to retry: {again}")
         if any(each.state != "done" for each in status):
             raise SystemExit(1)
         print(f"done; now: egoskin study report {self.dir}")

@@ -1000,6 +1000,22 @@ def test_the_command_plans_tells_and_reports(finished: Path, tmp_path: Path):
     assert "#SBATCH --array=0-0" in array
 
 
+def test_the_command_tells_what_is_left_and_what_is_not_tried_again(
+    folder: StudyFolder,
+):
+    folder.plan(resolve(dataclasses.replace(SHORT, seeds=(0, 1, 2))))
+    args = ("--dir", folder.path)
+    planned = succeed("study", "plan", *args, "--steps-per-s", "0.1")
+    # Two runs of 512 steps.
+    assert "\n  1 of these runs are done; left: 2 runs, 2.8 core-hours\n" in planned
+    for _ in range(3):
+        folder.note_failure("blind-seed1", "error")
+    again = f"not tried again; to retry: egoskin study run --dir {folder.path} --again"
+    ended = call("study", "run", *args, "--only", "blind-seed1")
+    assert (ended.returncode, ended.stdout.splitlines()[-1]) == (1, again)
+    assert again not in call("study", "run", *args, "--only", "blind-seed0").stdout
+
+
 @pytest.mark.parametrize(
     ("args", "text"),
     [
