@@ -16,6 +16,7 @@ from __future__ import annotations
 import json
 import math
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -25,22 +26,20 @@ import tyro
 from egoskin.bounds import COUNT, POSITIVE, check_bounds
 from egoskin.commands.errors import check_packages, parse_subcommand
 from egoskin.evaluation.visibility import alike, analyse, warning_texts
-from egoskin.parallel import available_cores
+from egoskin.parallel import WorkerError, available_cores
 from egoskin.progress import counted, duration
 from egoskin.storage.files import write_file
 from egoskin.storage.serialization import to_plain
-from egoskin.study.claims import owner
-from egoskin.study.cost import Speed, cost, measure_all
+from egoskin.study.claims import is_claimed, owner
+from egoskin.study.cost import WORTH_MEASURING, Speed, cost, measure_all
 from egoskin.study.fields import settings
-from egoskin.study.manifest import Manifest, load_study, resolve
+from egoskin.study.manifest import Manifest, PlannedRun, load_study, resolve
 from egoskin.study.runner import LocalRunner, Progress, Runner, slurm_script
 from egoskin.study.shipped import STUDIES
 from egoskin.study.store import RunStatus, StudyFolder
 
 # Cores of a common server.
 _MANY_CORES = 64
-# Environment steps of a study that is long enough to measure its best settings.
-_WORTH_MEASURING = 50_000_000
 # Fields that the analysis of visibility takes from the base, by their first parts.
 _OF_THE_BASE = (
     "env.robot",
@@ -94,11 +93,24 @@ def find_study(name: str) -> Manifest:
     return resolve(load_study(Path(name)))
 
 
-def fastest(speeds: list[Speed]) -> Speed:
-    """Print the measured speeds; return the highest."""
-    for speed in speeds:
-        print(f"  {speed}")
-    return max(speeds, key=lambda speed: speed.per_s)
+def fastest(manifest: Manifest, runs: Sequence[PlannedRun]) -> tuple[Speed, str] | None:
+    """Print measured speeds; return the highest for some runs, and the cell measured.
+
+    A run of each cell is tried, until one can be measured; None if none can.
+    """
+    first: dict[str, PlannedRun] = {}
+    for run in runs:
+        first.setdefault(run.cell.name, run)
+    for run in first.values():
+        try:
+            speeds = measure_all(manifest, run, available_cores())
+        except (ValueError, OSError, WorkerError) as error:
+            print(f"note: {run.name} cannot be measured: {error}", file=sys.stderr)
+            continue
+        for speed in speeds:
+            print(f"  {speed}")
+        return max(speeds, key=lambda speed: speed.of(len(runs))), run.cell.name
+    return None
 
 
 def show(text: str, stays: bool) -> None:
@@ -141,10 +153,12 @@ class Plan:
         describe(manifest)
         per_s, source, cores = self.steps_per_s, "as given", available_cores()
         if per_s is None:
-            run = manifest.runs[0]
-            best = fastest(measure_all(manifest, run, cores))
+            measured = fastest(manifest, manifest.runs)
+            if measured is None:
+                raise ValueError("no run can be measured: use --steps-per-s")
+            best, cell = measured
             per_s = best.per_s / cores
-            source = f"measured on {run.cell.name}; full ray grids take longer"
+            source = f"measured on {cell}; full ray grids take longer"
         total = cost(manifest, per_s)
         print(
             f"{counted(total.runs, 'run')}, {total.frames / 1e6:,.1f} M frames, "
@@ -155,6 +169,16 @@ class Plan:
             f"minutes per run\n"
             f"  {total.disk / 1e9:,.2f} GB of disk"
         )
+        if self.dir is not None:
+            status = StudyFolder(self.dir).status(manifest.runs)
+            left = [each for each in status if each.state != "done"]
+            if len(left) < len(status):
+                frames = sum(each.run.end - each.frames for each in left)
+                print(
+                    f"  {len(status) - len(left)} of these runs are done; left: "
+                    f"{counted(len(left), 'run')}, {frames / per_s / 3600:,.1f} "
+                    "core-hours"
+                )
         if self.visibility:
             seen = what_is_seen(manifest)
             if seen and self.dir is not None:
@@ -274,18 +298,22 @@ class Run:
         ).run()
         print("\r\x1b[K" * sys.stdout.isatty(), end="")
         print_status(folder, manifest, folder.status(manifest.runs))
+        if any(each.state == "failed" for each in status):
+            again = f"egoskin study run --dir {self.dir} --again"
+            print(f"not tried again; to retry: {again}")
         if any(each.state != "done" for each in status):
             raise SystemExit(1)
         print(f"done; now: egoskin study report {self.dir}")
 
     def _cores_per_run(self, manifest: Manifest, status: list[RunStatus]) -> int:
         """Return the number of cores per run with the highest total throughput."""
-        left = [each for each in status if each.state != "done"]
+        left = [s for s in status if s.state != "done" and s.tries < self.tries]
         frames = sum(each.run.end - each.frames for each in left)
-        if self.on != "local" or self.parallel or frames < _WORTH_MEASURING:
+        if self.on != "local" or self.parallel or frames < WORTH_MEASURING:
             return 1
-        measured = measure_all(manifest, left[0].run, available_cores())
-        return fastest(measured).cores_per_run
+        measured = fastest(manifest, [each.run for each in left])
+        # The job of a run that cannot start reports why.
+        return 1 if measured is None else measured[0].cores_per_run
 
     def _where(self) -> type[Runner]:
         """Return the runner for the study."""
@@ -326,14 +354,22 @@ def print_status(
         row = "".join(f"{entries[cell.name, seed]:<{wide}}" for seed in manifest.seeds)
         print(f"{cell.name:{width}}  {row.rstrip()}")
     for each in status:
-        if each.state == "running" and (where := owner(folder.claims, each.run.name)):
-            print(f"{each.run.name}: running on {where}")
+        if each.state == "running":
+            print(f"{each.run.name}: running {where(folder, each.run.name)}")
         if each.failure is not None:
             print(
                 f"{each.run.name}: failed {counted(each.failure.tries, 'time')}, "
                 f"last: {each.failure.error}"
             )
     print(Progress.of(status))
+
+
+def where(folder: StudyFolder, name: str) -> str:
+    """Return the host and process that work on a run, in a few words."""
+    if not is_claimed(folder.claims, name):
+        # A job that was killed leaves its name.
+        return "outside the study"
+    return f"on {owner(folder.claims, name) or 'an unknown host'}"
 
 
 def entry(status: RunStatus) -> str:

@@ -117,7 +117,36 @@ def from_plain(kind: type[T], content: Any, what: str) -> T:
         raise ValueError(text) from error
     # ValueError is raised by the checks of the configuration itself.
     except (dacite.DaciteError, ValueError) as error:
-        raise ValueError(f"{what}: {error}") from error
+        text = _object_for_list(kind, content) or error
+        raise ValueError(f"{what}: {text}") from error
+
+
+def _object_for_list(kind: Any, content: Any, path: str = "") -> str:
+    """Return what is wrong with an object given for a list, which dacite does not tell.
+
+    Args:
+        kind: Type of the content.
+        content: Plain values.
+        path: Dotted name of the content.
+
+    Returns:
+        The text, "" if there is none.
+    """
+    if get_origin(kind) in (Union, UnionType):
+        # Of several types, dacite tells that none fits.
+        kinds = [x for x in get_args(kind) if x is not type(None)]
+        kind = kinds[0] if len(kinds) == 1 else kind
+    if dataclasses.is_dataclass(kind) and isinstance(content, dict):
+        hints = get_type_hints(kind)
+        parts = [(hints[k], x, f"{path}.{k}") for k, x in content.items() if k in hints]
+    elif get_origin(kind) is tuple and isinstance(content, (list, tuple)):
+        parts = [(get_args(kind)[0], x, path) for x in content]
+    elif get_origin(kind) is tuple and isinstance(content, dict):
+        given = json.dumps(to_plain(content), default=str)
+        return f"{path.lstrip('.')} must be {_described(kind)}, got {given}"
+    else:
+        return ""
+    return next(filter(None, (_object_for_list(*part) for part in parts)), "")
 
 
 def _fields_beside(key: str, kind: Any, content: Any) -> list[str]:

@@ -298,6 +298,10 @@ def learning_curves(manifest: Manifest, results: Sequence[Result]) -> Figure | N
         axes.set_title(title, fontsize=10)
         axes.set_ylim(0, 100)
         _plain(axes)
+    for column in axes_grid.T:
+        # Shared axes have their numbers in the last row, which may be hidden here.
+        lowest = [axes for axes in column if axes.get_visible()][-1]
+        lowest.tick_params(labelbottom=True)
     _legend_above(figure, axes_grid.flat)
     figure.supxlabel("environment steps [millions]", fontsize=10)
     figure.supylabel("success at 3 s in training [%]", fontsize=10)

@@ -28,6 +28,7 @@ from egoskin.hints import did_you_mean
 from egoskin.make import EnvConfig
 from egoskin.policies.policy import load_networks
 from egoskin.rng import check_seed
+from egoskin.runs.checks import check_fits
 from egoskin.runs.config import (
     INIT_HASH,
     MACHINE_FIELDS,
@@ -62,6 +63,8 @@ from egoskin.study.fields import (
 # Fields that a study sets itself, and fields that are the same in all its cells.
 _NOT_OF_A_STUDY = RESUME_FIELDS | {"seed", "device", "engine"}
 _OF_ALL_CELLS = {"snapshot_frames", "checkpoint_interval"}
+# Longest name of a run [bytes]: file names, of at most 255 bytes, are longer than it.
+_LONGEST_NAME = 200
 # Fields that the sensor's label already contains.
 _LABEL = ("env.sensor.coverage", "env.sensor.signal", "env.sensor.range")
 
@@ -351,8 +354,8 @@ def resolve(study: Study) -> Manifest:
     """Return the manifest of a new study, with the current defaults.
 
     Raises:
-        ValueError: If a cell is invalid, or has the name of another; the text names
-            the cell.
+        ValueError: If a cell is invalid or cannot start, or its name is too long or
+            that of another; the text names the cell.
     """
     task = training_task(study.standard, TrainConfig().env.task)
     default = TrainConfig(env=EnvConfig(task=task), total_frames=study.frames)
@@ -374,7 +377,9 @@ def resolve(study: Study) -> Manifest:
             standard_task(config.env, study.evaluation.standard)
             init = None
             if config.init_from is not None:
-                init = content_hash({}, load_networks(config.init_from)[0])
+                initial = load_networks(config.init_from)
+                init = content_hash({}, initial[0])
+                check_fits(config, skin, initial)
         except (ValueError, OSError) as error:
             raise ValueError(f"{what}: {error}") from error
         cell = Cell(
@@ -383,6 +388,12 @@ def resolve(study: Study) -> Manifest:
             skin_sha256=digest,
             init_sha256=init,
         )
+        seed = max(study.seeds)
+        if (n := len(PlannedRun(cell=cell, seed=seed).name.encode())) > _LONGEST_NAME:
+            raise ValueError(
+                f"{what}: the names of its runs would have {n} bytes, and at most "
+                f"{_LONGEST_NAME} are possible; set fields that all cells share in base"
+            )
         other = cells.setdefault(cell.name, cell)
         if other is not cell:
             differs = changed_values(other.config, config)

@@ -286,8 +286,14 @@ def _deciding(judged: Judged) -> Tested:
     if judged.verdict == "refuted":
         return min(judged.claims, key=lambda c: c.p_refute)
     claims = judged.claims if judged.verdict == "confirmed" else judged.deciding
-    known = [c for c in claims if c.effect is not None]
-    return max(known, key=lambda c: c.p_confirm)
+    known = [(c, c.effect) for c in claims if c.effect is not None]
+
+    def nearness(claim: Tested, effect: Effect) -> float:
+        return -min(abs(effect.mean - end) for end in claim.claim.region.bounds)
+
+    # With one seed all p-values are 1: the claim nearest to an end needs most seeds.
+    claim, _ = max(known, key=lambda each: (each[0].p_confirm, nearness(*each)))
+    return claim
 
 
 def _finding_rows(judged: Sequence[Judged], results: Sequence[Result]) -> str:

@@ -186,8 +186,8 @@ def contrast(weights: Mapping[str, float], table: Table) -> Effect | None:
 def assumed_sd(effect: Effect, weights: Mapping[str, float], table: Table) -> float:
     """Return the standard deviation of a contrast of one seed per cell.
 
-    If it is unknown or zero, unpaired seeds are assumed whose spread is that of the
-    contrast's own cells or, if unknown too, the largest of any cell: cells near 0 or
+    If it is unknown or zero, unpaired seeds are assumed. The spread of a cell without
+    two seeds that differ is then taken to be the largest of any cell: cells near 0 or
     100 % hardly vary. NaN if no cell has two seeds that differ.
 
     Args:
@@ -197,11 +197,10 @@ def assumed_sd(effect: Effect, weights: Mapping[str, float], table: Table) -> fl
     """
     if effect.sd > 0:
         return effect.sd
-    sd = seed_sd({name: table.get(name, {}) for name in weights})
-    if not sd > 0:
-        each = [seed_sd({name: values}) for name, values in table.items()]
-        sd = max((x for x in each if x > 0), default=math.nan)
-    return sd * math.sqrt(sum(w**2 for w in weights.values()))
+    each = {name: seed_sd({name: values}) for name, values in table.items()}
+    known = {name: sd for name, sd in each.items() if sd > 0}
+    largest = max(known.values(), default=math.nan)
+    return math.hypot(*(w * known.get(name, largest) for name, w in weights.items()))
 
 
 def holm(p_values: Sequence[float]) -> list[float]:

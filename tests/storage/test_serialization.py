@@ -37,7 +37,9 @@ def test_a_value_of_the_wrong_type_is_named(value: Any):
         from_plain(TrainConfig, [], "my.json")
 
 
-@pytest.mark.parametrize("value", [None, 3, "ab", [1.0], [1.0, "x"], [[1.0, 2.0]], {}])
+@pytest.mark.parametrize(
+    "value", [None, 3, "ab", [1.0], [1.0, "x"], [[1.0, 2.0]], {}, {"low": 1.0}]
+)
 def test_a_range_that_is_none_is_named(value: Any):
     plain = to_plain(TrainConfig())
     plain["env"]["task"]["throws"]["interval"] = value
@@ -51,6 +53,10 @@ def test_a_range_that_is_none_is_named(value: Any):
         ({"standard": 2}, r'standard must be one of "2", "1", "paper", got 2'),
         ({"seeds": ["0"]}, r'seeds must be a list, each item an integer, got \["0"\]'),
         ({"seeds": "all"}, r"seeds must be a list, each item an integer$"),
+        (
+            {"cells": {"sensor.range": 1}},
+            r'cells must be a list, each item an object, got \{"sensor.range": 1\}$',
+        ),
         ({"purpose": 3}, "purpose must be a string, got 3"),
         ({"frame": 1}, "there is no field 'frame', did you mean 'frames'?"),
         ({}, "name is missing"),

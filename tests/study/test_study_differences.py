@@ -37,5 +37,13 @@ def test_a_cell_with_one_seed_has_no_p_value_but_the_spread_of_the_others():
     # 75 - 55, and the standard deviation of a difference of two unpaired seeds.
     distance = 20 / (math.sqrt(2) * stats.tstd(FIRST))
     assert new.seeds_needed == seeds_needed([distance], 0.05 / 2)
+    # As much as a cell that varies, even if the first cell hardly does.
+    table = {"blind": {0: 0.0, 1: 0.0488, 2: 0.0}, "x": {0: 3.0}}
+    table["y"] = {0: 50.0, 1: 60.0, 2: 41.0}
+    new, _ = differences(["blind", "x", "y"], table)
+    wide = seeds_needed([3 / stats.tstd([50.0, 60.0, 41.0])], 0.05 / 4)
+    assert new.seeds_needed is not None
+    assert wide is not None
+    assert new.seeds_needed >= wide > 50
     assert differences(["a", "b"], {"b": {0: 75.0}}) == []
     assert differences(["a"], {"a": {0: 75.0}}) == []

@@ -142,6 +142,7 @@ def test_a_cell_is_named_by_what_differs():
         ({"checkpoint_interval": 1.0}, "checkpoint_interval cannot be set here"),
         ({"sensor.coverage": "none"}, "cell blind is defined twice"),
         ({"skin.path": "no.json"}, r"no\.json"),
+        ({"init_from": "localization"}, "reads 3 values of 'signal', but here there "),
     ],
 )
 def test_a_cell_that_cannot_exist_is_named(cell, text):
@@ -165,6 +166,14 @@ def test_two_cells_of_one_name_are_told_what_they_differ_in(tmp_path: Path):
     blind = {"sensor.coverage": "none"}
     with pytest.raises(ValueError, match=r"named blind; they .* in sensor\.range"):
         changed(cells=(blind, {**blind, "sensor.range": 1.0}))
+
+
+def test_a_cell_whose_name_is_too_long_for_files_is_told_by_its_number():
+    cell = {"ppo.network.hidden": [256] * 41 + [1000]}
+    assert len(changed(cells=(cell,)).runs[0].name) == 200
+    text = r"cell 2: the names of its runs would have 201 bytes, and at most 200 "
+    with pytest.raises(ValueError, match=text):
+        changed(cells=({}, cell), seeds=(0, 10))
 
 
 @pytest.mark.parametrize(

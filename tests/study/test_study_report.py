@@ -256,6 +256,22 @@ def test_the_cost_of_a_decision_is_in_core_hours(
     assert hours[1] == 4 * hours[0] > 0
 
 
+def test_the_claim_of_a_row_is_the_one_that_needs_its_seeds(
+    manifest: Manifest, tmp_path: Path, without_pictures
+):
+    folder = StudyFolder(tmp_path)
+    folder.plan(manifest)
+    # With one seed; at 2 m the end of the region is nearer.
+    success = {"proximity-1m": 50.0, "localization-1m": 50.0}
+    success |= {"proximity-2m": 64.0, "localization-2m": 60.0}
+    for name, value in success.items():
+        store(folder, manifest, manifest.run(f"field-{name}-seed0"), value)
+    write_report(folder, tmp_path / "report")
+    text = (tmp_path / "report" / "report.md").read_text()
+    (row,) = (line for line in text.splitlines() if line.startswith("| 2 |"))
+    assert "| field-proximity-2m - field-localization-2m: +4.0 |" in row
+
+
 def test_runs_on_an_unknown_number_of_cores_have_no_core_hours(
     manifest: Manifest, tmp_path: Path, without_pictures
 ):
@@ -313,6 +329,21 @@ def test_signals_whose_seeds_have_no_spread_are_neither_equal_nor_different(
     (axes,) = figure.axes
     points = [x for x in axes.lines if x.get_marker() == "o" and len(x.get_xdata())]
     assert [point.get_color() for point in points] == ["#888888"]
+
+
+def test_the_lowest_panel_of_each_column_has_numbers_on_its_axis(tmp_path: Path):
+    cells = ({"sensor.range": 1.0}, {"sensor.range": 2.0}, {"history": 3})
+    mine = resolve(dataclasses.replace(FINDINGS, name="mine", cells=cells, seeds=(0,)))
+    folder = StudyFolder(tmp_path)
+    folder.plan(mine)
+    store_all(folder, mine)
+    figure = learning_curves(mine, folder.results(mine))
+    assert figure is not None
+    one, two, other, hidden = figure.axes
+    assert not hidden.get_visible()
+    # The other cells are below the first column.
+    told = [axes.xaxis.get_tick_params()["labelbottom"] for axes in (one, two, other)]
+    assert told == [False, True, True]
 
 
 def test_an_infinite_range_is_left_out_of_the_figure_over_ranges(manifest: Manifest):

@@ -15,12 +15,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
 
 from calling import call, hide, limit_file_size, succeed, wait_for
+from egoskin.commands import study as command
+from egoskin.commands.study import Run as RunStudy
 from egoskin.commands.study import print_status, show
 from egoskin.evaluation.throw_set import evaluate, standard_task
 from egoskin.make import EnvConfig
@@ -32,7 +34,7 @@ from egoskin.storage.tensor_file import load_tensors, save_tensors
 from egoskin.study import cost as cost_module
 from egoskin.study import evaluation, job, store
 from egoskin.study.claims import claimed
-from egoskin.study.cost import cost, measure, measure_all
+from egoskin.study.cost import Cost, Speed, cost, measure, measure_all
 from egoskin.study.job import CLAIMED, STOPPED, Stop, work
 from egoskin.study.manifest import EvaluationPlan, Manifest, PlannedRun, Study, resolve
 from egoskin.study.metrics import runs_csv
@@ -449,6 +451,19 @@ def test_status_says_where_a_run_is_running(folder: StudyFolder, capsys):
     assert "running on" not in capsys.readouterr().out
 
 
+def test_a_job_that_is_dead_is_not_said_to_run(folder: StudyFolder, capsys):
+    shutil.rmtree(folder.result_path(NAME))
+    manifest = folder.manifest()
+    with claimed(folder.claims, NAME):
+        (owner,) = folder.claims.glob("*.owner.*")
+        content = owner.read_text()
+    # It was killed, and its run is trained by hand.
+    owner.write_text(content)
+    with Run.open(folder.run_path(NAME)).locked():
+        print_status(folder, manifest, folder.status(manifest.runs))
+    assert f"{NAME}: running outside the study\n" in capsys.readouterr().out
+
+
 def test_a_failure_that_is_forgotten_meanwhile_is_none(folder: StudyFolder):
     # Another runner's job finishes the run while this one reads.
     folder.note_failure(NAME, "error")
@@ -474,6 +489,143 @@ def test_only_numbers_of_cores_that_all_cells_can_use_are_measured(
     cells = ({"num_envs": 16}, {"num_envs": 6})
     manifest = resolve(dataclasses.replace(SHORT, cells=cells))
     assert measure_all(manifest, manifest.runs[0], 4) == [(1, 4), (2, 2)]
+
+
+def test_a_long_study_with_fewer_runs_than_cores_uses_them_all():
+    total = Cost(runs=3, frames=60_000_000, per_s=1000, disk=0.0)
+    # On 16 cores each run has 4, on 2 cores the third has to wait.
+    assert total.wall_s(16) == pytest.approx(20_000 / 4)
+    assert total.wall_s(2) == pytest.approx(2 * 20_000)
+    short = dataclasses.replace(total, frames=30_000_000)
+    assert short.wall_s(16) == pytest.approx(10_000)
+
+
+LONG = dataclasses.replace(STUDY, frames=65_536_000, seeds=(0,))
+"""A study that is long enough to be measured."""
+
+
+def speeds(cores: int) -> list[Speed]:
+    """Speeds on a machine where a run hardly gains from more cores than eight."""
+    per_s = {1: 160e3, 2: 158e3, 4: 155e3, 8: 120e3, 16: 80e3}
+    return [
+        Speed(cores_per_run=n, parallel=cores // n, per_s=x) for n, x in per_s.items()
+    ]
+
+
+@pytest.mark.parametrize(("runs", "cores"), [(16, 1), (8, 2), (4, 4), (3, 8), (1, 16)])
+def test_runs_that_are_fewer_than_the_cores_have_several_each(
+    runs: int, cores: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    monkeypatch.setattr(command, "available_cores", lambda: 16)
+    monkeypatch.setattr(command, "measure_all", lambda *args: speeds(args[2]))
+    cells, seeds = STUDY.cells[:1], tuple(range(runs))
+    manifest = resolve(dataclasses.replace(LONG, cells=cells, seeds=seeds))
+    status = [RunStatus(run=run, state="missing") for run in manifest.runs]
+    assert RunStudy(dir=tmp_path)._cores_per_run(manifest, status) == cores
+
+
+def test_a_run_that_cannot_be_measured_is_told_and_another_is(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys
+):
+    manifest = resolve(dataclasses.replace(LONG, seeds=(0, 1)))
+    one, other = (cell.name for cell in manifest.cells)
+    tried = []
+
+    def measure_all(manifest: Manifest, run: PlannedRun, cores: int) -> list[Speed]:
+        tried.append(run.name)
+        if run.cell.name in broken:
+            raise ValueError("no skin")
+        return speeds(cores)
+
+    monkeypatch.setattr(command, "available_cores", lambda: 16)
+    monkeypatch.setattr(command, "measure_all", measure_all)
+    run = RunStudy(dir=tmp_path)
+    status = [RunStatus(run=run, state="missing") for run in manifest.runs]
+    broken = {one}
+    assert run._cores_per_run(manifest, status) == 4
+    assert tried == [f"{one}-seed0", f"{other}-seed0"]
+    note = f"note: {one}-seed0 cannot be measured: no skin\n"
+    assert capsys.readouterr().err == note
+    broken = {one, other}
+    assert run._cores_per_run(manifest, status) == 1
+    # A run that has used up its tries is not measured.
+    tried.clear()
+    lost = Failure(tries=3, error="no skin")
+    failed = [
+        dataclasses.replace(s, state="failed", failure=lost)
+        if s.run.cell.name == one
+        else s
+        for s in status
+    ]
+    run._cores_per_run(manifest, failed)
+    assert tried == [f"{other}-seed0"]
+    assert run._cores_per_run(manifest, failed[::2]) == 1
+    assert tried == [f"{other}-seed0"]
+
+
+MEASURING = """
+import os, sys, time
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+
+@dataclass
+class Config:
+    num_workers: int = 1
+    learner_threads: int = 1
+
+def wait(*args):
+    Path(sys.argv[2], str(os.getpid())).touch()
+    time.sleep(600)
+
+if __name__ == sys.argv[1]:
+    wait()
+if __name__ == "__main__":
+    from egoskin.commands.errors import clear_errors
+    from egoskin.study import cost
+
+    cost._train = wait
+    with clear_errors():
+        cell = SimpleNamespace(name="x")
+        cost.measure(SimpleNamespace(cell=cell, config=Config()), parallel=2)
+"""
+
+
+@pytest.mark.parametrize(
+    ("number", "where"),
+    [
+        # While the processes import, and while they train.
+        (signal.SIGINT, "__mp_main__"),
+        (signal.SIGKILL, ""),
+    ],
+)
+def test_a_measurement_that_is_ended_leaves_nothing(number, where, tmp_path: Path):
+    script, temporary, begun = (tmp_path / x for x in ("m.py", "tmp", "begun"))
+    script.write_text(MEASURING)
+    temporary.mkdir()
+    begun.mkdir()
+    with subprocess.Popen(
+        [sys.executable, str(script), where, str(begun)],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        env={**os.environ, "TMPDIR": str(temporary)},
+    ) as process:
+        try:
+            wait_for(lambda: len(list(begun.iterdir())) == 2)
+            # Ctrl-C reaches the whole group.
+            (os.killpg if number == signal.SIGINT else os.kill)(process.pid, number)
+            # A child that lives keeps the pipe open.
+            _, errors = process.communicate(timeout=60)
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+    killed = number == signal.SIGKILL
+    assert process.returncode == (-number if killed else 128 + number)
+    # Python itself tells of the semaphores of a process that is killed.
+    assert killed or errors == "stopped\n"
+    assert not list(temporary.iterdir())
 
 
 @pytest.mark.slow
@@ -846,6 +998,22 @@ def test_the_command_plans_tells_and_reports(finished: Path, tmp_path: Path):
     assert "1 of 2 runs are done" in (folder / "report/report.md").read_text()
     array = succeed("study", "slurm", folder, "--cores", "2")
     assert "#SBATCH --array=0-0" in array
+
+
+def test_the_command_tells_what_is_left_and_what_is_not_tried_again(
+    folder: StudyFolder,
+):
+    folder.plan(resolve(dataclasses.replace(SHORT, seeds=(0, 1, 2))))
+    args = ("--dir", folder.path)
+    planned = succeed("study", "plan", *args, "--steps-per-s", "0.1")
+    # Two runs of 512 steps.
+    assert "\n  1 of these runs are done; left: 2 runs, 2.8 core-hours\n" in planned
+    for _ in range(3):
+        folder.note_failure("blind-seed1", "error")
+    again = f"not tried again; to retry: egoskin study run --dir {folder.path} --again"
+    ended = call("study", "run", *args, "--only", "blind-seed1")
+    assert (ended.returncode, ended.stdout.splitlines()[-1]) == (1, again)
+    assert again not in call("study", "run", *args, "--only", "blind-seed0").stdout
 
 
 @pytest.mark.parametrize(

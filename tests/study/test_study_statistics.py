@@ -177,12 +177,21 @@ def test_the_spread_of_cells_without_repeated_seeds_is_the_largest_of_any_cell()
     effect = contrast(weights, table)
     assert effect is not None
     assert assumed_sd(effect, weights, table) == pytest.approx(wide)
-    # A spread of its own counts alone.
+    # A cell near 0 % has its own spread, which is not that of the other one.
     weights = {"a": -1.0, "floor": 1.0}
     effect = contrast(weights, table)
     assert effect is not None
-    own = math.sqrt(2) * stats.tstd([0.0, 0.1])
-    assert assumed_sd(effect, weights, table) == pytest.approx(own)
+    both = math.hypot(stats.tstd([50.0, 54.0]), stats.tstd([0.0, 0.1]))
+    assert assumed_sd(effect, weights, table) == pytest.approx(both)
+    # Weights count, as do seeds without a spread.
+    weights = {"same": 0.5, "a": -1.0}
+    table["same"] = {0: 40.0, 1: 40.0}
+    effect = contrast(weights, table)
+    assert effect is not None
+    both = math.hypot(0.5, 1.0) * stats.tstd([50.0, 54.0])
+    assert assumed_sd(effect, weights, table) == pytest.approx(both)
+    table = {"a": {0: 10.0}, "b": {0: 30.0}}
+    assert math.isnan(assumed_sd(effect, {"a": -1.0, "b": 1.0}, table))
 
 
 def test_a_metric_that_sets_cells_apart_is_told_from_one_that_does_not():
