@@ -28,6 +28,8 @@ _STYLES = {
 }
 _OTHERS = ("#E69F00", "#56B4E9", "#CC79A7", "#0072B2", "#D55E00", "#009E73")
 _BLIND, _ORACLE = "#555555", "#000000"
+# Largest change of a line by leaving out points [pixels].
+_SIMPLIFY = 0.3
 # Factor between the ranges at which two signals of the same range are drawn.
 _SHIFT = 1.04
 _VERDICTS = {"confirmed": "#0072B2", "refuted": "#D55E00", "undecided": "#888888"}
@@ -312,13 +314,14 @@ def _legend(name: str, grid: Mapping[str, Place]) -> str:
     return grid[name].signal if name in grid else name
 
 
+@mpl.rc_context({"path.simplify_threshold": _SIMPLIFY})
 def _draw_curves(
     axes: Axes, results: Sequence[Result], colour: str, label: str
 ) -> None:
     """Draw the learning curves of a cell."""
     first = max(r.stored.frames[0] for r in results)
     last = min(r.stored.frames[-1] for r in results)
-    for result in results:
+    for result in results if len(results) > 1 else ():
         frames, success = result.stored.frames, 100 * result.stored.success
         axes.plot(frames / 1e6, success, color=colour, linewidth=0.6, alpha=0.6)
     x = np.array([f for f in results[0].stored.frames if first <= f <= last])

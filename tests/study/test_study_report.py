@@ -9,6 +9,8 @@ import json
 import math
 import re
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,10 +21,12 @@ from calling import fail
 from egoskin.commands.study import what_is_seen
 from egoskin.runs.run import Run
 from egoskin.study.figures import (
+    _draw_curves,
     equivalence,
     learning_curves,
     places,
     sample_efficiency,
+    save,
     success_by_range,
 )
 from egoskin.study.findings import judge_findings
@@ -344,6 +348,25 @@ def test_the_lowest_panel_of_each_column_has_numbers_on_its_axis(tmp_path: Path)
     # The other cells are below the first column.
     told = [axes.xaxis.get_tick_params()["labelbottom"] for axes in (one, two, other)]
     assert told == [False, True, True]
+
+
+def test_curves_of_a_long_training_make_a_small_picture(tmp_path: Path):
+    rng = np.random.default_rng(0)
+    flat = SimpleNamespace(
+        frames=np.arange(1, 1001) * 65536.0, success=0.001 * rng.random(1000)
+    )
+    seed: Any = SimpleNamespace(stored=flat)
+    figure = Figure()
+    axes = figure.subplots()
+    axes.set_ylim(0, 100)
+    # One seed is its own mean; two are also drawn each.
+    _draw_curves(axes, [seed], "red", "one seed")
+    assert len(axes.lines) == 1
+    _draw_curves(axes, [seed, seed], "blue", "two seeds")
+    assert len(axes.lines) == 1 + 3
+    save(figure, tmp_path, "curves")
+    paths = re.findall(r'd="([^"]*)"', (tmp_path / "curves.svg").read_text())
+    assert max(path.count("L") for path in paths) < 250
 
 
 def test_an_infinite_range_is_left_out_of_the_figure_over_ranges(manifest: Manifest):
