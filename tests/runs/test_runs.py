@@ -258,9 +258,9 @@ def test_a_film_has_no_more_frames_than_the_run_has_steps(
     assert command[command.index("--size") + 1 :][:3] == ["480", "270", "--longest-of"]
 
 
-def test_a_long_log_does_not_slow_its_next_line(config: TrainConfig):
+def test_a_long_log_does_not_slow_its_next_line(config: TrainConfig, tmp_path: Path):
     def seconds(lines: int) -> float:
-        run = Run.create(replace(config, run_dir=config.run_dir / str(lines)))
+        run = Run.create(replace(config, run_dir=tmp_path / str(lines)))
         run.record_start()
         row = {"frames": 1.0, **{f"value_{i}": i / 3 for i in range(30)}}
         run.start_metrics(0)
