@@ -39,7 +39,8 @@ class _KeyedTransform(Transform):
         """Return a copy for another environment, which shares nothing that changes."""
         new = super().clone()
         for name, buffer in self.named_buffers(recurse=False):
-            new.register_buffer(name, buffer.clone())
+            # Not registered again, which would add it to the state dict of both.
+            setattr(new, name, buffer.clone())
         return new
 
     @abstractmethod

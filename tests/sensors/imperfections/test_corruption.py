@@ -467,6 +467,16 @@ def test_a_step_makes_no_tensor_from_numbers(monkeypatch):
     assert clock.tolist() == [[0, 1]] * 2
 
 
+def test_a_clone_has_the_same_state_dict():
+    corruption = Corruption([Noise(constant=0.1)], dt=DT, seed=0)
+    before = list(corruption.state_dict())
+    clone = corruption.clone()
+    clone.mask([1])
+    assert list(corruption.state_dict()) == list(clone.state_dict()) == before
+    assert len(corruption._masked) == 0
+    corruption.load_state_dict(clone.state_dict())
+
+
 def test_episode_and_step_are_counted_from_reset_to_reset():
     corruption = Corruption([Noise(constant=0.1)], dt=DT, seed=0)
     done = torch.tensor([0, 0, 1, 0, 0, 0, 1, 0], dtype=torch.bool)[None, :, None]
