@@ -214,8 +214,6 @@ egoskin bench loop --help lists the options of loop; likewise for the others.
 """Text by command."""
 WITH_SUBCOMMANDS = ("skin", "robot", "study", "bench")
 """Commands whose first argument is a subcommand."""
-
-
 ARGUMENTS = {
     "evaluate": "POLICY",
     "view": "[POLICY ...]",

@@ -173,7 +173,7 @@ class Plan:
             status = StudyFolder(self.dir).status(manifest.runs)
             left = [each for each in status if each.state != "done"]
             if len(left) < len(status):
-                frames = sum(each.run.end - each.frames for each in left)
+                frames = sum(each.frames_left for each in left)
                 print(
                     f"  {len(status) - len(left)} of these runs are done; left: "
                     f"{counted(len(left), 'run')}, {frames / per_s / 3600:,.1f} "
@@ -308,7 +308,7 @@ class Run:
     def _cores_per_run(self, manifest: Manifest, status: list[RunStatus]) -> int:
         """Return the number of cores per run with the highest total throughput."""
         left = [s for s in status if s.state != "done" and s.tries < self.tries]
-        frames = sum(each.run.end - each.frames for each in left)
+        frames = sum(each.frames_left for each in left)
         if self.on != "local" or self.parallel or frames < WORTH_MEASURING:
             return 1
         measured = fastest(manifest, [each.run for each in left])

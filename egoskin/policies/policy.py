@@ -11,6 +11,7 @@ import copy
 import dataclasses
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from shlex import quote
 from typing import Any, get_args
 
 import torch
@@ -470,9 +471,10 @@ def _no_checkpoint(folder: Path) -> str:
     if policies := sorted((folder / "policies").glob("*.safetensors")):
         return f"{folder} has no checkpoint; its latest policy is {policies[-1]}"
     if (folder / "config.json").is_file():
+        resume = f"egoskin train --resume {quote(str(folder))}"
         return (
             f"{folder} has no checkpoint yet: its training is starting, or was stopped "
-            f"before the first (continue with: egoskin train --resume {folder})"
+            f"before the first (continue with: {resume})"
         )
     return f"{folder} is not a run folder: it has no {CHECKPOINT_NAME}"
 

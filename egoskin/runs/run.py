@@ -406,10 +406,9 @@ class Run:
         if first:
             writer.writeheader()
         writer.writerow(dict(metrics))
-        added = line.getvalue().splitlines(keepends=True)
-        self._metrics += added
+        self._metrics += line.getvalue().splitlines(keepends=True)
         try:
-            append(self._metrics_path, "".join(added).encode())
+            append(self._metrics_path, line.getvalue().encode())
         except FileNotFoundError:
             # This is the first line, or the file was removed.
             write_file(self._metrics_path, "".join(self._metrics).encode())

@@ -61,7 +61,7 @@ class Progress:
         total = sum(each.run.end for each in status)
         done = sum(each.frames for each in status)
         lost = sum(
-            each.run.end - each.frames
+            each.frames_left
             for each in status
             if tries and each.state == "failed" and each.tries >= tries
         )

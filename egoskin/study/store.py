@@ -83,11 +83,16 @@ class RunStatus:
         return 0 if self.failure is None else self.failure.tries
 
     @property
+    def frames_left(self) -> int:
+        """Environment steps left to its end."""
+        return self.run.end - self.frames
+
+    @property
     def left_s(self) -> float | None:
         """Time left to its end at that speed [s], None if unknown."""
         if self.state == "done":
             return 0.0
-        return (self.run.end - self.frames) / self.per_s if self.per_s else None
+        return self.frames_left / self.per_s if self.per_s else None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
