@@ -55,6 +55,7 @@ TOP = "commands"
 MUJOCO = {
     "robots.chains",
     "robots.config",
+    "robots.meshes",
     "robots.portable",
     "robots.spec",
     "shapes",

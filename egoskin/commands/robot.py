@@ -26,9 +26,9 @@ from egoskin.progress import counted
 from egoskin.robots.builtin import ROBOTS
 from egoskin.robots.checks import Finding, check_model, names_of
 from egoskin.robots.config import RobotConfig
+from egoskin.robots.meshes import fit_meshes
 from egoskin.robots.own import find_robot
 from egoskin.robots.portable import portable
-from egoskin.robots.spec import links_with_meshes
 from egoskin.sensors.config import SkinConfig
 from egoskin.storage.files import check_output
 from egoskin.viewer.film import save_picture
@@ -58,10 +58,9 @@ class Check:
         """
         check_output(self.out, "--out", (".png",))
         robot = find_robot(self.robot)
-        without_meshes: list[str] = []
+        meshes: list[Finding] = []
         if ROBOTS.get(robot.name) is not robot:
-            if robot.is_urdf and robot.model_path is not None:
-                without_meshes = links_with_meshes(robot.model_path)
+            meshes = list(_meshes(robot))
             robot = portable(robot)
         mass = float(robot.model.body_mass.sum())
         print(
@@ -69,12 +68,7 @@ class Check:
             f"{counted(len(robot.links), 'link')}, {mass:.2f} kg"
         )
         wrong = 0
-        if without_meshes:
-            print(
-                f"  note   {', '.join(without_meshes)}: collision meshes of a URDF are "
-                "left out; balls pass through, so add primitives"
-            )
-        for finding in findings(robot, self.skin):
+        for finding in (*meshes, *findings(robot, self.skin)):
             print(f"  {finding.kind:<5}  {finding.text}", flush=True)
             wrong += finding.kind == "wrong"
         if self.out is not None:
@@ -85,6 +79,28 @@ class Check:
                 f"{robot.name} cannot be trained: fix the {counted(wrong, 'error')} "
                 "above"
             )
+
+
+def _meshes(robot: RobotConfig) -> Iterator[Finding]:
+    """Tell what becomes of collision meshes."""
+    fits, lost = fit_meshes(robot.spec(), robot.model_path if robot.is_urdf else None)
+    if fits:
+        excess = [fit.excess for fit in fits]
+        shapes = ", ".join(
+            f"{fit.link} ({', '.join(each.kind for each in fit.primitives)})"
+            for fit in fits
+        )
+        yield Finding(
+            "note",
+            f"collision meshes become primitives around them, of {min(excess):.1f} to "
+            f"{max(excess):.1f} times the volume of their convex hulls: {shapes}",
+        )
+    if lost:
+        yield Finding(
+            "note",
+            f"{', '.join(lost)}: collision meshes that are not found, or neither STL "
+            "nor OBJ, are left out; balls pass through, so add primitives",
+        )
 
 
 def findings(robot: RobotConfig, skin: SkinConfig) -> Iterator[Finding]:

@@ -15,6 +15,7 @@ import numpy as np
 
 from egoskin.robots.chains import body_id, body_name
 from egoskin.robots.config import RobotConfig, round_off
+from egoskin.robots.meshes import fit_meshes
 from egoskin.robots.spec import set_inertia
 
 # Collision bits of balls and floor; a robot's own bits are above them.
@@ -29,7 +30,6 @@ _PRIMITIVES = (
     mujoco.mjtGeom.mjGEOM_BOX,
     mujoco.mjtGeom.mjGEOM_CYLINDER,
 )
-_QUAT = mujoco.mjtOrientation.mjORIENTATION_QUAT
 
 
 def portable(robot: RobotConfig) -> RobotConfig:
@@ -37,18 +37,20 @@ def portable(robot: RobotConfig) -> RobotConfig:
 
     Visual meshes, actuators, sensors, key frames, their defaults, and everything that
     is not below the base are left out; masses are kept. A cylinder becomes the capsule
-    inside it, of the same length and radius, or, if it is flat, a box; a primitive that
-    MuJoCo fits to a mesh becomes one with a size of its own. The base of a
-    URDF floats. Margins of contacts are zero. If the file does not use this package's
-    collision bits (see ``egoskin/assets/h1_2.xml``), self-collision stays as in the
-    file, and balls and floor collide with all shapes.
+    inside it, of the same length and radius, or, if it is flat, a box; a collision mesh
+    the smallest primitives around it; a primitive that MuJoCo fits to a mesh one with a
+    size of its own. Links do not collide with each other if they overlap in the default
+    pose and one of them had a collision mesh. The base of a URDF floats. Margins of
+    contacts are zero. If the file does not use this package's collision bits (see
+    ``egoskin/assets/h1_2.xml``), self-collision stays as in the file, and balls and
+    floor collide with all shapes.
 
     Args:
         robot: A robot of the task; `RobotConfig.model_path` is read.
 
     Raises:
-        ValueError: If a collision shape is not a sphere, capsule, box or cylinder, or
-            the model contains other elements that cannot be kept as data.
+        ValueError: If a collision shape is of another kind (ellipsoid, height field),
+            or the model contains other elements that cannot be kept as data.
     """
     if robot.model_xml is not None:
         return robot
@@ -70,7 +72,7 @@ def portable(robot: RobotConfig) -> RobotConfig:
     for body in list(spec.worldbody.bodies):
         if body.name not in keep:
             spec.delete(body)
-    _fit_primitives(spec)
+    fits, _ = fit_meshes(spec, robot.model_path if robot.is_urdf else None, in_pairs)
     for geom in list(spec.geoms):
         touches = geom.contype or geom.conaffinity or geom.name in in_pairs
         if geom.parent.name == "world" or (
@@ -84,8 +86,8 @@ def portable(robot: RobotConfig) -> RobotConfig:
                 f"{robot.name}: link {geom.parent.name!r} has a collision shape, "
                 f"{geom.name or 'unnamed'}, of kind "
                 f"{geom.type.name.removeprefix('mjGEOM_').lower()}; a robot stored as "
-                "data may have spheres, capsules, boxes and cylinders: replace it, or "
-                'make it visual only (contype="0" conaffinity="0")'
+                "data may have spheres, capsules, boxes, cylinders and meshes: replace "
+                'it, or make it visual only (contype="0" conaffinity="0")'
             )
     for each in (*spec.geoms, *spec.pairs):
         # A ball within the margin would count as a touch.
@@ -98,6 +100,7 @@ def portable(robot: RobotConfig) -> RobotConfig:
         if not {exclude.bodyname1, exclude.bodyname2} <= bodies:
             spec.delete(exclude)
     _set_bits(spec, in_pairs)
+    _exclude_overlaps(spec, robot, {fit.link for fit in fits})
     for elements in (
         *(spec.actuators, spec.sensors, spec.keys, spec.cameras, spec.lights),
         *(spec.meshes, spec.textures, spec.hfields, spec.skins),
@@ -177,20 +180,6 @@ def _thicken(spec: mujoco.MjSpec, model: mujoco.MjModel) -> bool:
     return found
 
 
-def _fit_primitives(spec: mujoco.MjSpec) -> None:
-    """Give the primitives that MuJoCo fits to meshes sizes and poses of their own."""
-    mesh = mujoco.mjtGeom.mjGEOM_MESH
-    fitted = [geom for geom in spec.geoms if geom.meshname and geom.type != mesh]
-    if not fitted:
-        return
-    # It numbers the geoms, and fits them.
-    model = spec.compile()
-    for geom in fitted:
-        geom.size, geom.pos = model.geom_size[geom.id], model.geom_pos[geom.id]
-        geom.quat, geom.alt.type = model.geom_quat[geom.id], _QUAT
-        geom.meshname = ""
-
-
 def _round_off(geom: mujoco.MjsGeom) -> None:
     """Turn a cylinder into a capsule or, if it is flat, into a box."""
     kind, geom.size = round_off(float(geom.size[0]), float(geom.size[1]))
@@ -211,3 +200,29 @@ def _set_bits(spec: mujoco.MjSpec, in_pairs: Collection[str]) -> None:
         own = (1 << (31 - _NUM_WORLD_BITS)) - 1
         geom.contype = (geom.contype & own) << _NUM_WORLD_BITS
         geom.conaffinity = (geom.conaffinity & own) << _NUM_WORLD_BITS | _WORLD_BITS
+
+
+def _exclude_overlaps(
+    spec: mujoco.MjSpec, robot: RobotConfig, links: Collection[str]
+) -> None:
+    """Let links not collide with those that they overlap in the default pose.
+
+    Args:
+        spec: The robot, of primitives.
+        robot: The robot.
+        links: Links whose shapes are larger than those of the file.
+    """
+    if not links:
+        return
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    for joint, position in zip(robot.joints, robot.default_joint_pos, strict=True):
+        data.joint(joint).qpos = position
+    mujoco.mj_fwdPosition(model, data)
+    pairs = {
+        tuple(sorted(body_name(model, model.geom_bodyid[g]) for g in contact.geom))
+        for contact in data.contact
+    }
+    for first, second in sorted(pairs):
+        if first in links or second in links:
+            spec.add_exclude(bodyname1=first, bodyname2=second)

@@ -92,14 +92,6 @@ def set_inertia(body: mujoco.MjsBody, model: mujoco.MjModel) -> None:
     body.explicitinertial = True
 
 
-def links_with_meshes(path: Path) -> list[str]:
-    """Return the links of a URDF that have collision meshes, which are left out."""
-    spec = mujoco.MjSpec.from_file(str(path))
-    mesh = mujoco.mjtGeom.mjGEOM_MESH
-    links = [geom.parent.name for geom in spec.geoms if geom.type == mesh]
-    return list(dict.fromkeys(links))
-
-
 def _unreadable(what: str, error: ValueError) -> ValueError:
     """Return the error for a model that MuJoCo cannot read, on one line."""
     text = " ".join(str(error).split())

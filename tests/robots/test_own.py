@@ -255,8 +255,12 @@ def test_shapes_that_only_look_are_dropped_and_their_masses_stay(tmp_path):
         own = getattr(before.model, name)[1:]
         np.testing.assert_allclose(getattr(after.model, name)[1:], own, atol=1e-5)
     assert "mesh" not in (after.model_xml or "mesh")
-    touching = text.replace('contype="0" conaffinity="0"', "")
-    with pytest.raises(ValueError, match=r"link .trunk. has a collision shape.* mesh"):
+    touching = text.replace(
+        'type="mesh" mesh="t" contype="0" conaffinity="0"',
+        'type="ellipsoid" size=".1 .1 .2"',
+    )
+    refused = r"link .trunk. has a collision shape.* of kind ellipsoid"
+    with pytest.raises(ValueError, match=refused):
         portable(read_folder(write_robot(tmp_path, model=touching)))
 
 
