@@ -20,6 +20,8 @@ from egoskin.robots.spec import set_inertia
 
 # Collision bits of balls and floor; a robot's own bits are above them.
 _WORLD_BITS, _NUM_WORLD_BITS = 3, 2
+# What a tendon without effect has none of.
+_TENDON_FORCES = ("limited", "stiffness", "damping", "frictionloss", "armature")
 # Elements of a default class that apply to what is kept.
 _KEPT_DEFAULTS = ("default", "joint", "geom", "site", "material", "pair")
 # An MJCF has six digits. Rounded, two inertias and their sum differ by less than this.
@@ -35,15 +37,16 @@ _PRIMITIVES = (
 def portable(robot: RobotConfig) -> RobotConfig:
     """Return a robot as self-contained data: an MJCF of primitives, as text.
 
-    Visual meshes, actuators, sensors, key frames, their defaults, and everything that
-    is not below the base are left out; masses are kept. A cylinder becomes the capsule
-    inside it, of the same length and radius, or, if it is flat, a box; a collision mesh
-    the smallest primitives around it; a primitive that MuJoCo fits to a mesh one with a
-    size of its own. Links do not collide with each other if they overlap in the default
-    pose and one of them had a collision mesh. The base of a URDF floats. Margins of
-    contacts are zero. If the file does not use this package's collision bits (see
-    ``egoskin/assets/h1_2.xml``), self-collision stays as in the file, and balls and
-    floor collide with all shapes.
+    Visual meshes, actuators, sensors, key frames, their defaults, tendons without
+    effect, and everything that is not below the base are left out; masses are kept. A
+    joint without a torque limit has that of its actuators. A cylinder becomes the
+    capsule inside it, of the same length and radius, or, if it is flat, a box; a
+    collision mesh the smallest primitives around it; a primitive that MuJoCo fits to a
+    mesh one with a size of its own. Links do not collide with each other if they
+    overlap in the default pose and one of them had a collision mesh. The base of a URDF
+    floats. Margins of contacts are zero. If the file does not use this package's
+    collision bits (see ``egoskin/assets/h1_2.xml``), self-collision stays as in the
+    file, and balls and floor collide with all shapes.
 
     Args:
         robot: A robot of the task; `RobotConfig.model_path` is read.
@@ -57,16 +60,18 @@ def portable(robot: RobotConfig) -> RobotConfig:
     spec, model = robot.spec(), robot.model
     keep = set(robot.links)
     _check_outermost(robot, model)
-    for kind, elements in {
-        "tendons": spec.tendons,
-        "equality constraints (in a URDF: mimic)": spec.equalities,
+    acting = [np.any(getattr(model, f"tendon_{name}")) for name in _TENDON_FORCES]
+    for kind, found in {
+        "tendons with limit, stiffness, damping, friction or armature": any(acting),
+        "equality constraints (in a URDF: mimic)": bool(spec.equalities),
     }.items():
-        if elements:
+        if found:
             raise ValueError(
                 f"{robot.name}: {kind} are not supported: remove them, or fix the "
                 "joints that they move"
             )
     _fix_inertia(spec, model)
+    _limit_torques(spec, model)
     in_pairs = {pair.geomname1 for pair in spec.pairs}
     in_pairs |= {pair.geomname2 for pair in spec.pairs}
     for body in list(spec.worldbody.bodies):
@@ -104,7 +109,7 @@ def portable(robot: RobotConfig) -> RobotConfig:
     for elements in (
         *(spec.actuators, spec.sensors, spec.keys, spec.cameras, spec.lights),
         *(spec.meshes, spec.textures, spec.hfields, spec.skins),
-        *(spec.texts, spec.numerics, spec.tuples),
+        *(spec.texts, spec.numerics, spec.tuples, spec.tendons),
     ):
         for element in list(elements):
             spec.delete(element)
@@ -159,6 +164,43 @@ def _fix_inertia(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
     for body in spec.bodies:
         if body.name != "world" and not body.explicitinertial:
             set_inertia(body, model)
+
+
+def _limit_torques(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
+    """Give joints without a torque limit that of their actuators."""
+    of_joints = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
+    for joint in spec.joints:
+        which = model.joint(joint.name).id if joint.name else -1
+        if which < 0 or model.jnt_actfrclimited[which]:
+            continue
+        own = np.flatnonzero(of_joints & (model.actuator_trnid[:, 0] == which))
+        limit = sum(
+            (
+                np.sort(model.actuator_gear[a, 0] * _force_range(model, a))
+                for a in own.tolist()
+            ),
+            np.zeros(2),
+        )
+        if limit.any() and np.isfinite(limit).all():
+            joint.actfrcrange = limit
+            joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_TRUE
+
+
+def _force_range(model: mujoco.MjModel, actuator: int) -> np.ndarray:
+    """Return the least and largest force of an actuator [N, or N m without gear]."""
+    low, high = -np.inf, np.inf
+    if model.actuator_forcelimited[actuator]:
+        low, high = model.actuator_forcerange[actuator]
+    if (
+        model.actuator_ctrllimited[actuator]
+        and model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED
+        and model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_NONE
+    ):
+        # A motor: its control, times a gain, is the force.
+        gain = model.actuator_gainprm[actuator, 0]
+        least, largest = np.sort(gain * model.actuator_ctrlrange[actuator])
+        low, high = max(low, least), min(high, largest)
+    return np.array([low, high])
 
 
 def _thicken(spec: mujoco.MjSpec, model: mujoco.MjModel) -> bool:

@@ -298,7 +298,19 @@ def test_settings_of_what_is_left_out_are_left_out(tmp_path):
     ("tag", "elements"),
     [
         ("equality", '<weld body1="left_arm" body2="right_arm"/>'),
-        ("tendon", '<fixed><joint joint="left_hip" coef="1"/></fixed>'),
+        *(
+            (
+                "tendon",
+                f'<fixed {what}><joint joint="left_hip" coef="1"/></fixed>',
+            )
+            for what in (
+                'stiffness="1"',
+                'damping="1"',
+                'frictionloss="1"',
+                'armature="1"',
+                'limited="true" range="-1 1"',
+            )
+        ),
     ],
 )
 def test_elements_that_move_a_robot_are_not_left_out(tag, elements, tmp_path):
@@ -306,6 +318,59 @@ def test_elements_that_move_a_robot_are_not_left_out(tag, elements, tmp_path):
     robot = read_folder(write_robot(tmp_path, model=model))
     with pytest.raises(ValueError, match=rf"{tag}.* are not supported"):
         portable(robot)
+
+
+def test_tendons_without_effect_are_left_out(tmp_path):
+    tendon = '<fixed name="t"><joint joint="left_hip" coef="1"/></fixed>'
+    model = MODEL.replace(
+        '<actuator><motor joint="left_hip"/>',
+        f'<tendon>{tendon}</tendon><actuator><motor tendon="t"/>',
+    )
+    robot = portable(read_folder(write_robot(tmp_path, model=model)))
+    assert robot.model.ntendon == 0
+    # And so the robot is that of the file without it.
+    assert robot.model_xml == portable(read_folder(write_robot(tmp_path))).model_xml
+
+
+@pytest.mark.parametrize(
+    ("actuators", "expected"),
+    [
+        ('<motor joint="left_hip" gear="50" ctrlrange="-2 2"/>', [-100, 100]),
+        ('<motor joint="left_hip" gear="-50" ctrlrange="-2 1"/>', [-50, 100]),
+        (
+            '<motor joint="left_hip" gear="50" ctrlrange="-2 2" forcerange="-1 1"/>',
+            [-50, 50],
+        ),
+        ('<position joint="left_hip" kp="90" forcerange="-70 70"/>', [-70, 70]),
+        ('<general joint="left_hip" gainprm="30" ctrlrange="-1 1"/>', [-30, 30]),
+        (
+            '<motor joint="left_hip" ctrlrange="-4 4"/>'
+            '<motor joint="left_hip" ctrlrange="-3 3"/>',
+            [-7, 7],
+        ),
+        # No limit, or one of positions.
+        ('<motor joint="left_hip"/>', [0, 0]),
+        ('<position joint="left_hip" kp="90" ctrlrange="-1 1"/>', [0, 0]),
+        (
+            '<motor joint="left_hip" ctrlrange="-4 4"/><motor joint="left_hip"/>',
+            [0, 0],
+        ),
+    ],
+)
+def test_a_joint_without_a_torque_limit_has_that_of_its_actuators(
+    actuators, expected, tmp_path
+):
+    def torques(model, joint):
+        robot = portable(read_folder(write_robot(tmp_path, model=model)))
+        return robot.model.jnt_actfrcrange[robot.model.joint(joint).id].tolist()
+
+    before, after = MODEL.split('<motor joint="left_hip"/>')
+    model = before + actuators + after
+    # Of the joint itself: its range counts.
+    assert torques(model, "left_hip") == [-60, 60]
+    model = model.replace('actuatorfrcrange="-60 60" ', "")
+    assert torques(model, "left_hip") == expected
+    assert torques(model, "left_ankle") == [0, 0]
 
 
 def test_the_base_of_a_urdf_floats(tmp_path):
