@@ -210,6 +210,8 @@ def fit_meshes(
         geom
         for geom in spec.geoms
         if geom.type == _MESH
+        # Floor and scenery are not kept.
+        and geom.parent.name != "world"
         and (geom.contype or geom.conaffinity or geom.name in in_pairs)
     ]
     fits: list[MeshFit] = []

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from calling import succeed
-from egoskin.robots.meshes import around_mesh
+from egoskin.robots.meshes import around_mesh, fit_meshes
 from egoskin.robots.own import read_folder
 from egoskin.robots.portable import portable
 from egoskin.robots.surface import distance_to
@@ -114,7 +114,12 @@ def with_mesh(more=""):
 
 
 def test_a_collision_mesh_of_an_mjcf_becomes_a_primitive(tmp_path):
-    before = read_folder(write_robot(tmp_path / "walker", model=with_mesh()))
+    # A rock of the scene is not the robot's.
+    rock = '<worldbody><geom type="mesh" mesh="m" pos="2 0 0"/>'
+    model = with_mesh().replace("<worldbody>", rock)
+    before = read_folder(write_robot(tmp_path / "walker", model=model))
+    fits, _ = fit_meshes(before.spec())
+    assert [fit.link for fit in fits] == ["trunk"]
     robot = portable(before)
     np.testing.assert_allclose(robot.model.body_mass, before.model.body_mass, 1e-5)
     np.testing.assert_allclose(
