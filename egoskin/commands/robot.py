@@ -26,9 +26,8 @@ from egoskin.progress import counted
 from egoskin.robots.builtin import ROBOTS
 from egoskin.robots.checks import Finding, check_model, names_of
 from egoskin.robots.config import RobotConfig
-from egoskin.robots.meshes import fit_meshes
-from egoskin.robots.own import find_robot
-from egoskin.robots.portable import portable
+from egoskin.robots.own import raw_robot
+from egoskin.robots.portable import Portable, make_portable
 from egoskin.sensors.config import SkinConfig
 from egoskin.storage.files import check_output
 from egoskin.viewer.film import save_picture
@@ -57,11 +56,11 @@ class Check:
             ValueError: If the robot cannot be trained.
         """
         check_output(self.out, "--out", (".png",))
-        robot = find_robot(self.robot)
+        robot = raw_robot(self.robot)
         meshes: list[Finding] = []
         if ROBOTS.get(robot.name) is not robot:
-            meshes = list(_meshes(robot))
-            robot = portable(robot)
+            made = make_portable(robot)
+            robot, meshes = made.robot, list(_meshes(made))
         mass = float(robot.model.body_mass.sum())
         print(
             f"{robot.name}: {counted(len(robot.joints), 'joint')}, "
@@ -81,10 +80,9 @@ class Check:
             )
 
 
-def _meshes(robot: RobotConfig) -> Iterator[Finding]:
-    """Tell what becomes of collision meshes."""
-    fits, lost = fit_meshes(robot.spec(), robot.model_path if robot.is_urdf else None)
-    if fits:
+def _meshes(made: Portable) -> Iterator[Finding]:
+    """Tell what became of collision meshes."""
+    if fits := made.fits:
         excess = [fit.excess for fit in fits]
         shapes = ", ".join(
             f"{fit.link} ({', '.join(each.kind for each in fit.primitives)})"
@@ -95,11 +93,12 @@ def _meshes(robot: RobotConfig) -> Iterator[Finding]:
             f"collision meshes become primitives around them, of {min(excess):.1f} to "
             f"{max(excess):.1f} times the volume of their convex hulls: {shapes}",
         )
-    if lost:
+    if made.lost:
         yield Finding(
             "note",
-            f"{', '.join(lost)}: collision meshes that are not found, or neither STL "
-            "nor OBJ, are left out; balls pass through, so add primitives",
+            f"{', '.join(made.lost)}: collision meshes that are not found, or neither "
+            "binary STL nor OBJ with a volume, are left out; balls pass through, so "
+            "add primitives",
         )
 
 

@@ -22,6 +22,9 @@ _MESH = mujoco.mjtGeom.mjGEOM_MESH
 _QUAT = mujoco.mjtOrientation.mjORIENTATION_QUAT
 # Half the least thickness of a primitive [m].
 _THINNEST = 5e-4
+# Each primitive is larger by this [m]: an MJCF has six digits, and no gap may open
+# between two parts of a mesh.
+_ROUNDING = 2e-5
 # A primitive turned relative to its link, or a second one, must save this share of the
 # volume: one along the link's axes is alike on both sides of the robot, and a sole
 # stays level; each one costs time in every step.
@@ -51,7 +54,12 @@ class MeshFit:
 
 
 def around_mesh(
-    link: str, vertices: np.ndarray, faces: np.ndarray, own_axes: np.ndarray
+    link: str,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    own_axes: np.ndarray,
+    *,
+    may_cut: bool = True,
 ) -> MeshFit:
     """Return one or two primitives around a mesh.
 
@@ -64,24 +72,27 @@ def around_mesh(
         vertices: Vertices in the link frame [m], ``[n, 3]``.
         faces: Vertices of each triangle, ``[f, 3]``.
         own_axes: Rotation from the mesh's own axes to the link frame, ``[3, 3]``.
+        may_cut: Whether there may be two.
     """
 
     def volume(parts: list[tuple[float, Primitive]]) -> float:
         return sum(part[0] for part in parts)
 
-    whole = [_around(link, vertices, own_axes)]
-    halves = min(
-        (
-            [
-                _around(link, np.concatenate(half), own_axes)
-                for half in (slabs[:cut], slabs[cut:])
-            ]
-            for slabs in (_slabs(vertices, faces, axis) for axis in range(3))
-            for cut in range(1, _SLABS)
-        ),
-        key=volume,
-    )
-    best = halves if volume(halves) < (1 - _SAVING) * volume(whole) else whole
+    best = [_around(link, vertices, own_axes)]
+    if may_cut:
+        halves = min(
+            (
+                [
+                    _around(link, np.concatenate(half), own_axes)
+                    for half in (slabs[:cut], slabs[cut:])
+                ]
+                for slabs in (_slabs(vertices, faces, axis) for axis in range(3))
+                for cut in range(1, _SLABS)
+            ),
+            key=volume,
+        )
+        if volume(halves) < (1 - _SAVING) * volume(best):
+            best = halves
     try:
         excess = volume(best) / float(ConvexHull(vertices).volume)
     except QhullError:
@@ -145,19 +156,20 @@ def _along(link: str, points: np.ndarray, axes: np.ndarray) -> tuple[float, Prim
     local = points @ axes
     low, high = local.min(0), local.max(0)
     centre, half = (low + high) / 2, np.maximum((high - low) / 2, _THINNEST)
+    half += _ROUNDING
     local -= centre
     shapes = [(8 * half.prod(), "box", half, np.eye(3))]
     for axis in range(3):
         along = np.abs(local[:, axis])
         square = (local**2).sum(1) - along**2
-        radius = max(np.sqrt(square.max()), _THINNEST)
+        radius = max(np.sqrt(square.max()), _THINNEST) + _ROUNDING
         # Each point is below the cap at its distance from the axis.
         caps = np.sqrt(np.maximum(radius**2 - square, 0))
         length = max((along - caps).max(), _THINNEST)
         volume = np.pi * radius**2 * (2 * length + 4 / 3 * radius)
         size, turned = [radius, length, 0], np.roll(np.eye(3), 2 - axis, axis=1)
         shapes.append((volume, "capsule", np.array(size), turned))
-    radius = max(np.linalg.norm(local, axis=1).max(), _THINNEST)
+    radius = max(np.linalg.norm(local, axis=1).max(), _THINNEST) + _ROUNDING
     size = np.array([radius, 0, 0])
     shapes.append((4 / 3 * np.pi * radius**3, "sphere", size, np.eye(3)))
     volume, kind, size, turned = min(shapes, key=lambda each: each[0])
@@ -171,13 +183,27 @@ def _along(link: str, points: np.ndarray, axes: np.ndarray) -> tuple[float, Prim
     return float(volume), primitive
 
 
+def set_shape(
+    geom: mujoco.MjsGeom,
+    kind: mujoco.mjtGeom,
+    size: np.ndarray,
+    position: np.ndarray,
+    quat: np.ndarray,
+) -> None:
+    """Give a geom a kind, MuJoCo's sizes [m] and a pose in the frame of its link."""
+    geom.type, geom.size, geom.meshname = kind, size, ""
+    geom.pos, geom.quat, geom.alt.type = position, quat, _QUAT
+    geom.fromto = np.full(6, np.nan)
+    # Else the pose would be relative to a frame of the file.
+    geom.set_frame(geom.parent.add_frame())
+
+
 def _set_primitive(geom: mujoco.MjsGeom, primitive: Primitive) -> None:
     """Give a geom of a link the kind, size and pose of a primitive."""
-    geom.type = getattr(mujoco.mjtGeom, f"mjGEOM_{primitive.kind.upper()}")
-    geom.size, geom.pos, geom.meshname = primitive.size, primitive.position, ""
+    kind = getattr(mujoco.mjtGeom, f"mjGEOM_{primitive.kind.upper()}")
     quat = np.empty(4)
     mujoco.mju_mat2Quat(quat, primitive.rotation.ravel())
-    geom.quat, geom.alt.type = quat, _QUAT
+    set_shape(geom, kind, primitive.size, primitive.position, quat)
 
 
 def _same_contacts(geom: mujoco.MjsGeom) -> mujoco.MjsGeom:
@@ -188,22 +214,16 @@ def _same_contacts(geom: mujoco.MjsGeom) -> mujoco.MjsGeom:
     return other
 
 
-def fit_meshes(
-    spec: mujoco.MjSpec, urdf: Path | None = None, in_pairs: Collection[str] = ()
-) -> tuple[list[MeshFit], list[str]]:
+def fit_meshes(spec: mujoco.MjSpec, in_pairs: Collection[str] = ()) -> list[MeshFit]:
     """Replace the collision meshes of a robot by primitives around them.
 
     Args:
-        spec: The robot; primitives that MuJoCo itself fits to meshes also get sizes and
+        spec: The robot. Primitives that MuJoCo itself fits to meshes get sizes and
             poses of their own.
-        urdf: Its URDF, whose meshes the specification lacks. A mesh is looked for by
-            its path, without ``package://`` and as much of its beginning as necessary,
-            from the folder of the URDF and the two above it.
         in_pairs: Names of geoms that collide whatever their bits.
 
     Returns:
-        The primitives in place of meshes, and the links of a URDF with meshes that are
-        not found or cannot be read (MuJoCo reads STL and OBJ).
+        The primitives in place of meshes.
     """
     fitted = [geom for geom in spec.geoms if geom.meshname and geom.type != _MESH]
     meshes = [
@@ -214,51 +234,62 @@ def fit_meshes(
         and geom.parent.name != "world"
         and (geom.contype or geom.conaffinity or geom.name in in_pairs)
     ]
-    fits: list[MeshFit] = []
-    if fitted or meshes:
-        # It numbers the geoms, and moves those of meshes.
-        model = spec.compile()
-        fits = [_fit(model, geom.id) for geom in meshes]
-        for geom in fitted:
-            geom.size, geom.pos = model.geom_size[geom.id], model.geom_pos[geom.id]
-            geom.quat, geom.alt.type = model.geom_quat[geom.id], _QUAT
-            geom.meshname = ""
-        for geom, fit in zip(meshes, fits, strict=True):
-            _set_primitive(geom, fit.primitives[0])
-            for primitive in fit.primitives[1:]:
-                _set_primitive(_same_contacts(geom), primitive)
-    if urdf is None:
-        return fits, []
-    fits, lost = _urdf_meshes(urdf)
-    for fit in fits:
-        for primitive in fit.primitives:
-            _set_primitive(spec.body(fit.link).add_geom(), primitive)
-    return fits, lost
+    if not fitted and not meshes:
+        return []
+    # It numbers the geoms, and moves those of meshes.
+    model = spec.compile()
+    # The pairs of a geom are of its name: a second one would have none.
+    fits = [_fit(model, geom.id, may_cut=geom.name not in in_pairs) for geom in meshes]
+    for geom in fitted:
+        size, position = model.geom_size[geom.id], model.geom_pos[geom.id]
+        set_shape(geom, geom.type, size, position, model.geom_quat[geom.id])
+    for geom, fit in zip(meshes, fits, strict=True):
+        _set_primitive(geom, fit.primitives[0])
+        for primitive in fit.primitives[1:]:
+            _set_primitive(_same_contacts(geom), primitive)
+    return fits
 
 
-def _urdf_meshes(path: Path) -> tuple[list[MeshFit], list[str]]:
-    """Return primitives around the collision meshes of a URDF, and links without."""
+def add_urdf_meshes(spec: mujoco.MjSpec, path: Path) -> tuple[list[MeshFit], list[str]]:
+    """Add primitives around the collision meshes of a URDF.
+
+    A mesh is looked for by its path, without ``package://`` and as much of its
+    beginning as necessary, from the folder of the URDF and the two above it.
+
+    Args:
+        spec: The robot, without its meshes.
+        path: Its URDF.
+
+    Returns:
+        The primitives, and the links with meshes that are not found or that MuJoCo
+        cannot read.
+    """
     fits: list[MeshFit] = []
     lost: list[str] = []
-    spec = mujoco.MjSpec.from_file(str(path))
-    for geom in spec.geoms:
-        if geom.type != _MESH:
+    file = mujoco.MjSpec.from_file(str(path))
+    for geom in file.geoms:
+        link = spec.body(geom.parent.name)
+        visual = not geom.contype and not geom.conaffinity
+        if geom.type != _MESH or visual or link is None:
             continue
-        mesh, alone = spec.mesh(geom.meshname), mujoco.MjSpec()
-        file = _find(path.resolve().parent, mesh.file, spec.meshdir)
+        mesh, alone = file.mesh(geom.meshname), mujoco.MjSpec()
+        found = _find(path.resolve().parent, mesh.file, file.meshdir)
         try:
             alone.add_mesh(
                 name="mesh",
-                file=str(file or ""),
+                file=str(found or ""),
                 scale=mesh.scale,
                 # The volume of a mesh that is not closed may be 0.
                 inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX,
             )
-            body = alone.worldbody.add_body(name=geom.parent.name)
+            body = alone.worldbody.add_body(name=link.name)
             body.add_geom(type=_MESH, meshname="mesh", pos=geom.pos, quat=geom.quat)
             fits.append(_fit(alone.compile(), 0))
         except ValueError:
-            lost.append(geom.parent.name)
+            lost.append(link.name)
+            continue
+        for primitive in fits[-1].primitives:
+            _set_primitive(link.add_geom(), primitive)
     return fits, list(dict.fromkeys(lost))
 
 
@@ -272,7 +303,7 @@ def _find(folder: Path, file: str, meshdir: str) -> Path | None:
     return None
 
 
-def _fit(model: mujoco.MjModel, geom: int) -> MeshFit:
+def _fit(model: mujoco.MjModel, geom: int, *, may_cut: bool = True) -> MeshFit:
     """Return the primitives around a geom that is a mesh."""
     mesh = model.geom_dataid[geom]
     vertices, faces = (
@@ -287,4 +318,4 @@ def _fit(model: mujoco.MjModel, geom: int) -> MeshFit:
     own_axes = rotation.reshape(3, 3)
     points = vertices.astype(float) @ own_axes.T + model.geom_pos[geom]
     link = body_name(model, int(model.geom_bodyid[geom]))
-    return around_mesh(link, points, faces, own_axes)
+    return around_mesh(link, points, faces, own_axes, may_cut=may_cut)

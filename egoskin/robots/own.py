@@ -55,6 +55,23 @@ _NEEDED = ("model", "base", "feet", "skin_links", "gains")
 def find_robot(name: str) -> RobotConfig:
     """Return a built-in robot by name, or one read from a path.
 
+    A robot of the task, which has gains, is that of trainings: self-contained data, as
+    of `egoskin.robots.portable.portable`. Others are as in their file.
+
+    Args:
+        name: As for `raw_robot`.
+
+    Raises:
+        ValueError: If there is no such robot, or its description is invalid.
+        OSError: If a file that it refers to cannot be read.
+    """
+    robot = raw_robot(name)
+    return portable(robot) if robot.gains and name not in ROBOTS else robot
+
+
+def raw_robot(name: str) -> RobotConfig:
+    """Return a built-in robot by name, or one as a file describes it.
+
     Args:
         name: Name of a built-in robot, a folder with ``robot.toml``, a `RobotConfig` in
             a Python file (``my_robot.py:ROBOT``; the file is executed), or an MJCF or

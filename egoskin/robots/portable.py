@@ -6,8 +6,9 @@ is loaded.
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from dataclasses import replace
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, replace
+from typing import Any
 from xml.etree import ElementTree
 
 import mujoco
@@ -15,13 +16,15 @@ import numpy as np
 
 from egoskin.robots.chains import body_id, body_name
 from egoskin.robots.config import RobotConfig, round_off
-from egoskin.robots.meshes import fit_meshes
+from egoskin.robots.meshes import MeshFit, add_urdf_meshes, fit_meshes, set_shape
 from egoskin.robots.spec import set_inertia
 
 # Collision bits of balls and floor; a robot's own bits are above them.
 _WORLD_BITS, _NUM_WORLD_BITS = 3, 2
 # What a tendon without effect has none of.
 _TENDON_FORCES = ("limited", "stiffness", "damping", "frictionloss", "armature")
+# Groups of geoms that pictures show are those up to this one.
+_LAST_SHOWN = 2
 # Elements of a default class that apply to what is kept.
 _KEPT_DEFAULTS = ("default", "joint", "geom", "site", "material", "pair")
 # An MJCF has six digits. Rounded, two inertias and their sum differ by less than this.
@@ -32,6 +35,18 @@ _PRIMITIVES = (
     mujoco.mjtGeom.mjGEOM_BOX,
     mujoco.mjtGeom.mjGEOM_CYLINDER,
 )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Portable:
+    """A robot as self-contained data, and what became of its collision meshes."""
+
+    robot: RobotConfig
+    """The robot, its model as text."""
+    fits: list[MeshFit]
+    """Primitives in place of collision meshes."""
+    lost: list[str]
+    """Links of a URDF with collision meshes that could not be read."""
 
 
 def portable(robot: RobotConfig) -> RobotConfig:
@@ -55,8 +70,13 @@ def portable(robot: RobotConfig) -> RobotConfig:
         ValueError: If a collision shape is of another kind (ellipsoid, height field),
             or the model contains other elements that cannot be kept as data.
     """
+    return make_portable(robot).robot
+
+
+def make_portable(robot: RobotConfig) -> Portable:
+    """Return a robot as of `portable`, and what became of its meshes."""
     if robot.model_xml is not None:
-        return robot
+        return Portable(robot=robot, fits=[], lost=[])
     spec, model = robot.spec(), robot.model
     keep = set(robot.links)
     _check_outermost(robot, model)
@@ -77,15 +97,26 @@ def portable(robot: RobotConfig) -> RobotConfig:
     for body in list(spec.worldbody.bodies):
         if body.name not in keep:
             spec.delete(body)
-    fits, _ = fit_meshes(spec, robot.model_path if robot.is_urdf else None, in_pairs)
+    # They may refer to what has been deleted.
+    _delete(
+        spec,
+        *(spec.actuators, spec.sensors, spec.keys, spec.cameras, spec.lights),
+        *(spec.texts, spec.numerics, spec.tuples, spec.tendons, spec.skins),
+    )
+    if robot.is_urdf and robot.model_path is not None:
+        fits, lost = add_urdf_meshes(spec, robot.model_path)
+    else:
+        fits, lost = fit_meshes(spec, in_pairs), []
+    _round_off(spec)
     for geom in list(spec.geoms):
         touches = geom.contype or geom.conaffinity or geom.name in in_pairs
+        if touches and geom.group > _LAST_SHOWN:
+            # What was shown in its place is left out.
+            geom.group = 0
         if geom.parent.name == "world" or (
             not touches and geom.type not in _PRIMITIVES
         ):
             spec.delete(geom)
-        elif geom.type == mujoco.mjtGeom.mjGEOM_CYLINDER:
-            _round_off(geom)
         elif geom.type not in _PRIMITIVES:
             raise ValueError(
                 f"{robot.name}: link {geom.parent.name!r} has a collision shape, "
@@ -97,22 +128,14 @@ def portable(robot: RobotConfig) -> RobotConfig:
     for each in (*spec.geoms, *spec.pairs):
         # A ball within the margin would count as a touch.
         each.margin = each.gap = 0.0
-    geoms, bodies = ({each.name for each in x} for x in (spec.geoms, spec.bodies))
+    geoms = {geom.name for geom in spec.geoms}
     for pair in list(spec.pairs):
         if not {pair.geomname1, pair.geomname2} <= geoms:
             spec.delete(pair)
-    for exclude in list(spec.excludes):
-        if not {exclude.bodyname1, exclude.bodyname2} <= bodies:
-            spec.delete(exclude)
     _set_bits(spec, in_pairs)
     _exclude_overlaps(spec, robot, {fit.link for fit in fits})
-    for elements in (
-        *(spec.actuators, spec.sensors, spec.keys, spec.cameras, spec.lights),
-        *(spec.meshes, spec.textures, spec.hfields, spec.skins),
-        *(spec.texts, spec.numerics, spec.tuples, spec.tendons),
-    ):
-        for element in list(elements):
-            spec.delete(element)
+    _delete(spec, spec.meshes, spec.textures, spec.hfields)
+    spec.meshdir = spec.texturedir = ""
     for material in spec.materials:
         material.textures = [""] * len(material.textures)
     base = spec.body(robot.base)
@@ -133,7 +156,14 @@ def portable(robot: RobotConfig) -> RobotConfig:
             raise
         data = replace(data, model_xml=_robot_only(spec.to_xml()))
         _ = data.model
-    return data
+    return Portable(robot=data, fits=fits, lost=lost)
+
+
+def _delete(spec: mujoco.MjSpec, *kinds: Iterable[Any]) -> None:
+    """Delete elements of a specification."""
+    for elements in kinds:
+        for element in list(elements):
+            spec.delete(element)
 
 
 def _robot_only(text: str) -> str:
@@ -222,10 +252,21 @@ def _thicken(spec: mujoco.MjSpec, model: mujoco.MjModel) -> bool:
     return found
 
 
-def _round_off(geom: mujoco.MjsGeom) -> None:
-    """Turn a cylinder into a capsule or, if it is flat, into a box."""
-    kind, geom.size = round_off(float(geom.size[0]), float(geom.size[1]))
-    geom.type = getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")
+def _round_off(spec: mujoco.MjSpec) -> None:
+    """Turn each cylinder into a capsule or, if it is flat, into a box."""
+    cylinders = [g for g in spec.geoms if g.type == mujoco.mjtGeom.mjGEOM_CYLINDER]
+    # Of one between two points, only the compiled model has length and pose.
+    ends = [geom for geom in cylinders if not np.isnan(geom.fromto).any()]
+    model = spec.compile() if ends else None
+    for geom in cylinders:
+        size = geom.size if model is None else model.geom_size[geom.id]
+        kind, rounded = round_off(float(size[0]), float(size[1]))
+        kind = getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")
+        if model is not None and geom in ends:
+            pose = model.geom_pos[geom.id], model.geom_quat[geom.id]
+            set_shape(geom, kind, np.array(rounded), *pose)
+        else:
+            geom.type, geom.size = kind, rounded
 
 
 def _set_bits(spec: mujoco.MjSpec, in_pairs: Collection[str]) -> None:
@@ -257,6 +298,8 @@ def _exclude_overlaps(
     if not links:
         return
     model = spec.compile()
+    # The file's options are not those of the scene.
+    model.opt.disableflags = 0
     data = mujoco.MjData(model)
     for joint, position in zip(robot.joints, robot.default_joint_pos, strict=True):
         data.joint(joint).qpos = position

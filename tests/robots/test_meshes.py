@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from calling import succeed
-from egoskin.robots.meshes import around_mesh, fit_meshes
+from egoskin.robots.meshes import around_mesh
 from egoskin.robots.own import read_folder
-from egoskin.robots.portable import portable
-from egoskin.robots.surface import distance_to
+from egoskin.robots.portable import make_portable, portable
+from egoskin.robots.surface import distance_to, sample_surface
 from owning import MODEL, write_robot
 
 
@@ -55,9 +55,9 @@ def test_a_turned_mesh_is_fitted_along_its_own_axes():
     found = fit(mesh, turn)
     (primitive,) = found.primitives
     assert primitive.kind == "box"
-    np.testing.assert_allclose(primitive.size, size, atol=1e-6)
+    np.testing.assert_allclose(primitive.size, size, atol=3e-5)
     np.testing.assert_allclose(primitive.rotation, turn, atol=1e-6)
-    assert found.excess == pytest.approx(1, abs=1e-6)
+    assert found.excess == pytest.approx(1, abs=1e-3)
 
 
 def test_head_and_trunk_are_two_boxes():
@@ -97,7 +97,7 @@ def test_a_flat_mesh_has_a_thickness():
     (primitive,) = found.primitives
     assert found.excess == np.inf
     assert primitive.kind == "box"
-    assert primitive.size.tolist() == [0.5, 0.5, 5e-4]
+    np.testing.assert_allclose(primitive.size, [0.5, 0.5, 5e-4], atol=3e-5)
 
 
 CORNERS = [(x, y, z) for x in (0, 0.1) for y in (0, 0.2) for z in (0, 0.6)]
@@ -118,16 +118,16 @@ def test_a_collision_mesh_of_an_mjcf_becomes_a_primitive(tmp_path):
     rock = '<worldbody><geom type="mesh" mesh="m" pos="2 0 0"/>'
     model = with_mesh().replace("<worldbody>", rock)
     before = read_folder(write_robot(tmp_path / "walker", model=model))
-    fits, _ = fit_meshes(before.spec())
-    assert [fit.link for fit in fits] == ["trunk"]
-    robot = portable(before)
+    made = make_portable(before)
+    assert [fit.link for fit in made.fits] == ["trunk"]
+    robot = made.robot
     np.testing.assert_allclose(robot.model.body_mass, before.model.body_mass, 1e-5)
     np.testing.assert_allclose(
         robot.model.body_inertia, before.model.body_inertia, 1e-5
     )
     (shape,) = [p for p in robot.primitives if abs(p.size[2] - 0.3) < 1e-4]
     assert (shape.link, shape.kind) == ("trunk", "box")
-    np.testing.assert_allclose(shape.size, (0.05, 0.1, 0.3), atol=1e-5)
+    np.testing.assert_allclose(shape.size, (0.05, 0.1, 0.3), atol=3e-5)
     np.testing.assert_allclose(shape.position, (0.05, 0.1, 0.7), atol=1e-5)
     geom = np.flatnonzero(np.abs(robot.model.geom_size[:, 2] - 0.3) < 1e-4).item()
     assert robot.model.geom_friction[geom].tolist() == [0.7, 0.1, 0.1]
@@ -162,6 +162,94 @@ def test_two_parts_of_a_mesh_collide_alike(tmp_path):
         np.testing.assert_array_equal(values[0], values[1])
 
 
+def test_a_mesh_in_a_frame_is_where_the_file_puts_it(tmp_path):
+    model = with_mesh()
+    start, end = model.index('<geom type="mesh"'), model.index('<body name="left_arm"')
+    mesh = model[start:end]
+    posed = (
+        f'<frame pos="0.3 0 0" euler="0 0 0.5">{mesh}{mesh.replace("mesh", "box", 1)}'
+    )
+    model = model[:start] + posed + "</frame>" + model[end:]
+    before = read_folder(write_robot(tmp_path / "walker", model=model))
+    after = portable(before)
+    tall = [np.abs(r.model.geom_size[:, 2] - 0.3) < 1e-3 for r in (before, after)]
+    # One that is around the mesh, and one that MuJoCo fits to it.
+    (box,) = before.model.geom_pos[tall[0]][-1:]
+    found = after.model.geom_pos[tall[1]]
+    assert len(found) == 2
+    np.testing.assert_allclose(found, [box, box], atol=1e-4)
+
+
+def test_a_robot_whose_meshes_are_shown_in_place_of_its_shapes_is_seen(tmp_path):
+    model = with_mesh().replace('<geom type="mesh"', '<geom group="3" type="mesh"')
+    robot = portable(read_folder(write_robot(tmp_path / "walker", model=model)))
+    assert robot.model.geom_group.max() == 0
+
+
+def test_what_looks_at_a_deleted_body_is_deleted_first(tmp_path):
+    scene = '<body name="post"/><camera name="c" mode="targetbody" target="post"/>'
+    model = with_mesh().replace("<worldbody>", f"<worldbody>{scene}")
+    robot = portable(read_folder(write_robot(tmp_path / "walker", model=model)))
+    assert robot.model.ncam == 0
+    assert "post" not in (robot.model_xml or "post")
+
+
+def test_no_sensor_is_between_the_parts_of_a_mesh(tmp_path):
+    rng = np.random.default_rng(0)
+    cut = 0
+    for _ in range(6):
+        pieces = []
+        for height, width in ((0, 0.3), (0.25, 0.1)):
+            piece = trimesh.creation.box((width, width, 0.25))
+            piece.vertices = piece.vertices + (0, 0, height) + rng.normal(size=3) / 100
+            pieces.append(piece)
+        mesh = trimesh.util.concatenate(pieces)
+        vertices, faces = (
+            " ".join(map(str, np.array(each).ravel()))
+            for each in (mesh.vertices, mesh.faces)
+        )
+        start, _, rest = with_mesh().partition("<asset>")
+        model = (
+            f'{start}<asset><mesh name="m" inertia="convex" vertex="{vertices}" '
+            f'face="{faces}"/>{rest[rest.index("</asset>") :]}'
+        )
+        robot = portable(read_folder(write_robot(tmp_path / "walker", model=model)))
+        parts = [p for p in robot.primitives if p.link == "trunk"][-2:]
+        cut += parts[1].size[2] != 0.2
+        points = sample_surface(robot, ["trunk"], 2000, np.random.default_rng(0))
+        depth = [-distance_to(part, points.position) for part in parts]
+        # On the surface of both is between them.
+        assert (np.max(np.abs(depth), axis=0) < 1e-4).sum() <= 3
+    assert cut
+
+
+def test_a_mesh_that_collides_by_pairs_alone_is_one_primitive(tmp_path):
+    mesh = trimesh.util.concatenate(
+        [trimesh.creation.box((0.3, 0.3, 0.2)), trimesh.creation.box((0.05, 0.05, 0.8))]
+    )
+    vertices, faces = (
+        " ".join(map(str, np.array(each).ravel()))
+        for each in (mesh.vertices, mesh.faces)
+    )
+    start, _, rest = with_mesh().partition("<asset>")
+    model = (
+        f'{start}<asset><mesh name="m" inertia="convex" vertex="{vertices}" '
+        f'face="{faces}"/>{rest[rest.index("</asset>") :]}'
+    )
+    pairs = '<contact><pair geom1="hull" geom2="hand"/></contact><actuator>'
+    alone = model.replace("<actuator>", pairs).replace(
+        '<geom type="mesh"', '<geom name="hull" contype="0" conaffinity="0" type="mesh"'
+    )
+    hand = '<body name="right_arm" pos="0 -0.25 0.3">'
+    alone = alone.replace(
+        hand, f'{hand}<geom name="hand" size="0.01" contype="0" conaffinity="0"/>'
+    )
+    for text, number in ((model, 2), (alone, 1)):
+        folder = write_robot(tmp_path / "walker", model=text)
+        (fit,) = make_portable(read_folder(folder)).fits
+        assert len(fit.primitives) == number
+
+
 def test_links_that_overlap_because_of_their_meshes_do_not_collide(tmp_path):
     # The trunk's mesh reaches into an arm of its arm.
     model = with_mesh().replace(
@@ -178,6 +266,12 @@ def test_links_that_overlap_because_of_their_meshes_do_not_collide(tmp_path):
     folder = write_robot(tmp_path / "walker", model=model)
     (folder / "robot.toml").write_text(toml)
     robot = portable(read_folder(folder))
+    # Without an effect here: the scene has options of its own.
+    off = model.replace(
+        "<worldbody>", '<option><flag contact="disable"/></option><worldbody>', 1
+    )
+    (folder / "walker.xml").write_text(off)
+    assert portable(read_folder(folder)).spec().excludes
     pairs = {tuple(sorted((e.bodyname1, e.bodyname2))) for e in robot.spec().excludes}
     assert ("head", "trunk") in pairs
     data = mujoco.MjData(robot.model)
@@ -214,19 +308,33 @@ TOML = (
 )
 
 
+# Unitree's files keep visual geoms.
+KEPT = '<mujoco><compiler discardvisual="false"/></mujoco>'
+
+
+@pytest.mark.parametrize("visuals", ["", KEPT])
 @pytest.mark.parametrize("folder", ["meshes", "../meshes", "../../stump/meshes"])
-def test_a_collision_mesh_of_a_urdf_is_found(folder, tmp_path):
+def test_a_collision_mesh_of_a_urdf_is_found(folder, visuals, tmp_path):
     home = tmp_path / "stump" / "urdf"
     (home / folder).mkdir(parents=True)
-    (home / "stump.urdf").write_text(URDF)
+    urdf = URDF.replace("stump/look.dae", "stump/meshes/look.stl")
+    # A second thing in the file's world is not the robot.
+    table = """<link name="world"/><link name="table"><collision><geometry>
+      <mesh filename="meshes/hull.stl"/></geometry></collision></link>
+      <joint name="a" type="fixed"><parent link="world"/><child link="table"/></joint>
+      <joint name="b" type="floating"><parent link="world"/><child link="hull"/></joint>
+    """
+    urdf = urdf.replace("<link", f"{visuals}{table}<link", 1)
+    (home / "stump.urdf").write_text(urdf)
     (home / "robot.toml").write_text(TOML)
     trimesh.creation.box((100, 200, 300)).export(home / folder / "hull.stl")
+    trimesh.creation.box((1, 1, 1)).export(home / folder / "look.stl")
     robot = portable(read_folder(home))
     hull, foot = robot.primitives
     assert (hull.link, hull.kind, foot.link) == ("hull", "box", "foot")
-    np.testing.assert_allclose(hull.size, (0.05, 0.1, 0.15), atol=1e-6)
+    np.testing.assert_allclose(hull.size, (0.05, 0.1, 0.15), atol=3e-5)
     np.testing.assert_allclose(hull.position, (0, 0, 0.2), atol=1e-6)
     assert robot.model.body_mass.sum() == pytest.approx(4)
     out = succeed("robot", "check", home)
     assert "1.0 to 1.0 times the volume of their convex hulls: hull (box)" in out
-    assert "foot: collision meshes that are not found, or neither STL nor OBJ" in out
+    assert "  note   foot: collision meshes that are not found, or neither" in out

@@ -167,6 +167,33 @@ def test_cylinders_become_capsules_as_long_and_as_wide(walker):
     assert (leg.kind, *leg.size[:2]) == ("capsule", 0.05, pytest.approx(0.23))
 
 
+def test_a_cylinder_between_two_points_is_where_it_was(tmp_path):
+    rod = '<geom type="cylinder" size="0.05" fromto="0.1 0.2 0 0.1 0.6 0.3" mass="1"/>'
+    model = MODEL.replace('<body name="left_arm"', f'{rod}<body name="left_arm"')
+    before = read_folder(write_robot(tmp_path, model=model))
+    after = portable(before)
+    own, expected = (
+        next(p for p in each.primitives if p.link == "trunk" and p.size[0] == 0.05)
+        for each in (after, before)
+    )
+    assert (own.kind, expected.kind) == ("capsule", "capsule")
+    for name in ("size", "position", "rotation"):
+        values = (getattr(each, name) for each in (own, expected))
+        np.testing.assert_allclose(*values, atol=1e-5)
+
+
+def test_paths_of_the_file_are_not_stored(tmp_path):
+    model = MODEL.replace("<compiler ", f'<compiler meshdir="{tmp_path}" ')
+    robot = portable(read_folder(write_robot(tmp_path / "walker", model=model)))
+    plain = portable(read_folder(write_robot(tmp_path / "walker")))
+    assert robot.model_xml == plain.model_xml
+
+
+def test_commands_take_the_robot_of_trainings(tmp_path):
+    folder = write_robot(tmp_path / "walker")
+    assert find_robot(str(folder)) == portable(read_folder(folder))
+
+
 def test_margins_are_no_touch(tmp_path):
     model = MODEL.replace("<geom type=", '<geom margin="0.05" gap="0.01" type=')
     robot = portable(read_folder(write_robot(tmp_path, model=model)))
