@@ -37,7 +37,7 @@ from egoskin.storage.tensor_file import part, prefixed
 from egoskin.transform import StatefulTransform
 
 # Larger numbers are taken to be typing errors.
-_MOST_AGENTS, _MOST_WORKERS = 2**20, 1024
+MOST_AGENTS, _MOST_WORKERS = 2**20, 1024
 # Memory of the simulation of one agent, and the memory that workers share besides the
 # tensors (at least a page for each tensor) [bytes].
 _SIMULATION, _SHARED_EXTRA = 12_000, 2**20
@@ -315,7 +315,7 @@ def check_num_workers(
         ValueError: If it does not divide the number of agents (the text lists valid
             values), or if either number is out of bounds.
     """
-    agents, processes = (num_envs, _MOST_AGENTS), (num_workers, _MOST_WORKERS)
+    agents, processes = (num_envs, MOST_AGENTS), (num_workers, _MOST_WORKERS)
     for what, (number, most) in {name: agents, "num_workers": processes}.items():
         wrong = number is not None and Interval(ge=1, le=most).violation(number)
         if wrong:

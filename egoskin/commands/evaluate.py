@@ -210,12 +210,13 @@ def _slip(motion: Motion) -> float | None:
     return None if motion.foot_slip is None else 100 * motion.foot_slip
 
 
-def perturbed_table(rows: list[Perturbed], task: DodgeballConfig) -> str:
+def perturbed_table(rows: list[Perturbed], task: DodgeballConfig, episodes: int) -> str:
     """Return success under each perturbation as text; success as in `table`."""
     age, later = task.success_age_s, _later(task)
     lines = [
-        f"\n  {'perturbed by':<26} {f'{age:g} s':>8}  {'(95 % interval)':<16} "
-        f"{f'{later:g} s':>8}  ended by a fall"
+        f"\n  {counted(episodes, 'episode')} each",
+        f"  {'perturbed by':<26} {f'{age:g} s':>8}  {'(95 % interval)':<16} "
+        f"{f'{later:g} s':>8}  ended by a fall",
     ]
     for row in rows:
         low, high = (100 * x for x in (row.success.low, row.success.high))
@@ -283,16 +284,20 @@ def main(args: list[str]) -> None:
     of_training = config.standard == "run"
     played = trained if of_training else config.standard
     throws = "the throws of its training" if of_training else f"standard {played}"
-    title = (
-        f"{config.policy}: trained for {policy.policy_spec.frames:,} frames "
-        f"on standard {trained}; evaluated on {throws}, "
-        f"throw set {config.throw_set} of {counted(config.episodes, 'episode')}"
-    )
-    if config.masked:
-        title += f", sensors masked: {', '.join(config.masked)}"
-    if config.engine != "mujoco":
-        title += f", engine {config.engine}"
-    title += ", physics at "
+
+    def title_of(number: int) -> str:
+        title = (
+            f"{config.policy}: trained for {policy.policy_spec.frames:,} frames "
+            f"on standard {trained}; evaluated on {throws}, "
+            f"throw set {config.throw_set} of {counted(number, 'episode')}"
+        )
+        if config.masked:
+            title += f", sensors masked: {', '.join(config.masked)}"
+        if config.engine != "mujoco":
+            title += f", engine {config.engine}"
+        return title
+
+    title = title_of(config.episodes) + ", physics at "
     task = env_config.task
     print(table(result, title + physics_rate(env_config), task))
     content = {
@@ -319,7 +324,8 @@ def main(args: list[str]) -> None:
     if config.perturbed:
         rows = perturb(*subject, **quarter, on_point=counting("perturbed"))
         line.finish()
-        print(perturbed_table(rows, task))
+        print(perturbed_table(rows, task, episodes))
+        content["perturbed_episodes"] = episodes
         content["perturbed"] = [dataclasses.asdict(row) for row in rows]
     if config.map is not None:
         lines = operating_map(
@@ -329,8 +335,8 @@ def main(args: list[str]) -> None:
             on_point=counting("map"),
         )
         line.finish()
-        what = title.removesuffix(", physics at ")
-        draw_map(config.map, lines, what, task.success_age_s)
+        draw_map(config.map, lines, title_of(episodes), task.success_age_s)
+        content["map_episodes"] = episodes
         content["map"] = [dataclasses.asdict(line) for line in lines]
         print(f"\n{config.map}: success against speed, interval, height and direction")
     if config.json is not None:

@@ -32,8 +32,10 @@ def check_repeats(config: TrainConfig, hashes: Mapping[str, str]) -> None:
     if config.config is None:
         return
     content, before = read_config(config.config)
+    env, own = content["env"], to_plain(config.env)
     if (
-        content["env"]["skin"] == to_plain(config.env.skin)
+        # Sensors are placed on the robot.
+        all(env.get(name) == own[name] for name in ("robot", "skin"))
         and before.get(SKIN_HASH, hashes[SKIN_HASH]) != hashes[SKIN_HASH]
     ):
         raise ValueError(
@@ -41,7 +43,7 @@ def check_repeats(config: TrainConfig, hashes: Mapping[str, str]) -> None:
             "sensors are placed differently here; use that run's skin: --skin.path "
             f"{config.config.parent / 'skin.json'}"
         )
-    if content["init_from"] == to_plain(config)["init_from"] and before.get(
+    if content.get("init_from") == to_plain(config)["init_from"] and before.get(
         INIT_HASH
     ) != hashes.get(INIT_HASH):
         raise ValueError(
@@ -104,9 +106,14 @@ def _check_init(
     path: str,
 ) -> None:
     """Raise ValueError unless an agent can start from what `load_networks` returned."""
-    robot, theirs = (s.env.robot_config.name for s in (spec, other))
-    if robot != theirs:
-        raise ValueError(f"{path} is a policy for {theirs}, not for {robot}")
+    robot, before = (s.env.robot_config for s in (spec, other))
+    if robot.name != before.name:
+        raise ValueError(f"{path} is a policy for {before.name}, not for {robot.name}")
+    if robot.joints != before.joints:
+        raise ValueError(
+            f"{path} is a policy for a {robot.name} with other joints, or in another "
+            f"order: {', '.join(before.joints)}; here: {', '.join(robot.joints)}"
+        )
     if other.network.hidden != spec.network.hidden:
         raise ValueError(
             f"{path} has layers of {list(other.network.hidden)}, not of "
@@ -124,4 +131,9 @@ def _check_init(
                 f"{path} reads {theirs} values of {key!r}, but here there are {here}"
                 + _other_options(spec, other)
             )
+    signal, was = (s.env.sensor.signal for s in (spec, other))
+    if spec.env.sensor.uses_skin and signal != was:
+        raise ValueError(
+            f"{path} reads the signal {was}, not {signal}: add --sensor.signal {was}"
+        )
     check_agent_tensors(agent_tensors(agent), tensors, path)

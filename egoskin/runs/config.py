@@ -209,7 +209,12 @@ def _default_of(given: argparse.Namespace) -> TrainConfig:
             raise ValueError(
                 f"no file {path}{folder}: --config takes the config.json of a run"
             )
-        return from_plain(TrainConfig, read_config(path)[0], str(path))
+        content, _ = read_config(path)
+        if not all(isinstance(content.get(part), dict) for part in ("env", "ppo")):
+            raise ValueError(
+                f"{path} is not the config.json of a run: it has no env or no ppo"
+            )
+        return from_plain(TrainConfig, content, str(path))
     if given.standard not in get_args(Standard):
         return TrainConfig()
     task = training_task(given.standard, DodgeballConfig())

@@ -41,11 +41,16 @@ class FilmMaker:
         traceback: TracebackType | None,
     ) -> None:
         """Finish the last film if training ended normally; otherwise stop it."""
-        if kind is not None and self._process is not None:
+        if kind is not None:
+            self.stop()
+        self._finish()
+
+    def stop(self) -> None:
+        """Stop the film that is being made, if any."""
+        if self._process is not None:
             self._process.terminate()
             self._process.communicate()
             self._process = None
-        self._finish()
 
     def start(self, policy: Path) -> None:
         """Start the film of a policy file, after waiting for the previous film."""

@@ -22,7 +22,6 @@ from __future__ import annotations
 import csv
 import datetime
 import errno
-import fcntl
 import io
 import itertools
 import os
@@ -55,6 +54,7 @@ from egoskin.runs.wandb_log import WandbLog
 from egoskin.sensors import Skin
 from egoskin.storage.files import PARTIAL, append, read_regular, write_file
 from egoskin.storage.formats import content_hash, sealed_json, unseal
+from egoskin.storage.locks import try_lock
 from egoskin.storage.serialization import (
     changed_fields,
     read_json,
@@ -276,7 +276,7 @@ class Run:
 
         Raises:
             RunLockedError: If another process is training it.
-            ValueError: If the lock is a link.
+            ValueError: If the lock is a link, or the file system has no locks.
         """
         path = self.path / "lock"
         flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
@@ -287,12 +287,8 @@ class Run:
                 raise
             raise ValueError(f"{path} is a link, which is not followed") from error
         try:
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise RunLockedError(
-                    f"{self.path} is being trained by another process"
-                ) from None
+            if not try_lock(descriptor, path):
+                raise RunLockedError(f"{self.path} is being trained by another process")
             yield
         finally:
             os.close(descriptor)

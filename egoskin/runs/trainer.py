@@ -393,6 +393,9 @@ def train(
                 saved_at = now
         trainer.save()
         trainer.keep_policy()
+        if trainer.frames < config.total_frames:
+            # Stopped: a second Ctrl-C while waiting would leave the film running.
+            films.stop()
 
 
 def _passes(interval: int | None, before: int, now: int) -> bool:

@@ -11,7 +11,6 @@ used again after an owner has removed all files; the content tells whose a file 
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import re
@@ -22,6 +21,8 @@ import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+
+from egoskin.storage.locks import try_lock
 
 HEARTBEAT_S = 15.0
 """Interval between heartbeats of an owner [s]."""
@@ -139,14 +140,8 @@ def _lock(path: Path, *, create: bool) -> Iterator[bool]:
             those who look do not see each other; and for an exclusive lock some file
             systems require that the file is open for writing.
     """
-    mode, kind = ("a", fcntl.LOCK_EX) if create else ("r", fcntl.LOCK_SH)
-    with open(path, mode) as file:
-        try:
-            fcntl.flock(file, kind | fcntl.LOCK_NB)
-        except BlockingIOError:
-            yield False
-            return
-        yield True
+    with open(path, "a" if create else "r") as file:
+        yield try_lock(file.fileno(), path, shared=not create)
 
 
 def _owners(folder: Path, name: str) -> list[Path]:

@@ -35,7 +35,7 @@ _SHIFT = 1.04
 _VERDICTS = {"confirmed": "#0072B2", "refuted": "#D55E00", "undecided": "#888888"}
 _GEOMETRIES = {
     ("field", "none"): "field",
-    ("ray", "none"): "ray, all 64 beams",
+    ("ray", "none"): "ray, all beams",
     ("ray", "min"): "ray, closest beam",
 }
 # Fields that place a cell in the paper's grid.

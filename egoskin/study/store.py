@@ -34,7 +34,7 @@ from egoskin.storage.formats import content_hash, read_sealed, sealed_json
 from egoskin.storage.serialization import read_json
 from egoskin.storage.tensor_file import load_tensors
 from egoskin.study.claims import is_claimed, is_locked
-from egoskin.study.manifest import Manifest, PlannedRun
+from egoskin.study.manifest import EvaluationPlan, Manifest, PlannedRun
 from egoskin.study.stored import StoredRun, load_run, record, thin, to_json
 
 State = Literal["done", "running", "failed", "stopped", "missing"]
@@ -46,6 +46,8 @@ START = "--- started"
 # Approximate maximum number of lines of metrics that are stored of a run.
 _LINES = 250
 _EVALUATION = "evaluation_*.json"
+# What an evaluation must share with the plan for its results to be comparable.
+_OF_EVALUATION = ("standard", "throw_set", "episodes")
 # Size of the end of a log that is searched for its last line [bytes].
 _TAIL = 2**16
 
@@ -272,15 +274,27 @@ class StudyFolder:
             write_file(folder / name, content)
         self._failure_path(planned.name).unlink(missing_ok=True)
 
-    def result(self, planned: PlannedRun) -> Result:
+    def result(self, planned: PlannedRun, plan: EvaluationPlan | None = None) -> Result:
         """Return a finished run.
+
+        Args:
+            planned: The run.
+            plan: How it must have been evaluated; None: in any way.
 
         Raises:
             ValueError: If it is damaged, or not the planned run.
         """
         folder = self.result_path(planned.name)
         stored = load_run(folder)
-        if differs := planned.differences(stored.config):
+        _, hashes = read_config(folder / "config.json", quiet=True)
+        differs = planned.differences(stored.config, hashes)
+        if plan is not None:
+            differs += [
+                f"evaluation.{name}"
+                for name in _OF_EVALUATION
+                if stored.evaluation[name] != getattr(plan, name)
+            ]
+        if differs:
             raise ValueError(
                 f"{folder} does not match the manifest: it differs in "
                 + ", ".join(differs)
@@ -303,7 +317,11 @@ class StudyFolder:
         Raises:
             ValueError: If one is damaged, or not the planned run.
         """
-        return [self.result(run) for run in manifest.runs if self.is_finished(run.name)]
+        return [
+            self.result(run, manifest.evaluation)
+            for run in manifest.runs
+            if self.is_finished(run.name)
+        ]
 
     # --- failures -------------------------------------------------------------------
 

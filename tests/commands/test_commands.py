@@ -34,6 +34,7 @@ from egoskin.evaluation.throw_set import (
     standard_task,
 )
 from egoskin.evaluation.upper_bound import Outcome, UpperBound
+from egoskin.progress import counted
 from egoskin.runs import trainer
 from egoskin.runs.run import Run
 from egoskin.sensors import MASK_ALL
@@ -271,6 +272,7 @@ def test_an_evaluation_draws_an_operating_map(
     speed, interval, both = result["map"]
     assert speed["names"] == ["speed of the ball [m/s]"]
     assert [point["values"] for point in speed["points"]] == [[4.0], [8.0]]
+    assert result["map_episodes"] == max(result["episodes"] // 4, 1)
     assert interval["trained"] == [[1.0, 2.0]]
     assert [point["values"] for point in both["points"]] == [[4.0, 1.0], [8.0, 1.0]]
 
@@ -285,6 +287,9 @@ def test_an_evaluation_tells_what_a_policy_bears(
     result, text = figures_of(tmp_path, trained, "--perturbed")
     names = [row["name"] for row in result["perturbed"]]
     assert names == list(kept)
+    each = result["perturbed_episodes"]
+    assert each == max(result["episodes"] // 4, 1)
+    assert f"\n  {counted(each, 'episode')} each\n" in text
     assert all(f"\n  {name} " in text for name in names)
 
 

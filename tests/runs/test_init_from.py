@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 import torch
 
+import egoskin
+from egoskin.robots.builtin import H1_2
+from egoskin.robots.portable import portable
 from egoskin.runs.config import parse_config
 from egoskin.runs.run import Run
 from egoskin.runs.trainer import Trainer, open_trainer, train
@@ -147,6 +152,12 @@ def test_other_networks_than_those_of_the_run_are_refused(
         (["--sensor.coverage", "none"], "64 values of 'signal', but here there are 0"),
         (["--privileged", "velocity"], "reads 50 values of 'privileged_observation'"),
         (["--init-from", "nowhere"], "no policy nowhere"),
+        # As many values with another meaning.
+        (
+            ["--init-from", "field_binary"],
+            "reads the signal binary, not proximity: add --sensor.signal binary$",
+        ),
+        (["--sensor.signal", "closeness"], "reads the signal proximity, not closeness"),
     ],
 )
 def test_networks_that_do_not_fit_are_refused_before_anything_is_made(
@@ -157,3 +168,39 @@ def test_networks_that_do_not_fit_are_refused_before_anything_is_made(
     with pytest.raises(ValueError, match=text):
         Run.create(parse_config([*args, str(folder), *options]))
     assert not folder.exists()
+
+
+def test_a_robot_of_the_same_name_with_its_joints_in_another_order_is_refused(
+    finished: Trainer, tmp_path: Path
+):
+    tree = ElementTree.parse(Path(egoskin.__file__).parent / "assets/h1_2.xml")
+    pelvis = tree.getroot().find("worldbody/body")
+    assert pelvis is not None
+    for body in pelvis.findall("body")[::-1]:
+        pelvis.remove(body)
+        pelvis.append(body)
+    tree.write(tmp_path / "h1_2.xml")
+    robot = portable(replace(H1_2, model_path=tmp_path / "h1_2.xml"))
+    config = blind_run(tmp_path / "run", 64)
+    config = replace(
+        config,
+        env=replace(config.env, robot=robot),
+        init_from=finished.run.policy_path(64),
+    )
+    with pytest.raises(ValueError, match="h1_2 with other joints, or in another order"):
+        Run.create(config)
+
+
+def test_a_repeated_run_may_have_another_robot(finished: Trainer, tmp_path: Path):
+    file = finished.run.path / "config.json"
+    options = ["--config", str(file), "--robot", "g1", "--run-dir"]
+    run = Run.create(parse_config([*options, str(tmp_path / "g1")]))
+    assert run.config.env.robot == "g1"
+
+
+@pytest.mark.parametrize("content", [{"total_frames": 1000}, {"env": {"history": 2}}])
+def test_a_part_of_a_configuration_is_not_one(content, tmp_path: Path):
+    file = tmp_path / "c.json"
+    file.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"c\.json is not the config\.json of a run"):
+        parse_config(["--config", str(file)])

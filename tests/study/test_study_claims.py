@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import json
 import os
 import signal
@@ -226,3 +227,14 @@ def test_of_many_hosts_that_see_a_dead_owner_one_takes_its_claim(
     for thread in threads:
         thread.join()
     assert len(won) == 1
+
+
+@pytest.mark.parametrize("name", ["ENOSYS", "EOPNOTSUPP", "ENOLCK"])
+def test_a_file_system_without_locks_is_named(name, tmp_path, monkeypatch):
+    def refuse(*args):
+        raise OSError(getattr(errno, name), "no locks")
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    text = r"run\.lock: its file system has no locks.*mount it with locks"
+    with pytest.raises(ValueError, match=text), claimed(tmp_path, "run"):
+        pass

@@ -142,10 +142,14 @@ def test_a_cell_is_named_by_what_differs():
         ({"checkpoint_interval": 1.0}, "checkpoint_interval cannot be set here"),
         ({"sensor.coverage": "none"}, "cell blind is defined twice"),
         ({"skin.path": "no.json"}, r"no\.json"),
+        ({"robot": "ROBOT"}, "robot walker cannot be trained: the default pose is out"),
         ({"init_from": "localization"}, "reads 3 values of 'signal', but here there "),
     ],
 )
-def test_a_cell_that_cannot_exist_is_named(cell, text):
+def test_a_cell_that_cannot_exist_is_named(cell, text, tmp_path: Path):
+    if "robot" in cell:
+        toml = TOML.replace("left_shoulder = 0.1", "left_shoulder = 1.8")
+        cell = {"robot": str(write_robot(tmp_path / "walker", toml))}
     with pytest.raises(ValueError, match=rf"(?s)study small, cell 2.*({text})"):
         changed(cells=({"sensor.coverage": "none"}, cell))
 
@@ -188,6 +192,11 @@ def test_a_cell_whose_name_is_too_long_for_files_is_told_by_its_number():
 def test_a_study_of_nothing_is_refused(fields, text):
     with pytest.raises(ValueError, match=text):
         dataclasses.replace(STUDY, **fields)
+
+
+def test_an_evaluation_has_no_more_episodes_than_can_be_played():
+    with pytest.raises(ValueError, match="episodes must be at most 1,048,576"):
+        EvaluationPlan(episodes=2_000_000)
 
 
 def test_a_study_can_be_a_file(tmp_path: Path):

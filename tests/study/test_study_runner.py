@@ -268,6 +268,32 @@ def test_a_run_of_another_study_is_not_adopted(folder: StudyFolder, tmp_path: Pa
         other.results(manifest)
 
 
+@pytest.mark.parametrize(
+    ("changed", "differs"),
+    [
+        ({"episodes": 7}, "evaluation.episodes"),
+        ({"throw_set": 3}, "evaluation.throw_set"),
+    ],
+)
+def test_a_result_of_another_evaluation_is_not_accepted(
+    changed, differs, folder: StudyFolder, tmp_path: Path
+):
+    plan = dataclasses.replace(SHORT.evaluation, **changed)
+    manifest = resolve(dataclasses.replace(SHORT, evaluation=plan))
+    other = StudyFolder(tmp_path / "other")
+    other.plan(manifest)
+    shutil.copytree(folder.result_path(NAME), other.result_path(NAME))
+    with pytest.raises(ValueError, match=f"it differs in {differs}$"):
+        other.results(manifest)
+
+
+def test_a_result_with_another_skin_is_not_accepted(folder: StudyFolder):
+    manifest = folder.manifest()
+    cells = [dataclasses.replace(c, skin_sha256="0" * 64) for c in manifest.cells]
+    with pytest.raises(ValueError, match=r"it differs in skin_sha256$"):
+        folder.results(dataclasses.replace(manifest, cells=tuple(cells)))
+
+
 def test_an_adopted_run_that_is_gone_is_named(folder: StudyFolder, tmp_path: Path):
     made = tmp_path / "made"
     shutil.move(folder.run_path(NAME), made)
