@@ -7,6 +7,7 @@ must not fork workers for a parent that has ended, so Linux then kills the serve
 from __future__ import annotations
 
 import ctypes
+import os
 import signal
 from importlib import import_module
 
@@ -17,6 +18,8 @@ _prctl = getattr(ctypes.CDLL(None), "prctl", None)
 if _prctl is not None:
     _prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 import_module("egoskin.make")
+# The parent compiles, and says so.
+os.environ[import_module("egoskin.sensors.kernels.compilation").TRIED] = "1"
 if _prctl is not None:
     # From here on the server notices by itself; the thread that started it may end.
     _prctl(_PR_SET_PDEATHSIG, 0)

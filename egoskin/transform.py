@@ -8,6 +8,7 @@ otherwise wait until the host has counted the rows.
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -321,6 +322,24 @@ class StatefulTransform(_KeyedTransform):
         self._write(tensordict_reset, values)
         return tensordict_reset
 
+    def _reset_on_native_autoreset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        """Start the rows that the environment itself has reset in its step."""
+        partial = self._rows_to_reset(tensordict, tensordict_reset.batch_size.numel())
+        before = self._read(tensordict_reset, self.out_keys)
+        self._reset(tensordict, tensordict_reset)
+        if partial is not None:
+            # Nobody else merges the rows that do not reset.
+            rows, _ = partial
+            values = self._read(tensordict_reset, self.out_keys)
+            values = [
+                old.index_copy(0, rows, new[rows])
+                for old, new in zip(before, values, strict=True)
+            ]
+            self._write(tensordict_reset, values)
+        return tensordict_reset
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the out keys into a stored tensordict, step by step.
 
@@ -367,13 +386,14 @@ class StatefulTransform(_KeyedTransform):
 
 def _starts(tensordict: TensorDictBase) -> Tensor:
     """Return which steps of a stored tensordict start an episode, ``[B, T]`` bool."""
-    keys, time = tensordict.keys(True), tensordict.batch_size[-1]
+    keys, (*before, time) = tensordict.keys(True), tensordict.batch_size
+    shape = (math.prod(before), time)
     if "is_init" in keys:
-        return tensordict["is_init"].reshape(-1, time)
+        return tensordict["is_init"].reshape(shape)
     if ("next", "done") not in keys:
         raise KeyError(
             "unknown starts of episodes: the tensordict has neither 'is_init' nor "
             "('next', 'done')"
         )
-    done = tensordict["next", "done"].reshape(-1, time)
+    done = tensordict["next", "done"].reshape(shape)
     return torch.cat((torch.ones_like(done[:, :1]), done[:, :-1]), 1)

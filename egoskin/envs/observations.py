@@ -43,7 +43,7 @@ class Proprioception(RowTransform):
         out_keys: Sequence[NestedKey] = ("observation",),
     ) -> None:
         super().__init__(in_keys, out_keys)
-        self.register_buffer("_default", default_joint_pos)
+        self.register_buffer("_default", default_joint_pos, persistent=False)
 
     def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Return the observation, ``[B, 6 + 2 J]`` or ``[B, 6 + 3 J]``."""

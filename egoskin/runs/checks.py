@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import reduce
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,7 +20,35 @@ from egoskin.policies.policy import (
 from egoskin.robots.checks import check_trainable
 from egoskin.runs.config import INIT_HASH, SKIN_HASH, TrainConfig, read_config
 from egoskin.sensors import Skin
+from egoskin.sensors.config import SensorConfig
 from egoskin.storage.serialization import changed_fields, to_plain
+
+
+def check_effect(sensor: SensorConfig, skin: Skin) -> None:
+    """Raise ValueError if a skin file leaves an option of the sensors without effect.
+
+    Args:
+        sensor: The options.
+        skin: The skin, as in its file.
+    """
+    if not sensor.uses_skin:
+        return
+    options, own = SensorConfig(), sensor.default_coverage
+    text = "has no effect: the skin file sets the {} of each sensor"
+    if (
+        sensor.range != options.range
+        and not np.isnan(skin.range).any()
+        and (skin.range != sensor.range).any()
+    ):
+        raise ValueError(f"sensor.range={sensor.range:g} {text.format('range')}")
+    if None in skin.coverage:
+        return
+    if sensor.coverage != options.coverage and not any(
+        isinstance(each, type(own)) for each in skin.coverage
+    ):
+        raise ValueError(f"sensor.coverage={sensor.coverage} {text.format('type')}")
+    if own != type(own)() and own not in skin.coverage:
+        raise ValueError(f"sensor.{sensor.coverage} {text.format('type')}")
 
 
 def check_repeats(config: TrainConfig, hashes: Mapping[str, str]) -> None:

@@ -38,7 +38,7 @@ import torch
 from torch import Tensor
 
 from egoskin.policies.policy import CHECKPOINT_NAME, load_networks
-from egoskin.runs.checks import check_fits, check_repeats
+from egoskin.runs.checks import check_effect, check_fits, check_repeats
 from egoskin.runs.config import (
     CALL_FIELDS,
     INIT_HASH,
@@ -99,7 +99,7 @@ class Run:
         Raises:
             ValueError: If the folder is not empty, the skin or the networks to start
                 from are not valid, do not fit, or are not those of the run to repeat,
-                or there is too little memory.
+                an option has no effect, or there is too little memory.
         """
         skin = config.env.skin.build(config.env.robot_config)
         hashes = {SKIN_HASH: content_hash(skin.to_dict())}
@@ -107,6 +107,7 @@ class Run:
         if config.init_from is not None:
             initial = load_networks(config.init_from)
             hashes[INIT_HASH] = content_hash({}, initial[0])
+        check_effect(config.env.sensor, skin)
         check_fits(config, skin, initial)
         check_repeats(config, hashes)
         path = config.run_dir

@@ -99,7 +99,7 @@ class FieldSensor(ProximitySensor):
                 for f in fields
             ]
             cos_half = torch.tensor(cosines, dtype=torch.float64)[:, None]
-        self.register_buffer("_cos_half", cos_half)
+        self.register_buffer("_cos_half", cos_half, persistent=False)
         if compile:
             cone = None if cos_half is None else cos_half.numpy()
             self._use_kernels("field", cos_half=cone)

@@ -197,7 +197,10 @@ class ProximitySensor(RowTransform):
 
         def constant(name: str, value: object, dtype: torch.dtype) -> None:
             # Copied, because `mask` changes the ranges of this sensor but not the skin.
-            self.register_buffer(name, torch.as_tensor(value, dtype=dtype).clone())
+            # A state dict must not carry the constants of one skin to another; of the
+            # ranges, it carries which are masked.
+            copied = torch.as_tensor(value, dtype=dtype).clone()
+            self.register_buffer(name, copied, persistent=name == "_range")
 
         # Constants are float64; `scene` converts them to the dtype of its inputs.
         constant("_link", [links.index(name) for name in skin.links], torch.int64)
@@ -270,7 +273,10 @@ class ProximitySensor(RowTransform):
 
     def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
         super()._load_from_state_dict(*args, **kwargs)
-        # It may hold another mask.
+        # It may hold another mask; the ranges stay those of the skin.
+        masked = self._range[:, 0] < 0
+        self._range.copy_(self._skin_range)
+        self._range[masked] = -1.0
         self._tell_ranges()
 
     @property

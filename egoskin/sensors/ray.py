@@ -122,13 +122,13 @@ class RaySensor(ProximitySensor):
             in_keys,
             out_keys,
         )
-        self.register_buffer("_beams", beams)
-        self.register_buffer("_beam_of", beam_of)
-        self.register_buffer("_depth", depth if depth.any() else None)
+        self.register_buffer("_beams", beams, persistent=False)
+        self.register_buffer("_beam_of", beam_of, persistent=False)
+        self.register_buffer("_depth", depth if depth.any() else None, persistent=False)
         pyramid = torch.stack((angles.cos(), angles.sin()))[..., None]
-        self.register_buffer("_pyramid", pyramid)
+        self.register_buffer("_pyramid", pyramid, persistent=False)
         slant = torch.tensor([r.slant for r in rays], dtype=torch.float64)
-        self.register_buffer("_reach", self._range * slant[:, None])
+        self.register_buffer("_reach", self._range * slant[:, None], persistent=False)
         # Temporaries should stay in the cache.
         self._chunk = max(1, _CHUNK // self._beams.shape[-1])
         if compile:

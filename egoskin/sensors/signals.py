@@ -52,7 +52,7 @@ class _Reading(RowTransform):
         limit = torch.as_tensor(max_range, dtype=torch.float64)
         if not limit.numel() or not (limit > 0).all():
             raise ValueError(f"max_range must be positive, got {max_range}")
-        self.register_buffer("_range", limit.reshape(-1))
+        self.register_buffer("_range", limit.reshape(-1), persistent=False)
 
     def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Return the signal, ``[B, S ...]`` flattened.
@@ -193,7 +193,8 @@ class SkinOrder(RowTransform):
             torch.tensor(group).repeat_interleave(each)
             for group, each in zip(groups, num_readings, strict=True)
         ]
-        self.register_buffer("_order", torch.cat(owner).argsort(stable=True))
+        order = torch.cat(owner).argsort(stable=True)
+        self.register_buffer("_order", order, persistent=False)
 
     def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Return the signal of all groups, ``[B, N]``."""

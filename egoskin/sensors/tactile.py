@@ -132,7 +132,7 @@ class ContactPenalty(Transform):
         if not prices or not all(map(math.isfinite, prices.values())):
             raise ValueError(f"prices must be finite and not empty, got {prices}")
         parts = [price * _matching(links, [p]) for p, price in prices.items()]
-        self.register_buffer("_prices", torch.stack(parts).sum(0))
+        self.register_buffer("_prices", torch.stack(parts).sum(0), persistent=False)
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         tactile, reward = (next_tensordict[key] for key in self.in_keys)
@@ -181,7 +181,7 @@ class ContactTermination(Transform):
         out_keys: Sequence[NestedKey] = ("terminated", "done"),
     ) -> None:
         super().__init__(in_keys=list(in_keys), out_keys=list(out_keys))
-        self.register_buffer("_counted", _matching(links, counted))
+        self.register_buffer("_counted", _matching(links, counted), persistent=False)
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         tactile, *ends = (next_tensordict[key] for key in self.in_keys)
@@ -224,7 +224,7 @@ class ContactFree(StatefulTransform):
         out_keys: Sequence[NestedKey] = ("contact_free",),
     ) -> None:
         super().__init__(in_keys, out_keys, state_keys=out_keys)
-        self.register_buffer("_counted", _matching(links, counted))
+        self.register_buffer("_counted", _matching(links, counted), persistent=False)
 
     def start(
         self,

@@ -29,7 +29,7 @@ from egoskin.make import MOST_AGENTS, EnvConfig
 from egoskin.policies.policy import load_networks
 from egoskin.rng import check_seed
 from egoskin.robots.checks import check_trainable
-from egoskin.runs.checks import check_fits
+from egoskin.runs.checks import check_effect, check_fits
 from egoskin.runs.config import (
     INIT_HASH,
     MACHINE_FIELDS,
@@ -374,6 +374,7 @@ def resolve(study: Study) -> Manifest:
                 skins[key] = skin, content_hash(skin.to_dict())
             skin, digest = skins[key]
             check_trainable(config.env.robot_config)
+            check_effect(config.env.sensor, skin)
             # These raise for sensors that do not fit each other, or the evaluation.
             config.env.pipeline(skin)
             standard_task(config.env, study.evaluation.standard)

@@ -29,6 +29,7 @@ from egoskin.envs.dodgeball import DodgeballConfig
 from egoskin.envs.rewards import TERMS
 from egoskin.envs.standards import training_task
 from egoskin.make import EnvConfig
+from egoskin.robots.builtin import H1_2
 from egoskin.runs import trainer as trainer_module
 from egoskin.runs.config import TrainConfig, parse_config
 from egoskin.runs.events import EventFile
@@ -37,7 +38,8 @@ from egoskin.runs.run import Run
 from egoskin.runs.starts import git_state
 from egoskin.runs.survival import SurvivalCurve
 from egoskin.runs.trainer import METRIC_KEYS, Trainer, open_trainer, train
-from egoskin.sensors.config import SensorConfig
+from egoskin.sensors import Field, Ray, Skin, place_sensors
+from egoskin.sensors.config import SensorConfig, SkinConfig
 from egoskin.storage.files import PARTIAL
 from egoskin.storage.formats import read_sealed, sealed_json
 from egoskin.storage.tensor_file import load_tensors, save_tensors
@@ -658,3 +660,36 @@ def test_tensorboard_shows_each_point_once(
     events.Reload()
     steps = [point.step for point in events.Scalars("reward/mean")]
     assert steps == [64, 128, 192]
+
+
+def test_options_that_a_skin_file_leaves_without_effect_are_refused(
+    config: TrainConfig, tmp_path: Path
+):
+    plain = place_sensors(H1_2, 4, seed=0)
+    whole = replace(plain, range=np.ones(4), coverage=(Field(),) * 4)
+    part = replace(plain, range=np.array([1, 1, 1, np.nan]), coverage=(Field(),) * 4)
+    grid = replace(plain, coverage=(Ray(grid=(4, 4)),) * 4)
+
+    def create(skin: Skin, name: str, **sensor: Any) -> None:
+        skin.save(tmp_path / "skin.json")
+        env = EnvConfig(
+            skin=SkinConfig(path=tmp_path / "skin.json"), sensor=SensorConfig(**sensor)
+        )
+        Run.create(replace(config, env=env, run_dir=tmp_path / name))
+
+    text = "has no effect: the skin file sets the (range|type) of each sensor"
+    for skin, sensor in (
+        (whole, {"range": 0.5}),
+        (whole, {"coverage": "ray"}),
+        (whole, {"field": Field(half_angle_deg=45)}),
+        (grid, {"coverage": "ray", "ray": Ray(grid=(2, 2))}),
+    ):
+        with pytest.raises(ValueError, match=text):
+            create(skin, "never", **sensor)
+    assert not (tmp_path / "never").exists()
+    # The default, what the file also says, and what some sensor takes.
+    create(whole, "default")
+    create(whole, "same", range=1.0)
+    create(part, "some", range=0.5)
+    create(grid, "kind", coverage="ray")
+    create(grid, "both", coverage="ray", ray=Ray(grid=(4, 4)))

@@ -196,6 +196,22 @@ def test_a_loaded_state_dict_brings_its_mask(compiled, random_state, monkeypatch
     assert not torch.equal(measure(plain, state)[0], without_mask[0])
 
 
+@COMPILED
+def test_a_loaded_state_dict_brings_no_skin(compiled, random_state, monkeypatch):
+    monkeypatch.setenv(SETTING, "1")
+    other = place_sensors(H1_2, 24, seed=7)
+    for make in (FieldSensor, RaySensor):
+        one, two = (
+            make(skin, H1_2.chain, BALLS, reach, compile=compiled)
+            for skin, reach in ((SKIN, 5.0), (other, 4.0))
+        )
+        state = random_state(16)
+        expected = measure(two, state)
+        two.load_state_dict(one.state_dict())
+        assert_same_bits(measure(two, state), expected)
+        assert two.ranges.tolist() == [4.0] * 24
+
+
 def test_a_mask_may_be_a_tensor_or_flags(random_state):
     sensor = FieldSensor(SKIN, H1_2.chain, BALLS, 5.0)
     sensor.mask([0, 2])

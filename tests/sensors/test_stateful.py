@@ -376,3 +376,56 @@ def test_inputs_and_earlier_states_are_never_written(build):
     for now, then in kept:
         keys = [*env.transform.in_keys, *env.transform.out_keys]
         assert_same_bits([now], [then], keys)
+
+
+class AutoResetEnv(EnvBase):
+    """Episodes of 4 and 5 steps, which the environment itself resets in its step."""
+
+    def __init__(self) -> None:
+        super().__init__(device="cpu", batch_size=torch.Size([2]))
+        flag = Binary(shape=(2, 1), dtype=torch.bool)
+        self.observation_spec = Composite(obs=Unbounded((2, 1)), shape=(2,))
+        self.action_spec, self.reward_spec = Unbounded((2, 1)), Unbounded((2, 1))
+        self.done_spec = Composite(done=flag, terminated=flag.clone(), shape=(2,))
+        self.time = torch.zeros(2, 1)
+        self._torchrl_native_autoreset = True
+
+    def _content(self, done: torch.Tensor) -> TensorDict:
+        flags = {"done": done, "terminated": done.clone()}
+        return TensorDict({"obs": self.time.clone(), **flags}, batch_size=[2])
+
+    def _reset(self, tensordict=None, **kwargs) -> TensorDict:
+        self.time.zero_()
+        return self._content(torch.zeros(2, 1, dtype=torch.bool))
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        self.time += 1
+        done = self.time >= torch.tensor([[4], [5]])
+        self.time[done] = 0
+        return self._content(done).set("reward", torch.zeros(2, 1))
+
+    def _set_seed(self, seed: int | None) -> None:
+        pass
+
+
+def test_rows_that_the_environment_resets_itself_start_anew():
+    env = TransformedEnv(AutoResetEnv(), History(3, ["obs"], ["history"]))
+    env._torchrl_native_autoreset = True
+    now = env.reset()
+    for step in range(1, 12):
+        now["action"] = torch.zeros(2, 1)
+        _, now = env.step_and_maybe_reset(now)
+        for row, length in enumerate((4, 5)):
+            age = step % length
+            expected = [max(age - back, 0) for back in (2, 1, 0)]
+            assert now["history"][row].tolist() == expected, (step, row)
+
+
+def test_stored_data_may_have_no_rows():
+    data = {
+        "distance": torch.zeros(0, 6, SENSORS),
+        "is_init": torch.zeros(0, 6, 1, dtype=torch.bool),
+    }
+    stored = TensorDict(data, batch_size=[0, 6])
+    read = Corruption(EVERYTHING[:1], dt=0.02, seed=0)(stored)
+    assert read["reading"].shape == (0, 6, SENSORS)

@@ -31,8 +31,9 @@ class SensorBench:
     """Time of the sensor kernels, on one thread, from joint positions to result.
 
     Poses and balls come from a rollout of the default task under random actions; in the
-    rows "close", every ball is within 0.5 m of a sensor. The ratio is to writing as
-    many bytes as the row's result into an existing buffer, measured in turn.
+    rows "close", every ball is within 0.5 m of a sensor. The ratio is to writing
+    into an existing buffer, measured in turn: as many bytes as frames or grid have, for
+    the field 24 bytes per sensor, for the minimum of the rays as many as their grid.
     """
 
     num_envs: Annotated[int, COUNT] = 4096
@@ -148,7 +149,7 @@ def _measure(config: SensorBench) -> list[Row]:
     poses = torch.empty(n, len(skin), 3), torch.empty(n, len(skin), 3, 3)
     frames_bytes, field_bytes = n * len(skin) * 48, n * len(skin) * 24
     grid_bytes = grid.numel() * 4
-    # By row: bytes of the result, states, and the function that is timed.
+    # By row: bytes to write, states, and the function that is timed.
     jobs: dict[str, tuple[int, list[State], Callable[..., Any]]] = {}
     proximity = Proximity(_RANGE)
 

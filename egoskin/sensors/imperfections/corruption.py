@@ -441,12 +441,14 @@ class Corruption(StatefulTransform):
         reading, after = corrupt(
             self._models,
             # Distances [B, S] count as one beam per sensor.
-            distance.reshape(*distance.shape[:2], -1),
+            distance.reshape(*distance.shape[:2], distance.shape[2:].numel()),
             before,
             self._moment(rows, clock, joint_vel),
         )
         if len(self._masked):
-            reading = reading.index_fill(1, self._masked, torch.inf)
+            # Specs are made of a dummy reading on the CPU.
+            masked = self._masked.to(reading.device)
+            reading = reading.index_fill(1, masked, torch.inf)
         values = [after[i][name] for i, name in self._states]
         return [reading.reshape(distance.shape), clock, *values]
 

@@ -27,6 +27,10 @@ from egoskin.storage.files import write_file
 SETTING = "EGOSKIN_COMPILE"
 """Environment variable: 0 disables the C++ kernels, for tests and measurements."""
 
+
+TRIED = "EGOSKIN_COMPILATIONTRIED"
+"""Environment variable of processes whose parent compiles, or has tried."""
+
 _log = logging.getLogger(__name__)
 
 # No -ffast-math: results must equal those of PyTorch.
@@ -56,8 +60,8 @@ def load_library(source: Path) -> ctypes.CDLL | None:
     """Return a C++ source as a library, compiled once per machine, or None.
 
     It is None if compilation fails, which is logged as one warning, or is disabled.
-    Child processes of `multiprocessing` use the library that the parent compiled; they
-    neither compile nor log.
+    Workers (`egoskin.preload`), and child processes whose parent has tried before they
+    started, neither compile nor log.
 
     Args:
         source: The file; it may include only system headers.
@@ -68,18 +72,19 @@ def load_library(source: Path) -> ctypes.CDLL | None:
 @functools.cache
 def _loaded(source: Path) -> ctypes.CDLL | None:
     """Return the library, or None after logging the reason."""
-    is_parent = parent_process() is None
+    is_first = parent_process() is None or TRIED not in os.environ
+    os.environ[TRIED] = "1"
     try:
         command, name = _recipe(source)
         folder = _cache()
         found = _find(folder, name)
-        if found is None and is_parent:
+        if found is None and is_first:
             _log.warning("compiling %s: some seconds, once per machine", source.name)
             found = _keep(folder, name, _compile(command, source))
     # Path.home() raises RuntimeError.
     except (OSError, RuntimeError) as error:
         found = None
-        if is_parent:
+        if is_first:
             _log.warning(
                 "%s is not compiled: sensors are slower, with the same results (%s)",
                 *(source.name, error),

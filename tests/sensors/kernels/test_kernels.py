@@ -287,6 +287,16 @@ def check_stays_plain(source: Path, caplog, *expected: str) -> None:
 
 
 @needs_compiler
+def test_a_child_compiles_only_if_its_parent_has_not_tried(source, cache, monkeypatch):
+    monkeypatch.setattr(compilation, "parent_process", lambda: "a parent")
+    monkeypatch.setenv(compilation.TRIED, "1")
+    assert load_anew(source) is None
+    # As in a child whose parent has no sensors.
+    monkeypatch.delenv(compilation.TRIED)
+    assert is_one(load_anew(source))
+
+
+@needs_compiler
 def test_a_library_is_compiled_once_for_this_user_alone(source, cache, caplog):
     assert is_one(load_anew(source))
     assert logged(caplog) == ["compiling one.cpp: some seconds, once per machine"]

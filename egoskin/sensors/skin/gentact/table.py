@@ -22,6 +22,7 @@ from egoskin.sensors.skin.gentact.source import (
     read_radius,
 )
 from egoskin.sensors.skin.skin import Skin
+from egoskin.storage.files import write_file
 
 _HEADER = "Index,X,Y,Z,NormX,NormY,NormZ,Radius,Parent,Object Name in Blender"
 _HEADERS = (
@@ -77,15 +78,16 @@ def save_gentact(skin: Skin, path: Path | str) -> tuple[str, ...]:
         raise ValueError(
             f"{slashed[0]!r} contains '/', the separator of GenTact's paths"
         )
-    with open(path, "w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(_HEADER.split(","))
-        radius = np.where(np.isnan(skin.radius), NO_RADIUS, skin.radius)
-        for i, link in enumerate(skin.links):
-            numbers = (*skin.position[i], *skin.normal[i], radius[i])
-            # repr is the shortest text that parses to the same number.
-            row = [repr(float(v)) for v in numbers]
-            writer.writerow([i, *row, f"/{skin.robot}/{link}/visuals", "visuals"])
+    text = io.StringIO(newline="")
+    writer = csv.writer(text)
+    writer.writerow(_HEADER.split(","))
+    radius = np.where(np.isnan(skin.radius), NO_RADIUS, skin.radius)
+    for i, link in enumerate(skin.links):
+        numbers = (*skin.position[i], *skin.normal[i], radius[i])
+        # repr is the shortest text that parses to the same number.
+        row = [repr(float(v)) for v in numbers]
+        writer.writerow([i, *row, f"/{skin.robot}/{link}/visuals", "visuals"])
+    write_file(Path(path), text.getvalue().encode())
     lost = {
         "coverage": any(c is not None for c in skin.coverage),
         "range": bool((~np.isnan(skin.range)).any()),
