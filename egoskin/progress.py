@@ -16,6 +16,12 @@ def counted(number: int, noun: str) -> str:
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
+def note(text: str) -> None:
+    """Print a line to stderr; on a terminal in place of an unfinished progress line."""
+    clear = "\r\x1b[K" if sys.stderr.isatty() else ""
+    print(f"{clear}{text}", file=sys.stderr, flush=True)
+
+
 def duration(seconds: float | None) -> str:
     """Return a time as text: "3 d 04 h", "2 h 05 min", "40 s", "-" for None."""
     if seconds is None:

@@ -6,6 +6,7 @@ shown at once: nothing heavy is imported before the arguments are checked for it
 
 from __future__ import annotations
 
+import os
 import resource
 import sys
 from importlib import import_module
@@ -72,6 +73,10 @@ def begin(name: str) -> None:
     command's own parser as ``--help``.
     """
     end_quietly()
+    # Closed, as of some daemons.
+    for stream in ("stdout", "stderr"):
+        if getattr(sys, stream) is None:
+            setattr(sys, stream, open(os.devnull, "w"))  # noqa: SIM115
     args = sys.argv[1:]
     if "--help-all" in args:
         sys.argv[1:] = ["--help" if arg == "--help-all" else arg for arg in args]

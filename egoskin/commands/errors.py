@@ -29,6 +29,7 @@ from egoskin.interrupts import (
 )
 from egoskin.memory import is_out_of_memory
 from egoskin.parallel import WorkerError
+from egoskin.progress import note
 
 NUMBERS = ConstructorRegistry()
 """Rules for reading options while it is entered: integers also as 1e6."""
@@ -84,19 +85,20 @@ def clear_errors() -> Iterator[None]:
         finally:
             sys.stdout.flush()
     except WorkerError as error:
-        raise SystemExit(f"error: {error}") from None
+        note(f"error: {error}")
+        raise SystemExit(1) from None
     except Exception as error:
         if is_out_of_memory(error):
             first, *_ = str(error).splitlines() or ["out of memory"]
             if "cuda" in first.lower():
                 first += "; for fewer robots: --num-envs, --episodes or --worlds"
-            print(f"error: too little memory: {first}", file=sys.stderr)
+            note(f"error: too little memory: {first}")
             raise SystemExit(2) from None
         if not isinstance(error, (ValueError, OSError, OverflowError, RecursionError)):
             raise
         if isinstance(error, BrokenPipeError) and _nobody_reads():
             raise unread_output() from None
-        print(f"error: {error}", file=sys.stderr)
+        note(f"error: {error}")
         raise SystemExit(2) from None
     except KeyboardInterrupt as error:
         end_next_time()

@@ -48,6 +48,8 @@ from egoskin.viewer.recording import check_film, record_episodes, render_recordi
 # Browsers show a picture of a GIF for 100 ms if its delay, whole centiseconds, is
 # below 20 ms.
 _GIF_FPS = 50.0
+# Frames per second if the control rate allows it.
+_FPS = 30.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,9 +75,9 @@ class RenderConfig:
     without its randomisation."""
     seconds: float | None = None
     """Stop at this age at the latest [s]; None: the whole episode."""
-    fps: float = 30.0
-    """Frames per second of the episode, at most the control rate; in a .gif, at most
-    50 per second played."""
+    fps: float | None = None
+    """Frames per second of the episode, at most the control rate; None: 30, or the
+    control rate if that is lower. In a .gif, at most 50 per second played."""
     slowdown: Annotated[float, Interval(gt=0, le=100)] = 1.0
     """The film plays this many times slower than real time."""
     size: tuple[int, int] = (960, 540)
@@ -93,7 +95,7 @@ class RenderConfig:
         check_output(self.sheet_path, "--sheet", (".png",))
         check_seed(self.throw_set, "throw_set")
         check_bounds(self)
-        played = self.fps / self.slowdown
+        played = (self.fps or _FPS) / self.slowdown
         if self.out.suffix.lower() == ".gif" and played > _GIF_FPS:
             raise ValueError(
                 f"browsers play a GIF with at most {_GIF_FPS:g} pictures per second, "
@@ -129,7 +131,8 @@ def main(args: list[str]) -> None:
     if config.policy is not None:
         env_config = standard_task(env_config, config.standard)
     hz = env_config.task.physics.control_hz
-    check_film(hz, config.fps, config.seconds)
+    fps = min(_FPS, hz) if config.fps is None else config.fps
+    check_film(hz, fps, config.seconds)
     # Created before playing, so that errors in drawing appear early.
     painter = painter_of(env_config, skin, size=config.size, camera=config.camera)
     line = StatusLine(f"playing {counted(config.longest_of, 'episode')}")
@@ -153,11 +156,11 @@ def main(args: list[str]) -> None:
             skin,
             recording,
             max_seconds=config.seconds,
-            fps=config.fps,
+            fps=fps,
             on_picture=lambda done, total: line.show(f"{done} of {total} pictures"),
         )
     sheet = contact_sheet(frames)
-    save_film(config.out, frames, config.fps / config.slowdown)
+    save_film(config.out, frames, fps / config.slowdown)
     save_picture(config.sheet_path, sheet)
     line.finish()
     last = frames[-1]

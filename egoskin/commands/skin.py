@@ -212,7 +212,7 @@ class Show:
         if self.robot is not None:
             robot = find_robot(self.robot)
         if robot is not None:
-            skin.check_links(robot.links, robot.name)
+            skin.check_robot(robot.name, robot.links, str(self.skin))
         print(table(skin, str(self.skin)))
         if self.picture is not None:
             if robot is None:

@@ -12,6 +12,7 @@ the policy does worse, it lacks training, or its sensors lack information.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import sys
@@ -92,6 +93,11 @@ def _counts(result: UpperBound, member: Tensor) -> dict[str, int]:
     return {name: int((each & member).sum()) for name, each in which.items()}
 
 
+def _total(result: UpperBound) -> dict[str, int]:
+    """Return the counts of all throws."""
+    return _counts(result, torch.ones_like(result.policy.avoided))
+
+
 def table(result: UpperBound, title: str) -> str:
     """Return the counts as text."""
     lines = [
@@ -100,7 +106,7 @@ def table(result: UpperBound, title: str) -> str:
         f"  {'height aimed at':<16} {'throws':>6}  {'avoids':>8} {'and stands':>10}"
         f"  {'avoids':>8} {'and stands':>10}",
     ]
-    total = _counts(result, torch.ones_like(result.policy.avoided))
+    total = _total(result)
     # More than the sum of the groups, if throws are aimed higher than the last.
     for row in [*groups(result), total]:
         name = "all" if row is total else f"{row['from_m']:g} to {row['to_m']:g} m"
@@ -145,5 +151,14 @@ def main(args: list[str]) -> None:
     )
     print(table(result, title))
     if config.json is not None:
-        content = {"by_height_m": groups(result)}
+        content = {
+            "policy": str(config.policy),
+            "frames": policy.policy_spec.frames,
+            "throw_set": config.throw_set,
+            "ball": config.ball,
+            "reach_m": config.reach,
+            "search": dataclasses.asdict(config.search),
+            "all": _total(result),
+            "by_height_m": groups(result),
+        }
         config.json.write_text(json.dumps(content, indent=2) + "\n")

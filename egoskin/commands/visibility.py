@@ -82,6 +82,14 @@ class VisibilityConfig:
     json: Path = Path("visibility.json")
     """JSON file to write all results to."""
 
+    def __post_init__(self) -> None:
+        """Raise ValueError for options of sensors that are not compared."""
+        for name, default in (("field", Field()), ("ray", Ray())):
+            if name not in self.coverages and getattr(self, name) != default:
+                raise ValueError(
+                    f"--{name} has no effect without {name} among --coverages"
+                )
+
 
 def show_progress(what: str, share: float) -> None:
     """Show the progress of the current stage, on a terminal."""

@@ -11,6 +11,8 @@ import sys
 from pathlib import Path
 from types import TracebackType
 
+from egoskin.progress import note
+
 _SIZE, _FPS = ("480", "270"), 20.0
 # A film shows the first seconds of the longest of this many episodes, which is more
 # informative than a random one.
@@ -59,7 +61,7 @@ class FilmMaker:
         self._film = self._folder / f"{policy.stem}.mp4"
         command = [sys.executable, "-m", "egoskin", "film", str(policy)]
         command += ["--out", str(self._film), "--standard", "run"]
-        command += ["--fps", f"{self._fps:g}", "--size", *_SIZE]
+        command += ["--fps", f"{self._fps!r}", "--size", *_SIZE]
         command += ["--longest-of", _EPISODES, "--seconds", _SECONDS]
         # The package may be imported from a clone, in any working directory.
         path = [str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH")]
@@ -78,9 +80,9 @@ class FilmMaker:
         if self._process is None:
             return
         if self._process.poll() is None:
-            print(f"waiting for the film {self._film}", file=sys.stderr)
+            note(f"waiting for the film {self._film}")
         _, errors = self._process.communicate()
         if status := self._process.returncode:
             last = errors.strip().splitlines()[-1:] or [f"exit status {status}"]
-            print(f"note: film {self._film} failed: {' '.join(last)}", file=sys.stderr)
+            note(f"note: film {self._film} failed: {' '.join(last)}")
         self._process = None

@@ -54,16 +54,7 @@ class SkinConfig:
                     f"from the file {self.path}"
                 )
         skin = Skin.load(self.path)
-        # Robots of one manufacturer can have the same link names.
-        if skin.robot != robot.name:
-            raise ValueError(
-                f"skin file {self.path}: made for the robot {skin.robot!r}, not "
-                f"{robot.name!r}; if it fits, change its field 'robot'"
-            )
-        try:
-            skin.check_links(robot.links)
-        except ValueError as error:
-            raise ValueError(f"skin file {self.path}: {error}") from error
+        skin.check_robot(robot.name, robot.links, f"skin file {self.path}")
         return skin
 
 

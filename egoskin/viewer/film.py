@@ -183,7 +183,7 @@ def _encode(path: Path, frames: Sequence[Frame], fps: float) -> str:
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error"]
     command += ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
     command += ["-r", str(Fraction(fps).limit_denominator()), "-i", "-"]
-    command += [*(_GIF if path.suffix.lower() == ".gif" else _MP4), str(path)]
+    command += [*(_GIF if path.suffix.lower() == ".gif" else _MP4), f"file:{path}"]
     errors: list[bytes] = []
     with subprocess.Popen(
         command,

@@ -15,12 +15,14 @@ import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import mujoco
 import numpy as np
 import torch
 from tensordict import TensorDictBase
 
+from egoskin.bounds import POSITIVE, check_bounds
 from egoskin.make import EnvConfig
 from egoskin.robots.config import RobotConfig
 from egoskin.sensors import Ray, Skin
@@ -52,13 +54,17 @@ class RenderingError(ValueError):
 class CameraConfig:
     """Placement of the camera relative to the robot that it follows."""
 
-    distance: float = 3.4
+    distance: Annotated[float, POSITIVE] = 3.4
     """Distance to a robot as tall as the H1-2 (1.78 m) [m]; it is scaled with the
     robot's height, or with its length if its base is fixed."""
     azimuth_deg: float = 30.0
     """Azimuth of the camera, relative to the robot's initial heading [deg]."""
     elevation_deg: float = 10.0
     """Angle by which the camera looks down [deg]."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for numbers out of bounds."""
+        check_bounds(self)
 
 
 def painter_of(

@@ -8,6 +8,9 @@ from pathlib import Path
 import pytest
 
 from calling import succeed
+from egoskin.commands.bench.loop import LoopConfig
+from egoskin.make import EnvConfig
+from egoskin.sensors.config import SensorConfig
 
 
 @pytest.mark.slow
@@ -94,3 +97,10 @@ def test_bench_gymnasium_compares_its_forms_with_our_own(tmp_path: Path):
     ]
     assert rows[0]["ratio"] == 1
     assert all(row["value"] > 0 for row in rows)
+
+
+def test_bench_loop_refuses_what_it_would_not_measure():
+    for options in ({"coverage": "none"}, {"coverage": "ray", "reduce": "min"}):
+        env = EnvConfig(sensor=SensorConfig(**options))
+        with pytest.raises(ValueError, match="field and full ray grid are measured"):
+            LoopConfig(env=env)

@@ -342,7 +342,10 @@ def test_an_upper_bound_counts_what_policy_and_search_avoid(tmp_path: Path):
     assert done.returncode == 0, done.stderr
     assert "12 throws (ball 1 of the episodes) of throw set 0 that came" in done.stdout
     assert "iteration 1 of 1" in done.stderr
-    rows = json.loads(out.read_text())["by_height_m"]
+    content = json.loads(out.read_text())
+    assert content["all"]["throws"] == 12
+    assert (content["ball"], content["search"]["seed"]) == (1, 0)
+    rows = content["by_height_m"]
     assert sum(row["throws"] for row in rows) == 12
     avoided = sum(row["policy_avoids"] for row in rows)
     assert 0 < avoided <= sum(row["search_avoids"] for row in rows)

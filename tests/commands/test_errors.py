@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -13,6 +15,7 @@ import torch
 from egoskin.commands.errors import clear_errors
 from egoskin.make import device_of
 from egoskin.parallel import WorkerError
+from egoskin.progress import StatusLine
 from egoskin.runs.config import parse_config
 from egoskin.storage.files import check_output
 
@@ -155,6 +158,35 @@ def test_a_broken_pipe_to_a_program_is_an_error(capfd):
     assert "Broken pipe" in capfd.readouterr().err
 
 
-def test_a_worker_that_ends_is_one_line():
-    with pytest.raises(SystemExit, match="error: worker 0 died"), clear_errors():
+def test_a_worker_that_ends_is_one_line(capfd):
+    with pytest.raises(SystemExit) as ended, clear_errors():
         raise WorkerError("worker 0 died")
+    assert ended.value.code == 1
+    assert capfd.readouterr().err == "error: worker 0 died\n"
+
+
+@pytest.mark.parametrize("error", [ValueError, WorkerError])
+def test_on_a_terminal_an_error_takes_the_place_of_the_progress(error, monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    StatusLine("playing 1 episode")
+    with pytest.raises(SystemExit), clear_errors():
+        raise error("too many")
+    expected = "\rplaying 1 episode\x1b[K\r\x1b[Kerror: too many\n"
+    assert sys.stderr.getvalue() == expected
+
+
+@pytest.mark.parametrize("stream", [1, 2])
+def test_a_closed_stream_is_no_fault(stream, tmp_path):
+    command = f"{sys.executable} -m egoskin skin place --num-sensors 2 --out a.json"
+    done = subprocess.run(
+        ["sh", "-c", f"{command} {stream}>&-"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert (tmp_path / "a.json").is_file()

@@ -279,7 +279,10 @@ def test_meshes_that_are_not_the_robots_are_left_out():
             ["show", "alien.json", "--picture", "a.png"],
             "for the robot 'alien': give its path with --robot PATH",
         ),
-        (["show", "alien.json", "--robot", "h1_2"], "which h1_2 does not have, did"),
+        (
+            ["show", "alien.json", "--robot", "h1_2"],
+            "alien.json: made for the robot 'alien', not 'h1_2'; if it fits, change",
+        ),
         (["show", "alien.json", "--picture", "a.jpg"], "must end in .png"),
         (["place", "--density", "torso_link=x", "--out", "a.json"], "must be a number"),
         (["place", "--links", "torso_lnk", "--out", "a.json"], "torso_lnk"),

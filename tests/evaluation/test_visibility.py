@@ -490,6 +490,10 @@ def test_the_command_has_the_body_in_the_way_if_asked(monkeypatch):
     ("args", "message"),
     [
         (["--ranges", "-1"], "ranges must be positive"),
+        (
+            ["--coverages", "ray", "--field.half-angle-deg", "30"],
+            "--field has no effect without field",
+        ),
         (["--out", "visibility.mp4"], "visibility.mp4 must end in .png or .jpg"),
         (["--json", "none/visibility.json"], "there is no folder none"),
     ],

@@ -234,7 +234,9 @@ def test_a_film_that_cannot_be_made_is_told_of(tmp_path, capfd):
     assert "config.json" in line
 
 
-@pytest.mark.parametrize(("control_hz", "fps"), [(60.0, "20"), (10.0, "10")])
+@pytest.mark.parametrize(
+    ("control_hz", "fps"), [(60.0, 20.0), (10.0, 10.0), (50 / 3,) * 2]
+)
 def test_a_film_has_no_more_frames_than_the_run_has_steps(
     control_hz, fps, tmp_path, monkeypatch
 ):
@@ -256,7 +258,7 @@ def test_a_film_has_no_more_frames_than_the_run_has_steps(
     with FilmMaker(tmp_path, control_hz) as maker:
         maker.start(tmp_path / "policy.safetensors")
     (command,) = commands
-    assert command[command.index("--fps") + 1] == fps
+    assert float(command[command.index("--fps") + 1]) == fps
     assert command[command.index("--size") + 1 :][:3] == ["480", "270", "--longest-of"]
 
 

@@ -108,15 +108,19 @@ def test_a_sheet_is_a_grid_filled_up_with_white():
 
 # imageio_ffmpeg does not close the pipe of an ffmpeg process that ended by itself.
 @pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
-@pytest.mark.parametrize("name", ["film.gif", "film.mp4"])
-def test_a_film_holds_the_frames_and_the_last_one_stands(name: str, tmp_path: Path):
-    path = tmp_path / name
+@pytest.mark.parametrize("name", ["film.gif", "film.mp4", "12:30.mp4"])
+def test_a_film_holds_the_frames_and_the_last_one_stands(
+    name: str, tmp_path: Path, monkeypatch
+):
+    # A bare name, which ffmpeg may take for an address.
+    monkeypatch.chdir(tmp_path)
+    path = Path(name)
     save_film(path, approach(5, closest=2), fps=10)
     # 5 frames of 100 ms, and one second of the last one.
-    _, seconds = imageio_ffmpeg.count_frames_and_secs(path)
+    _, seconds = imageio_ffmpeg.count_frames_and_secs(tmp_path / path)
     assert seconds == pytest.approx(1.5, abs=0.05)
-    assert list(tmp_path.iterdir()) == [path]
-    reader = imageio_ffmpeg.read_frames(path)
+    assert list(tmp_path.iterdir()) == [tmp_path / path]
+    reader = imageio_ffmpeg.read_frames(tmp_path / path)
     width, height = next(reader)["size"]
     assert (width, height) == (160, 90)
     # Below the text each is brighter than the previous one.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -319,3 +320,12 @@ def test_numbers_out_of_range_are_refused(
 def test_a_size_that_is_no_film_is_refused(skin: Skin, size: tuple[int, int]):
     with pytest.raises(ValueError, match="two even numbers of at least 16"):
         painter_of(EnvConfig(), skin, size=size)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"distance": 0.0}, {"azimuth_deg": math.nan}, {"elevation_deg": math.inf}],
+)
+def test_a_camera_that_is_nowhere_is_refused(options):
+    with pytest.raises(ValueError, match=next(iter(options))):
+        CameraConfig(**options)

@@ -34,6 +34,7 @@ from egoskin.make import (
 )
 from egoskin.parallel import WorkerPool, available_cores
 from egoskin.policies.policy import PolicySpec, sparse_sources
+from egoskin.sensors import Field
 from egoskin.storage.tensor_file import part
 
 
@@ -69,6 +70,12 @@ class LoopConfig:
         """Raise ValueError for invalid values."""
         check_bounds(self)
         check_num_workers(self.num_envs, self.num_workers)
+        sensor = self.env.sensor
+        if (sensor.coverage, sensor.reduce) != ("field", "none"):
+            raise ValueError(
+                "env.sensor.coverage and env.sensor.reduce have no effect: field and "
+                "full ray grid are measured"
+            )
 
 
 class Recording(MujocoPhysics):
@@ -123,7 +130,9 @@ def loop(config: LoopConfig) -> list[Row]:
     """Return the rows of the loop benchmark, for the field and the ray grid."""
     rows = []
     for coverage in ("field", "ray"):
-        sensor = replace(config.env.sensor, coverage=coverage, reduce="none")
+        # Options of the field are for the field.
+        own = {} if coverage == "field" else {"field": Field()}
+        sensor = replace(config.env.sensor, coverage=coverage, **own)
         env = replace(config.env, sensor=sensor)
         rows += _Loop(replace(config, env=env), coverage).rows()
     return rows

@@ -245,6 +245,26 @@ class Skin:
         """Number of sensors ``S``."""
         return len(self.links)
 
+    def check_robot(self, name: str, links: Sequence[str], what: str = "skin") -> None:
+        """Raise ValueError unless the skin was made for a robot.
+
+        Robots of one manufacturer can have the same link names.
+
+        Args:
+            name: Name of the robot.
+            links: Its links.
+            what: The skin or its file, for the error text.
+        """
+        if self.robot != name:
+            raise ValueError(
+                f"{what}: made for the robot {self.robot!r}, not {name!r}; if it fits, "
+                "change its field 'robot'"
+            )
+        try:
+            self.check_links(links)
+        except ValueError as error:
+            raise ValueError(f"{what}: {error}") from error
+
     def check_links(self, known: Sequence[str], robot: str | None = None) -> None:
         """Raise ValueError if a sensor sits on a link the robot does not have.
 

@@ -72,14 +72,14 @@ class SkinPage(ServedPage):
         port: Port of 127.0.0.1; 0 for any free one.
 
     Raises:
-        ValueError: If the skin is on links that the robot does not have.
+        ValueError: If the skin was made for another robot or other links.
         OSError: If the port cannot be used.
     """
 
     def __init__(self, robot: RobotConfig, skin: Skin | None, port: int = 0) -> None:
         self.robot, self.skin = robot, skin
         if skin is not None:
-            skin.check_links(robot.links, robot.name)
+            skin.check_robot(robot.name, robot.links)
         self.body = Body(robot)
         super().__init__(port)
         self.joint_pos = robot.default_joint_pos.copy()
