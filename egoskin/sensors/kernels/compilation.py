@@ -28,7 +28,7 @@ SETTING = "EGOSKIN_COMPILE"
 """Environment variable: 0 disables the C++ kernels, for tests and measurements."""
 
 
-TRIED = "EGOSKIN_COMPILATIONTRIED"
+TRIED = "EGOSKIN_COMPILATION_TRIED"
 """Environment variable of processes whose parent compiles, or has tried."""
 
 _log = logging.getLogger(__name__)
