@@ -113,7 +113,7 @@ def kept_robot(name: str) -> str | RobotConfig:
         ValueError: If there is no such robot, or its description is invalid.
         OSError: If a file that it refers to cannot be read.
     """
-    return name if name in ROBOTS else portable(find_robot(name))
+    return name if name in ROBOTS else portable(raw_robot(name))
 
 
 def _name(robot: str | RobotConfig) -> str:

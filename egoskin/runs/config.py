@@ -225,12 +225,11 @@ def _option(name: str) -> str:
     return f"--{name.replace('_', '-')}"
 
 
-def load_config(path: Path, *, quiet: bool = False) -> TrainConfig:
+def load_config(path: Path) -> TrainConfig:
     """Return the configuration of a run folder.
 
     Args:
         path: The folder.
-        quiet: Whether to accept a file without a seal silently.
 
     Raises:
         ValueError: If it is not a run folder, or its configuration is damaged.
@@ -238,7 +237,7 @@ def load_config(path: Path, *, quiet: bool = False) -> TrainConfig:
     file = path / "config.json"
     if not file.is_file():
         raise ValueError(f"{path} is not a run folder: it has no config.json")
-    return from_plain(TrainConfig, read_config(file, quiet=quiet)[0], str(file))
+    return from_plain(TrainConfig, read_config(file)[0], str(file))
 
 
 def read_config(

@@ -286,8 +286,7 @@ class StudyFolder:
         """
         folder = self.result_path(planned.name)
         stored = load_run(folder)
-        _, hashes = read_config(folder / "config.json", quiet=True)
-        differs = planned.differences(stored.config, hashes)
+        differs = planned.differences(stored.config, stored.hashes)
         if plan is not None:
             differs += [
                 f"evaluation.{name}"

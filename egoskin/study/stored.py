@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from egoskin.runs.config import TrainConfig, load_config
+from egoskin.runs.config import TrainConfig, read_config
 from egoskin.runs.run import Run
 from egoskin.storage.formats import read_sealed
 from egoskin.storage.serialization import from_plain, read_json
@@ -54,6 +54,8 @@ class StoredRun:
 
     config: TrainConfig
     """Its configuration."""
+    hashes: dict[str, str]
+    """Hashes of its files, by ``SKIN_HASH`` and ``INIT_HASH``; older runs lack some."""
     record: Record
     """How it was made."""
     frames: np.ndarray
@@ -174,9 +176,12 @@ def load_run(path: Path) -> StoredRun:
     # There is no estimate before an episode can have lasted that long.
     curve = curve[np.isfinite(curve[:, 1])]
     evaluation, _ = read_sealed(evaluations[-1])
+    file = path / "config.json"
+    # No note about a missing seal: stored runs are under version control.
+    config, hashes = read_config(file, quiet=True)
     return StoredRun(
-        # No note about a missing seal: stored runs are under version control.
-        config=load_config(path, quiet=True),
+        config=from_plain(TrainConfig, config, str(file)),
+        hashes=hashes,
         record=from_plain(Record, read_json(what), str(what)),
         frames=curve[:, 0],
         success=curve[:, 1],

@@ -100,17 +100,20 @@ def test_a_flat_mesh_has_a_thickness():
     np.testing.assert_allclose(primitive.size, [0.5, 0.5, 5e-4], atol=3e-5)
 
 
-CORNERS = [(x, y, z) for x in (0, 0.1) for y in (0, 0.2) for z in (0, 0.6)]
+BOX = trimesh.creation.box(bounds=[(0, 0, 0), (0.1, 0.2, 0.6)])
 
 
-def with_mesh(more=""):
-    """Return the walker with a box-shaped collision mesh on its trunk."""
-    vertices = " ".join(str(v) for corner in CORNERS for v in corner)
+def with_mesh(mesh=BOX, inertia="convex"):
+    """Return the walker with a collision mesh on its trunk."""
+    vertices, faces = (
+        " ".join(map(str, np.array(each).ravel()))
+        for each in (mesh.vertices, mesh.faces)
+    )
+    asset = f'<mesh name="m" inertia="{inertia}" vertex="{vertices}" face="{faces}"/>'
     geom = '<geom type="mesh" mesh="m" mass="1" pos="0 0 0.4" friction="0.7 0.1 0.1"/>'
-    return MODEL.replace(
-        "<worldbody>",
-        f'<asset><mesh name="m" vertex="{vertices}"/></asset><worldbody>',
-    ).replace('<body name="left_arm"', f'{geom}{more}<body name="left_arm"')
+    return MODEL.replace("<worldbody>", f"<asset>{asset}</asset><worldbody>").replace(
+        '<body name="left_arm"', f'{geom}<body name="left_arm"'
+    )
 
 
 def test_a_collision_mesh_of_an_mjcf_becomes_a_primitive(tmp_path):
@@ -137,21 +140,8 @@ def test_a_collision_mesh_of_an_mjcf_becomes_a_primitive(tmp_path):
 
 def test_two_parts_of_a_mesh_collide_alike(tmp_path):
     # A trunk and a narrow head.
-    head = [(x, y, z) for x in (0, 0.02) for y in (0, 0.03) for z in (0.6, 0.9)]
-    vertices = " ".join(str(v) for corner in CORNERS + head for v in corner)
-    mesh = trimesh.util.concatenate(
-        [trimesh.convex.convex_hull(np.array(points)) for points in (CORNERS, head)]
-    )
-    vertices, faces = (
-        " ".join(map(str, np.array(each).ravel()))
-        for each in (mesh.vertices, mesh.faces)
-    )
-    model = with_mesh()
-    start, _, rest = model.partition("<asset>")
-    model = (
-        f'{start}<asset><mesh name="m" inertia="shell" vertex="{vertices}" '
-        f'face="{faces}"/>{rest[rest.index("</asset>") :]}'
-    )
+    head = trimesh.creation.box(bounds=[(0, 0, 0.6), (0.02, 0.03, 0.9)])
+    model = with_mesh(trimesh.util.concatenate([BOX, head]), "shell")
     robot = portable(read_folder(write_robot(tmp_path / "walker", model=model)))
     own = [
         g for g in range(robot.model.ngeom) if robot.model.geom_friction[g, 0] == 0.7
@@ -199,43 +189,25 @@ def test_no_sensor_is_between_the_parts_of_a_mesh(tmp_path):
     cut = 0
     for _ in range(6):
         pieces = []
-        for height, width in ((0, 0.3), (0.25, 0.1)):
+        # Above 1 m, the six digits of an MJCF are steps of 10 micrometres.
+        for height, width in ((1, 0.3), (1.25, 0.1)):
             piece = trimesh.creation.box((width, width, 0.25))
             piece.vertices = piece.vertices + (0, 0, height) + rng.normal(size=3) / 100
             pieces.append(piece)
-        mesh = trimesh.util.concatenate(pieces)
-        vertices, faces = (
-            " ".join(map(str, np.array(each).ravel()))
-            for each in (mesh.vertices, mesh.faces)
-        )
-        start, _, rest = with_mesh().partition("<asset>")
-        model = (
-            f'{start}<asset><mesh name="m" inertia="convex" vertex="{vertices}" '
-            f'face="{faces}"/>{rest[rest.index("</asset>") :]}'
-        )
-        robot = portable(read_folder(write_robot(tmp_path / "walker", model=model)))
-        parts = [p for p in robot.primitives if p.link == "trunk"][-2:]
-        cut += parts[1].size[2] != 0.2
-        points = sample_surface(robot, ["trunk"], 2000, np.random.default_rng(0))
-        depth = [-distance_to(part, points.position) for part in parts]
+        model = with_mesh(trimesh.util.concatenate(pieces))
+        made = make_portable(read_folder(write_robot(tmp_path / "walker", model=model)))
+        (fit,) = made.fits
+        cut += len(fit.primitives) == 2
+        points = sample_surface(made.robot, ["trunk"], 2000, 0).position
+        depth = [-distance_to(part, points) for part in fit.primitives]
         # On the surface of both is between them.
         assert (np.max(np.abs(depth), axis=0) < 1e-4).sum() <= 3
     assert cut
 
 
 def test_a_mesh_that_collides_by_pairs_alone_is_one_primitive(tmp_path):
-    mesh = trimesh.util.concatenate(
-        [trimesh.creation.box((0.3, 0.3, 0.2)), trimesh.creation.box((0.05, 0.05, 0.8))]
-    )
-    vertices, faces = (
-        " ".join(map(str, np.array(each).ravel()))
-        for each in (mesh.vertices, mesh.faces)
-    )
-    start, _, rest = with_mesh().partition("<asset>")
-    model = (
-        f'{start}<asset><mesh name="m" inertia="convex" vertex="{vertices}" '
-        f'face="{faces}"/>{rest[rest.index("</asset>") :]}'
-    )
+    plate, rod = (trimesh.creation.box(s) for s in ((0.3, 0.3, 0.2), (0.05, 0.05, 0.8)))
+    model = with_mesh(trimesh.util.concatenate([plate, rod]))
     pairs = '<contact><pair geom1="hull" geom2="hand"/></contact><actuator>'
     alone = model.replace("<actuator>", pairs).replace(
         '<geom type="mesh"', '<geom name="hull" contype="0" conaffinity="0" type="mesh"'
