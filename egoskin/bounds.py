@@ -14,7 +14,7 @@ import functools
 import math
 import sys
 import typing
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from numbers import Integral, Real
 from typing import Any
@@ -97,15 +97,18 @@ def check_bounds(config: Any) -> None:
                 raise BoundsError(type(config), f"{name} must {wrong}, got {value}")
 
 
-def check_ranges(config: Any) -> None:
-    """Raise ValueError if a tuple of a dataclass is not (low, high), low <= high.
+def check_ranges(config: Any, other: Collection[str] = ()) -> None:
+    """Raise ValueError if a range of a dataclass is not (low, high), low <= high.
 
     Args:
-        config: The dataclass; its tuples are pairs of numbers.
+        config: The dataclass; its tuples are ranges, except for those named in
+            ``other``.
+        other: Names of other tuples.
     """
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
-        if isinstance(value, tuple) and not value[0] <= value[1]:
+        is_range = isinstance(value, tuple) and field.name not in other
+        if is_range and not value[0] <= value[1]:
             raise ValueError(
                 f"{field.name} must be (low, high) with low <= high, got {value}"
             )

@@ -388,6 +388,8 @@ class Ellipsoid:
 
 Shape = Sphere | Box | Capsule | Ellipsoid
 """Any shape; all have the methods listed in the module docstring."""
+NUM_SIZES = {"sphere": 1, "capsule": 2, "box": 3, "ellipsoid": 3}
+"""Number of sizes of each kind of shape, as MuJoCo counts them."""
 
 
 def shape_of(kind: str, size: Sequence[float]) -> Shape:
@@ -402,13 +404,13 @@ def shape_of(kind: str, size: Sequence[float]) -> Shape:
         ValueError: If the kind is unknown, or a size is missing, not positive or not
             finite.
     """
-    needed = {"sphere": 1, "capsule": 2, "box": 3, "ellipsoid": 3}
-    if kind not in needed:
-        hint = did_you_mean(kind, needed)
-        raise ValueError(f"kind must be one of {', '.join(needed)}, got {kind!r}{hint}")
-    sizes = [float(value) for value in size][: needed[kind]]
-    if len(sizes) < needed[kind]:
-        raise ValueError(f"a {kind} needs {needed[kind]} sizes, got {sizes}")
+    if kind not in NUM_SIZES:
+        hint, kinds = did_you_mean(kind, NUM_SIZES), ", ".join(NUM_SIZES)
+        raise ValueError(f"kind must be one of {kinds}, got {kind!r}{hint}")
+    needed = NUM_SIZES[kind]
+    sizes = [float(value) for value in size][:needed]
+    if len(sizes) < needed:
+        raise ValueError(f"a {kind} needs {needed} sizes, got {sizes}")
     if kind == "sphere":
         return Sphere(radius=sizes[0])
     if kind == "capsule":

@@ -29,6 +29,7 @@ from egoskin.sensors import Ray, RaySensor, SensorPipeline, place_sensors
 from egoskin.sensors.config import SensorConfig
 from egoskin.shapes import Sphere
 from egoskin.sparse import SparseRows
+from sensing import KINDS, SHAPES
 from throwing import TASK
 
 SKIN = place_sensors(H1_2, 16, seed=0)
@@ -112,9 +113,10 @@ def test_hits_are_the_readings_of_the_grid(random_state, ray):
 
 
 @pytest.mark.parametrize("signal", ["proximity", "closeness", "binary"])
-def test_the_sparse_signal_is_that_of_the_transforms(random_state, signal):
+@pytest.mark.parametrize("shape", SHAPES, ids=KINDS)
+def test_the_sparse_signal_is_that_of_the_transforms(random_state, signal, shape):
     pipeline = SensorPipeline(replace(RAYS, signal=signal), H1_2, SKIN)
-    objects = (Sphere(radius=0.25),) * 3
+    objects = (shape,) * 3
     rays = pipeline.sparse_rays(objects)
     state = random_state(200, seed=2, objects=3)
     dense = state.clone()

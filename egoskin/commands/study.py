@@ -214,6 +214,10 @@ def what_is_seen(manifest: Manifest) -> dict[str, Any]:
         or any(name.startswith(_OF_THE_BASE) for name in manifest.overrides(c))
     ]
     sensors = [c.config.env.sensor for c in skinned if c not in others]
+    base = manifest.base.env
+    if base.task.throws.shape != "sphere":
+        print("visibility is analysed for spheres only")
+        return {}
     if others:
         print(
             "visibility is not analysed for cells with an infinite range, or another "
@@ -223,7 +227,6 @@ def what_is_seen(manifest: Manifest) -> dict[str, Any]:
     if not sensors:
         print("no cell is left: there is no visibility to analyse")
         return {}
-    base = manifest.base.env
     analysis = analyse(
         base.robot_config,
         base.skin.build(base.robot_config),

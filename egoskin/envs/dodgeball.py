@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Annotated
 
@@ -31,7 +30,6 @@ from egoskin.rng import Stream, uniform
 from egoskin.robots.config import RobotConfig
 from egoskin.robots.kinematics import axis_vectors, rotate_inverse
 from egoskin.rounding import pad_rows
-from egoskin.shapes import Shape
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,7 +115,6 @@ class DodgeballEnv(EnvBase):
         num_threads: Physics threads; results do not depend on it.
         hold: Whether the robot is held rigid in its start pose.
         tactile: Whether to return the links touched, under the key ``tactile``.
-        objects: Shapes of the thrown objects; by default those of the configuration.
         engine: Physics engine.
         device: Device of the simulation and of all tensors.
 
@@ -136,7 +133,6 @@ class DodgeballEnv(EnvBase):
         num_threads: int = 1,
         hold: bool = False,
         tactile: bool = True,
-        objects: Sequence[Shape] | None = None,
         engine: type[Physics] = DEFAULT_ENGINE,
         device: torch.device | str = "cpu",
     ) -> None:
@@ -148,7 +144,7 @@ class DodgeballEnv(EnvBase):
         throws = config.throws
         self.scene = Scene(
             robot=robot,
-            objects=tuple(throws.balls if objects is None else objects),
+            objects=throws.balls,
             config=config.physics,
             weightless_objects=not throws.gravity,
             link_contacts=tactile,

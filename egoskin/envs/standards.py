@@ -21,6 +21,7 @@ CUSTOM = "custom"
 
 # Settings shared by all versions, followed by those that differ.
 _SHARED = {
+    "shape": "sphere",
     "radius": 0.15,
     "num_balls": 2,
     "interval": (1.0, 2.0),

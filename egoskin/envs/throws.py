@@ -22,7 +22,7 @@ from egoskin.rng import Stream, between, uniform
 from egoskin.robots.config import RobotConfig
 from egoskin.robots.kinematics import LinkKinematics, axis_vectors, rotate
 from egoskin.robots.surface import sample_surface
-from egoskin.shapes import Sphere
+from egoskin.shapes import NUM_SIZES, Shape, shape_of
 
 # Target points on the body: dense enough that neighbours are 2 cm apart, and fixed, so
 # that a throw set is the same in every run.
@@ -38,14 +38,20 @@ _Seconds = Annotated[tuple[float, float], Interval(gt=0, le=1000)]
 _MetresPerSecond = Annotated[tuple[float, float], Interval(ge=0.01, le=1000)]
 _Degrees = Annotated[tuple[float, float], Interval(ge=-360, le=360)]
 _Metres = Annotated[tuple[float, float], Interval(gt=0, le=1000)]
+_OBJECT = Interval(ge=1e-3, le=10)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ThrowConfig:
     """The balls and how they are thrown; every range is sampled uniformly."""
 
-    radius: Annotated[float, Interval(ge=1e-3, le=10)] = 0.15
-    """Radius of the balls [m]."""
+    shape: Literal["sphere", "box", "capsule", "ellipsoid"] = "sphere"
+    """Shape of the balls. They do not rotate: their axes are those of the world."""
+    radius: Annotated[float, _OBJECT] = 0.15
+    """Radius of spheres [m]."""
+    size: Annotated[tuple[float, ...], _OBJECT] = ()
+    """Size of any other shape [m]: half lengths of a box along x, y, z; radius and half
+    length (along z, without the ends) of a capsule; semi-axes of an ellipsoid."""
     num_balls: Annotated[int, Interval(ge=1, le=100)] = 2
     """Number of balls, thrown in turn; with several, a slow ball can land before its
     next throw."""
@@ -80,7 +86,8 @@ class ThrowConfig:
     def __post_init__(self) -> None:
         """Raise ValueError for invalid values, or options without effect."""
         check_bounds(self)
-        check_ranges(self)
+        check_ranges(self, other=["size"])
+        self._check_size()
         for name in ("box_half_width", "box_height"):
             changed = getattr(self, name) != getattr(ThrowConfig, name)
             if changed and self.aim != "box":
@@ -91,10 +98,26 @@ class ThrowConfig:
         """Downward acceleration of the balls [m/s^2]."""
         return GRAVITY if self.flight == "ballistic" else 0.0
 
+    def _check_size(self) -> None:
+        """Raise ValueError unless just the sizes of the shape are given."""
+        if self.shape == "sphere":
+            if self.size:
+                raise ValueError("size has no effect with shape=sphere: use radius")
+            return
+        if self.radius != ThrowConfig.radius:
+            raise ValueError(f"radius has no effect with shape={self.shape}: use size")
+        shape_of(self.shape, self.size)
+        if len(self.size) > NUM_SIZES[self.shape]:
+            raise ValueError(
+                f"a {self.shape} needs {NUM_SIZES[self.shape]} sizes, got "
+                f"{list(self.size)}"
+            )
+
     @property
-    def balls(self) -> tuple[Sphere, ...]:
+    def balls(self) -> tuple[Shape, ...]:
         """Shape of each ball."""
-        return (Sphere(radius=self.radius),) * self.num_balls
+        size = (self.radius,) if self.shape == "sphere" else self.size
+        return (shape_of(self.shape, size),) * self.num_balls
 
 
 @dataclass(frozen=True, kw_only=True)

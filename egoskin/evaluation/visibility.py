@@ -343,7 +343,7 @@ def analyse(
         skin: The sensors.
         sensors: Sensor configurations by name; only coverage and occlusion are used.
         ranges: Ranges of sensors that have none of their own [m].
-        throws: The throws.
+        throws: The throws, of spheres.
         num_throws: Number of throws.
         seed: Seed of the throws and of the points on the surface.
         timestep: Physics time step of the task [s].
@@ -352,7 +352,8 @@ def analyse(
 
     Raises:
         ValueError: If there is no coverage, range or throw, a range (also of the skin)
-            is not positive and finite, one is repeated, or the seed is invalid.
+            is not positive and finite, one is repeated, the seed is invalid, or the
+            throws are not of spheres.
     """
     if not sensors or not ranges:
         raise ValueError("an analysis needs at least one coverage and one range")
@@ -364,7 +365,11 @@ def analyse(
     check_seed(seed)
     if num_throws < 1:
         raise ValueError(f"num_throws must be at least 1, got {num_throws}")
-    body, ball = StandingRobot(robot), Sphere(radius=throws.radius)
+    body, ball = StandingRobot(robot), throws.balls[0]
+    if not isinstance(ball, Sphere):
+        raise ValueError(
+            f"visibility is analysed for spheres, got shape={throws.shape}"
+        )
     skin.check_links(robot.links, robot.name)
     cells = pipelines(robot, skin, sensors, max(ranges))
     far = farthest(cells)

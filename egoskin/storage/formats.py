@@ -29,7 +29,7 @@ from torch import Tensor
 
 from egoskin.storage.serialization import read_json
 
-FORMAT = 6
+FORMAT = 7
 """Number of the format in which files are written."""
 _SEAL = ("format", "egoskin", "sha256")
 _ANY = object()
@@ -111,6 +111,7 @@ _MIGRATIONS = {
     ),
     4: Migration(added={"engine": _ENGINE}),
     5: Migration(added={"init_from": None}),
+    6: Migration(added={"env.task.throws.shape": "sphere", "env.task.throws.size": []}),
 }
 assert _MIGRATIONS.keys() == set(range(1, FORMAT))
 

@@ -25,7 +25,9 @@ from egoskin.robots.builtin import H1_2
 
 # All values are repeated here: a standard never changes; a better one is a new version.
 SHARED = {
+    "shape": "sphere",
     "radius": 0.15,
+    "size": (),
     "num_balls": 2,
     "interval": (1.0, 2.0),
     "height": (2.0, 3.0),
@@ -125,8 +127,8 @@ OTHER_THROWS = {
     "flight": "ballistic",
     "aim": "box",
 }
-# They have no effect without another option.
-BOX = {"box_half_width": 0.4, "box_height": (0.3, 1.7)}
+# They have no effect, or are not valid, without another option.
+TOGETHER = {"box_half_width", "box_height", "shape", "size"}
 OTHER_ENDS = {
     "start_joint_noise": 0.04,
     "episode_length_s": 9.0,
@@ -144,6 +146,14 @@ def test_another_throw_is_custom(version, name):
 
 
 @pytest.mark.parametrize("version", VERSIONS)
+def test_other_objects_than_spheres_are_custom(version):
+    task = training_task(version, DodgeballConfig())
+    throws = replace(task.throws, shape="ellipsoid", size=(0.15, 0.15, 0.15))
+    assert standard_of(replace(task, throws=throws)) == "custom"
+    assert training_task(version, replace(task, throws=throws)) == task
+
+
+@pytest.mark.parametrize("version", VERSIONS)
 @pytest.mark.parametrize("name", OTHER_ENDS)
 def test_another_start_or_end_is_custom(version, name):
     task = training_task(version, DodgeballConfig())
@@ -153,4 +163,4 @@ def test_another_start_or_end_is_custom(version, name):
 def test_no_field_of_the_throws_is_forgotten_here():
     fields = {field.name for field in dataclasses.fields(ThrowConfig)}
     assert fields == SHARED.keys() | {"aim", "first_delay"}
-    assert fields - BOX.keys() == OTHER_THROWS.keys()
+    assert fields - TOGETHER == OTHER_THROWS.keys()

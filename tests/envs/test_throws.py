@@ -470,6 +470,15 @@ def test_every_throw_hits_a_rigid_robot(flight, aim, request, capsys):
         ({"lead": -0.1}, "lead must not be negative, got -0.1"),
         ({"box_half_width": 0.0}, "box_half_width has no effect without aim=box"),
         ({"box_height": (1.0, 1.0)}, "box_height has no effect without aim=box"),
+        ({"size": (0.1,)}, "size has no effect with shape=sphere: use radius"),
+        (
+            {"shape": "box", "size": (0.1, 0.1, 0.1), "radius": 0.2},
+            "radius has no effect with shape=box: use size",
+        ),
+        ({"shape": "box"}, r"a box needs 3 sizes, got \[\]"),
+        ({"shape": "capsule", "size": (0.1, 0.2, 0.3)}, "a capsule needs 2 sizes"),
+        ({"shape": "box", "size": (0.1, 0.0, 0.1)}, "size must be at least 0.001"),
+        ({"shape": "cube", "size": (0.1,)}, "kind must be one of sphere, .*'cube'"),
     ],
 )
 def test_throws_that_cannot_be_thrown_are_refused(changes, message):

@@ -431,6 +431,10 @@ def test_nothing_is_seen_after_the_contact(thrown):
         ({"sensors": {}}, "at least one coverage and one range"),
         ({"num_throws": 0}, "num_throws must be at least 1"),
         ({"seed": -1}, r"seed must be in \[0, 2\*\*32\), got -1"),
+        (
+            {"throws": ThrowConfig(shape="capsule", size=(0.1, 0.2))},
+            "visibility is analysed for spheres, got shape=capsule",
+        ),
     ],
 )
 def test_what_cannot_be_analysed_is_refused(skin, changes, message):

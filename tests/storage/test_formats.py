@@ -303,13 +303,15 @@ def test_an_option_that_is_no_more_is_refused_where_it_had_an_effect(run: Path):
 
 
 def test_a_migration_leaves_alone_what_is_there_and_makes_no_parts():
-    given = {"env": {"task": {"throws": {"aim": "box", "first_delay": [0, 1]}}}}
+    throws = {"aim": "box", "first_delay": [0, 1], "shape": "sphere", "size": []}
+    given = {"env": {"task": {"throws": throws}}}
     same, _ = migrate(given, 1)
     assert same["env"]["task"].pop("randomization")["gains"] == [1.0, 1.0]
     assert same == given
     assert migrate({"ppo": {"gamma": 0.9}}, 1) == ({"ppo": {"gamma": 0.9}}, {})
     bare, _ = migrate({"env": {}}, 1)
-    assert bare["env"]["task"]["throws"] == {"aim": "body", "first_delay": [0.0, 0.0]}
+    throws = {"aim": "body", "first_delay": [0.0, 0.0], "shape": "sphere", "size": []}
+    assert bare["env"]["task"]["throws"] == throws
     now = {"env": {}, "core_frames": [0, 0]}
     assert migrate(now, FORMAT) == (now, {})
 
@@ -317,14 +319,17 @@ def test_a_migration_leaves_alone_what_is_there_and_makes_no_parts():
 def rewrite_as_format(
     number: int, run: Path, field: str, value: Any, monkeypatch, *, in_policy: bool
 ):
-    """Write a run in an older format, which lacks a field of this value."""
+    """Write a run in an older format, which lacks a field ("a.b") of this value."""
     config, checkpoint = run / "config.json", run / "checkpoint.safetensors"
     content, _ = read_sealed(config)
     tensors, header = load_tensors(checkpoint)
     holders = [content, header["config"]]
     holders += [header["policy"]] * in_policy
+    *path, name = field.split(".")
     for part in holders:
-        assert part.pop(field) == value
+        for inner in path:
+            part = part[inner]
+        assert part.pop(name) == value
     with monkeypatch.context() as patch:
         patch.setattr("egoskin.storage.formats.FORMAT", number)
         config.write_bytes(sealed_json(content))
@@ -342,6 +347,14 @@ def test_a_run_of_format_4_was_simulated_by_mujoco(run: Path, monkeypatch):
 def test_a_run_of_format_5_started_from_new_networks(run: Path, monkeypatch):
     rewrite_as_format(5, run, "init_from", None, monkeypatch, in_policy=False)
     resume(run)
+
+
+def test_in_a_run_of_format_6_spheres_were_thrown(run: Path, monkeypatch):
+    field = "env.task.throws.shape"
+    rewrite_as_format(6, run, field, "sphere", monkeypatch, in_policy=True)
+    resume(run)
+    policy = egoskin.load_policy(run)
+    assert policy.env_config.task.throws.shape == "sphere"
 
 
 @pytest.mark.parametrize(

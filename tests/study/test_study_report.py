@@ -436,6 +436,9 @@ def test_visibility_is_that_of_the_cells_with_the_bases_skin(capsys):
     assert "field-proximity-infm" in said
     assert "field-proximity-0.5m-num_sensors-8, field-proximity-0.3m-occlusion" in said
     assert what_is_seen(resolve(dataclasses.replace(study, cells=cells[1:]))) == {}
+    throws = {"task.throws.shape": "capsule", "task.throws.size": (0.1, 0.2)}
+    assert what_is_seen(resolve(dataclasses.replace(study, base=throws))) == {}
+    assert capsys.readouterr().out.endswith("visibility is analysed for spheres only\n")
 
 
 def test_frames_to_a_share_are_read_off_the_curve(

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pytest
+import torch
 
 pytest.importorskip("viser")
 
@@ -24,10 +25,12 @@ from egoskin.policies.policy import policy_file, save_policy
 from egoskin.sensors import Ray, Skin
 from egoskin.sensors.config import SensorConfig, SkinConfig
 from egoskin.viewer.web import session as session_module
+from egoskin.viewer.web.body import mesh_of
 from egoskin.viewer.web.page import Page, _short
 from egoskin.viewer.web.panel import EPISODES, MEMORY
 from egoskin.viewer.web.session import Frame
 from making import make_agent
+from sensing import KINDS, SHAPES
 from visiting import Visitor
 
 
@@ -97,6 +100,17 @@ def test_a_throw_changes_what_the_sensors_show(page: Page):
     assert any((a != b).any() for a, b in zip(colours, shown, strict=True))
     assert page._scenes[0]._balls[0].visible
     assert page._scenes[0]._lines.visible
+
+
+@pytest.mark.parametrize("shape", SHAPES, ids=KINDS)
+def test_an_object_is_drawn_as_its_shape(shape):
+    mesh = mesh_of(shape)
+    extents = torch.from_numpy(np.abs(mesh.vertices).max(0))
+    reach = shape.signed_distance(*torch.diag(extents).unbind(0))
+    # The surface passes the ends of the mesh, which are vertices, on each axis.
+    assert reach.abs().max() < 1e-6
+    x, y, z = torch.from_numpy(np.array(mesh.vertices)).unbind(-1)
+    assert shape.signed_distance(x, y, z).abs().max() < 0.01
 
 
 def test_balls_are_thrown_by_themselves_as_often_as_the_panel_says(page: Page):

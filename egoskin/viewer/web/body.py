@@ -13,6 +13,7 @@ import trimesh
 from egoskin.robots.chains import body_name, joint_name
 from egoskin.robots.config import RobotConfig
 from egoskin.sensors import Skin
+from egoskin.shapes import Shape
 
 # Geom groups below this are drawn, as by default in MuJoCo's viewer; groups from 3 on
 # hold collision geoms.
@@ -164,6 +165,15 @@ class Body:
             place[:3, :3], place[:3, 3] = rotation.reshape(3, 3), model.geom_pos[geom]
             mesh.apply_transform(place)
             yield int(model.geom_bodyid[geom]), tuple(map(float, rgba)), mesh
+
+
+def mesh_of(shape: Shape) -> trimesh.Trimesh:
+    """Return the mesh of an object, in its own frame."""
+    spec = mujoco.MjSpec()
+    shape.add_geom(spec.worldbody)
+    mesh = _mesh(spec.compile(), 0)
+    assert mesh is not None
+    return mesh
 
 
 def _mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh | None:

@@ -13,8 +13,8 @@ import trimesh
 import viser
 
 from egoskin.sensors import Ray, Skin
-from egoskin.shapes import Sphere
-from egoskin.viewer.web.body import Body
+from egoskin.shapes import Shape
+from egoskin.viewer.web.body import Body, mesh_of
 from egoskin.viewer.web.session import Frame
 
 # Colours (r, g, b).
@@ -87,7 +87,7 @@ class RobotScene:
         name: str,
         body: Body,
         skin: Skin | None,
-        balls: Sequence[Sphere] = (),
+        balls: Sequence[Shape] = (),
         place: tuple[float, float] = (0.0, 0.0),
         title: str = "",
     ) -> None:
@@ -113,15 +113,16 @@ class RobotScene:
                 color=_lit(rgb),
                 opacity=None if opacity == 1 else opacity,
             )
+        meshes = map(mesh_of, balls)
         self._balls = [
-            server.scene.add_icosphere(
+            server.scene.add_mesh_simple(
                 f"{name}/ball_{i}",
-                radius=ball.radius,
+                mesh.vertices,
+                mesh.faces,
                 color=_BALL,
-                subdivisions=4,
                 visible=False,
             )
-            for i, ball in enumerate(balls)
+            for i, mesh in enumerate(meshes)
         ]
         self._trails = [deque(maxlen=_TRAIL_LENGTH) for _ in balls]
         self._trail = _lines(server, f"{name}/trail", 0.02)
