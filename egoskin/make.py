@@ -302,7 +302,10 @@ def check_env_memory(
 
 
 def check_num_workers(
-    num_envs: int, num_workers: int | None, name: str = "num_envs"
+    num_envs: int,
+    num_workers: int | None,
+    name: str = "num_envs",
+    engine: Engine = "mujoco",
 ) -> int:
     """Return the number of workers.
 
@@ -310,11 +313,18 @@ def check_num_workers(
         num_envs: Number of agents.
         num_workers: Number of workers; None for the default.
         name: Name of the number of agents, for the error text.
+        engine: Physics engine.
 
     Raises:
         ValueError: If it does not divide the number of agents (the text lists valid
-            values), or if either number is out of bounds.
+            values), if either number is out of bounds, or with engine warp if it is not
+            1.
     """
+    if engine == "warp" and num_workers not in (None, 1):
+        raise ValueError(
+            "engine warp simulates in one process: leave out num_workers, got "
+            f"{num_workers}"
+        )
     agents, processes = (num_envs, MOST_AGENTS), (num_workers, _MOST_WORKERS)
     for what, (number, most) in {name: agents, "num_workers": processes}.items():
         wrong = number is not None and Interval(ge=1, le=most).violation(number)

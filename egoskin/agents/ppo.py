@@ -60,7 +60,7 @@ class PPOConfig:
     ppo_epochs: Annotated[int, Interval(ge=1, le=1000)] = 5
     """Passes over a rollout."""
     num_mini_batches: Annotated[int, COUNT] = 4
-    """Minibatches in each pass (fewer if a rollout's frames cannot be divided so)."""
+    """Minibatches in each pass."""
     gamma: Annotated[float, SHARE] = 0.995
     """Discount per control step."""
     gae_lambda: Annotated[float, SHARE] = 0.8
@@ -255,7 +255,7 @@ class PPO:
         count = 0
         for _ in range(config.ppo_epochs):
             order = torch.randperm(len(batch), device=batch.device)
-            for index in order.chunk(config.num_mini_batches):
+            for index in order.tensor_split(config.num_mini_batches):
                 for name, value in self.step(batch, index).items():
                     sums[name] = sums.get(name, 0.0) + value
                 count += 1

@@ -85,15 +85,11 @@ class EvaluateConfig:
         """Raise ValueError for invalid values."""
         check_seed(self.throw_set, "throw_set")
         check_bounds(self)
-        check_num_workers(self.episodes, self.num_workers, "episodes")
+        check_num_workers(self.episodes, self.num_workers, "episodes", self.engine)
         check_output(self.json, "--json")
         check_output(self.map, "--map", PICTURE_SUFFIXES)
         if self.map is not None:
             check_packages("--map", "plot", "matplotlib")
-        if self.engine == "warp" and self.num_workers not in (None, 1):
-            raise ValueError(
-                "engine warp simulates in one process: leave out num_workers"
-            )
         engine_of(self.engine)
         if self.engine == "mujoco" and device_of(self.device).type != "cpu":
             raise ValueError("engine mujoco simulates on the CPU: leave out device")

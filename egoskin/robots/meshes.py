@@ -183,15 +183,20 @@ def _along(link: str, points: np.ndarray, axes: np.ndarray) -> tuple[float, Prim
     return float(volume), primitive
 
 
+def type_of(kind: str) -> mujoco.mjtGeom:
+    """Return MuJoCo's type of a kind of primitive."""
+    return getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")
+
+
 def set_shape(
     geom: mujoco.MjsGeom,
-    kind: mujoco.mjtGeom,
+    type_: mujoco.mjtGeom,
     size: np.ndarray,
     position: np.ndarray,
     quat: np.ndarray,
 ) -> None:
-    """Give a geom a kind, MuJoCo's sizes [m] and a pose in the frame of its link."""
-    geom.type, geom.size, geom.meshname = kind, size, ""
+    """Give a geom a type, MuJoCo's sizes [m] and a pose in the frame of its link."""
+    geom.type, geom.size, geom.meshname = type_, size, ""
     geom.pos, geom.quat, geom.alt.type = position, quat, _QUAT
     geom.fromto = np.full(6, np.nan)
     # Else the pose would be relative to a frame of the file.
@@ -200,10 +205,10 @@ def set_shape(
 
 def _set_primitive(geom: mujoco.MjsGeom, primitive: Primitive) -> None:
     """Give a geom of a link the kind, size and pose of a primitive."""
-    kind = getattr(mujoco.mjtGeom, f"mjGEOM_{primitive.kind.upper()}")
     quat = np.empty(4)
     mujoco.mju_mat2Quat(quat, primitive.rotation.ravel())
-    set_shape(geom, kind, primitive.size, primitive.position, quat)
+    pose = primitive.position, quat
+    set_shape(geom, type_of(primitive.kind), primitive.size, *pose)
 
 
 def _same_contacts(geom: mujoco.MjsGeom) -> mujoco.MjsGeom:

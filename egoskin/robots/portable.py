@@ -16,7 +16,13 @@ import numpy as np
 
 from egoskin.robots.chains import body_id, body_name
 from egoskin.robots.config import RobotConfig, round_off
-from egoskin.robots.meshes import MeshFit, add_urdf_meshes, fit_meshes, set_shape
+from egoskin.robots.meshes import (
+    MeshFit,
+    add_urdf_meshes,
+    fit_meshes,
+    set_shape,
+    type_of,
+)
 from egoskin.robots.spec import set_inertia
 
 # Collision bits of balls and floor; a robot's own bits are above them.
@@ -261,12 +267,11 @@ def _round_off(spec: mujoco.MjSpec) -> None:
     for geom in cylinders:
         size = geom.size if model is None else model.geom_size[geom.id]
         kind, rounded = round_off(float(size[0]), float(size[1]))
-        kind = getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")
         if model is not None and geom in ends:
             pose = model.geom_pos[geom.id], model.geom_quat[geom.id]
-            set_shape(geom, kind, np.array(rounded), *pose)
+            set_shape(geom, type_of(kind), np.array(rounded), *pose)
         else:
-            geom.type, geom.size = kind, rounded
+            geom.type, geom.size = type_of(kind), rounded
 
 
 def _set_bits(spec: mujoco.MjSpec, in_pairs: Collection[str]) -> None:

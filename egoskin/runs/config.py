@@ -79,12 +79,7 @@ class TrainConfig:
         """Raise ValueError for invalid values."""
         check_bounds(self)
         check_seed(self.seed)
-        check_num_workers(self.num_envs, self.num_workers)
-        if self.engine == "warp" and self.num_workers not in (None, 1):
-            raise ValueError(
-                "engine warp simulates all agents in one process: leave out "
-                f"num_workers, got {self.num_workers}"
-            )
+        check_num_workers(self.num_envs, self.num_workers, engine=self.engine)
         if self.standard is not None and self.env.standard not in (
             self.standard,
             CUSTOM,

@@ -304,7 +304,7 @@ def plain_update(agent: Agent, rollout: TensorDict, config: PPOConfig) -> float:
     low, high = config.network.std_bounds
     for _ in range(config.ppo_epochs):
         order = torch.randperm(len(action))
-        for index in order.chunk(config.num_mini_batches):
+        for index in order.tensor_split(config.num_mini_batches):
             new = torch.distributions.Normal(*agent.head(inputs[index]))
             ratio = (new.log_prob(action[index]).sum(-1) - before[index]).exp()
             gain = advantage.flatten()[index]
@@ -326,6 +326,20 @@ def plain_update(agent: Agent, rollout: TensorDict, config: PPOConfig) -> float:
     then = (rollout["loc"].reshape(-1, 2), rollout["scale"].reshape(-1, 2))
     old = torch.distributions.Normal(*then)
     return float(torch.distributions.kl_divergence(old, after).sum(-1).mean())
+
+
+def test_there_are_as_many_minibatches_as_asked_for(monkeypatch):
+    torch.manual_seed(0)
+    network = NetworkConfig()
+    agent = Agent({"observation": 3}, ["observation"], ["observation"], 2, network)
+    rollout = broken_rollout(agent)
+    ppo = PPO(agent, PPOConfig(ppo_epochs=1, num_mini_batches=rollout.numel() - 1))
+    sizes, step = [], ppo.step
+    monkeypatch.setattr(
+        ppo, "step", lambda data, index: sizes.append(len(index)) or step(data, index)
+    )
+    ppo.update(rollout)
+    assert sizes == [2] + [1] * (rollout.numel() - 2)
 
 
 def test_an_update_is_that_of_plain_pytorch():
