@@ -206,6 +206,10 @@ def describe(manifest: Manifest) -> None:
 
 def what_is_seen(manifest: Manifest) -> dict[str, Any]:
     """Print and return the visibility of thrown balls by coverage and range."""
+    base = manifest.base.env
+    if base.task.throws.shape != "sphere":
+        print("visibility is analysed for spheres only")
+        return {}
     skinned = [c for c in manifest.cells if c.config.env.sensor.uses_skin]
     others = [
         c
@@ -214,10 +218,6 @@ def what_is_seen(manifest: Manifest) -> dict[str, Any]:
         or any(name.startswith(_OF_THE_BASE) for name in manifest.overrides(c))
     ]
     sensors = [c.config.env.sensor for c in skinned if c not in others]
-    base = manifest.base.env
-    if base.task.throws.shape != "sphere":
-        print("visibility is analysed for spheres only")
-        return {}
     if others:
         print(
             "visibility is not analysed for cells with an infinite range, or another "

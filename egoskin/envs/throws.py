@@ -46,7 +46,8 @@ class ThrowConfig:
     """The balls and how they are thrown; every range is sampled uniformly."""
 
     shape: Literal["sphere", "box", "capsule", "ellipsoid"] = "sphere"
-    """Shape of the balls. They do not rotate: their axes are those of the world."""
+    """Shape of the thrown objects, called balls. They do not rotate: their axes are
+    those of the world."""
     radius: Annotated[float, _OBJECT] = 0.15
     """Radius of spheres [m]."""
     size: Annotated[tuple[float, ...], _OBJECT] = ()

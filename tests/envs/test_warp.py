@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from dataclasses import fields, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -41,7 +42,7 @@ from egoskin.runs.config import TrainConfig
 from egoskin.runs.run import Run
 from egoskin.runs.trainer import METRIC_KEYS
 from egoskin.sensors.config import SensorConfig
-from egoskin.shapes import Sphere
+from egoskin.shapes import Box, Capsule, Ellipsoid, Shape, Sphere
 from sensing import use_warp_kernels
 from throwing import TASK
 
@@ -52,12 +53,13 @@ wp = pytest.importorskip("warp")
 
 DEFAULT = torch.from_numpy(H1_2.default_joint_pos).float()
 J = len(DEFAULT)
+BALL = Sphere(radius=0.15)
 
 
-def scene(radius: float = 0.15, **options: Any) -> Scene:
+def scene(ball: Shape = BALL, **options: Any) -> Scene:
     """Return a scene with the robot and two balls."""
     options = {"config": PhysicsConfig(), **options}
-    return Scene(robot=H1_2, objects=(Sphere(radius=radius),) * 2, **options)
+    return Scene(robot=H1_2, objects=(ball,) * 2, **options)
 
 
 def engines(num_envs: int, **options: Any) -> list[Physics]:
@@ -153,8 +155,20 @@ def test_for_fifty_steps_a_robot_stands_and_steps_as_with_mujoco(motion):
     )
 
 
-def test_balls_that_hit_or_miss_by_two_centimetres_do_so_here_as_well():
-    # Unambiguous: hits with 2 cm smaller balls, and misses with 2 cm larger ones.
+@pytest.mark.parametrize(
+    "ball",
+    [
+        lambda r: Sphere(radius=r),
+        lambda r: Box(half_extents=(r, r - 0.05, r + 0.05)),
+        lambda r: Capsule(radius=r - 0.05, half_length=0.1),
+        lambda r: Ellipsoid(semi_axes=(r, r - 0.05, r + 0.05)),
+    ],
+    ids=["sphere", "box", "capsule", "ellipsoid"],
+)
+def test_what_hits_or_misses_by_two_centimetres_does_so_here_as_well(
+    ball: Callable[[float], Shape],
+):
+    # Unambiguous: hits with 2 cm smaller objects, and misses with 2 cm larger ones.
     n, steps = 96, 50
     config = EnvConfig().task
     thrower = Thrower(config.throws, H1_2, config.physics.timestep)
@@ -168,7 +182,8 @@ def test_balls_that_hit_or_miss_by_two_centimetres_do_so_here_as_well():
         ("warp", 0.15),
     ):
         physics = engine_of(name)(
-            scene(radius, hold=True, weightless_objects=True, link_contacts=True), n
+            scene(ball(radius), hold=True, weightless_objects=True, link_contacts=True),
+            n,
         )
         put(physics, n)
         state = physics.read()
