@@ -81,7 +81,7 @@ class Check:
 
 
 def _meshes(made: Portable) -> Iterator[Finding]:
-    """Tell what became of collision meshes."""
+    """Tell what became of collision meshes and ellipsoids."""
     if fits := made.fits:
         excess = [fit.excess for fit in fits]
         shapes = ", ".join(
@@ -90,8 +90,9 @@ def _meshes(made: Portable) -> Iterator[Finding]:
         )
         yield Finding(
             "note",
-            f"collision meshes become primitives around them, of {min(excess):.1f} to "
-            f"{max(excess):.1f} times the volume of their convex hulls: {shapes}",
+            "collision meshes and ellipsoids become primitives around them, of "
+            f"{min(excess):.1f} to {max(excess):.1f} times the volume of their convex "
+            f"hulls: {shapes}",
         )
     if made.lost:
         yield Finding(

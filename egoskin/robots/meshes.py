@@ -1,4 +1,4 @@
-"""Primitives around the collision meshes of a robot.
+"""Primitives around the collision meshes and ellipsoids of a robot.
 
 MuJoCo collides the convex hull of a mesh. A primitive around it is faster, and its
 distance to a sensor or ball has a closed form.
@@ -6,6 +6,7 @@ distance to a sensor or ball has a closed form.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Collection
 from dataclasses import dataclass
 from itertools import pairwise
@@ -19,6 +20,7 @@ from egoskin.robots.chains import body_name
 from egoskin.robots.config import Primitive
 
 _MESH = mujoco.mjtGeom.mjGEOM_MESH
+_ELLIPSOID = mujoco.mjtGeom.mjGEOM_ELLIPSOID
 _QUAT = mujoco.mjtOrientation.mjORIENTATION_QUAT
 # Half the least thickness of a primitive [m].
 _THINNEST = 5e-4
@@ -31,6 +33,8 @@ _ROUNDING = 2e-5
 _SAVING = 0.2
 # A mesh is cut at one of the planes between this many slabs.
 _SLABS = 12
+# Faces from pole to pole of a polyhedron around a sphere, which is 1 % larger.
+_LATITUDES = 16
 # Attributes of a geom that the parts of a mesh share.
 _LIKE = (
     *("contype", "conaffinity", "condim", "priority", "group", "material", "rgba"),
@@ -40,12 +44,12 @@ _LIKE = (
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MeshFit:
-    """Primitives in place of a collision mesh."""
+    """Primitives in place of a collision mesh or ellipsoid."""
 
     primitives: tuple[Primitive, ...]
     """The primitives, on one link."""
     excess: float
-    """Their volume relative to that of the mesh's convex hull; infinite if flat."""
+    """Their volume relative to that of its convex hull; infinite if flat."""
 
     @property
     def link(self) -> str:
@@ -220,7 +224,7 @@ def _same_contacts(geom: mujoco.MjsGeom) -> mujoco.MjsGeom:
 
 
 def fit_meshes(spec: mujoco.MjSpec, in_pairs: Collection[str] = ()) -> list[MeshFit]:
-    """Replace the collision meshes of a robot by primitives around them.
+    """Replace the collision meshes and ellipsoids of a robot by primitives around them.
 
     Args:
         spec: The robot. Primitives that MuJoCo itself fits to meshes get sizes and
@@ -228,13 +232,14 @@ def fit_meshes(spec: mujoco.MjSpec, in_pairs: Collection[str] = ()) -> list[Mesh
         in_pairs: Names of geoms that collide whatever their bits.
 
     Returns:
-        The primitives in place of meshes.
+        The primitives in place of others.
     """
-    fitted = [geom for geom in spec.geoms if geom.meshname and geom.type != _MESH]
+    replaced = (_MESH, _ELLIPSOID)
+    fitted = [g for g in spec.geoms if g.meshname and g.type not in replaced]
     meshes = [
         geom
         for geom in spec.geoms
-        if geom.type == _MESH
+        if geom.type in replaced
         # Floor and scenery are not kept.
         and geom.parent.name != "world"
         and (geom.contype or geom.conaffinity or geom.name in in_pairs)
@@ -309,18 +314,36 @@ def _find(folder: Path, file: str, meshdir: str) -> Path | None:
 
 
 def _fit(model: mujoco.MjModel, geom: int, *, may_cut: bool = True) -> MeshFit:
-    """Return the primitives around a geom that is a mesh."""
-    mesh = model.geom_dataid[geom]
-    vertices, faces = (
-        each[first[mesh] : first[mesh] + number[mesh]]
-        for each, first, number in (
-            (model.mesh_vert, model.mesh_vertadr, model.mesh_vertnum),
-            (model.mesh_face, model.mesh_faceadr, model.mesh_facenum),
+    """Return the primitives around a geom that is a mesh or an ellipsoid."""
+    if model.geom_type[geom] == _ELLIPSOID:
+        unit, faces = _around_unit_sphere()
+        vertices = unit * model.geom_size[geom]
+    else:
+        mesh = model.geom_dataid[geom]
+        vertices, faces = (
+            each[first[mesh] : first[mesh] + number[mesh]]
+            for each, first, number in (
+                (model.mesh_vert, model.mesh_vertadr, model.mesh_vertnum),
+                (model.mesh_face, model.mesh_faceadr, model.mesh_facenum),
+            )
         )
-    )
     rotation = np.empty(9)
     mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
     own_axes = rotation.reshape(3, 3)
     points = vertices.astype(float) @ own_axes.T + model.geom_pos[geom]
     link = body_name(model, int(model.geom_bodyid[geom]))
     return around_mesh(link, points, faces, own_axes, may_cut=may_cut)
+
+
+@functools.cache
+def _around_unit_sphere() -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices and faces of a polyhedron that contains the unit sphere."""
+    polar = np.linspace(0, np.pi, _LATITUDES + 1)
+    azimuth = np.linspace(0, 2 * np.pi, 2 * _LATITUDES, endpoint=False)
+    t, f = (each.ravel() for each in np.meshgrid(polar[1:-1], azimuth))
+    poles = np.array([[0, 0, 1.0], [0, 0, -1.0]])
+    ring = np.stack((np.sin(t) * np.cos(f), np.sin(t) * np.sin(f), np.cos(t)), -1)
+    points = np.concatenate((poles, ring))
+    hull = ConvexHull(points)
+    # The nearest face touches the sphere.
+    return points / -hull.equations[:, 3].max(), hull.simplices

@@ -45,12 +45,12 @@ _PRIMITIVES = (
 
 @dataclass(frozen=True, kw_only=True)
 class Portable:
-    """A robot as self-contained data, and what became of its collision meshes."""
+    """A robot as self-contained data, and what became of some collision shapes."""
 
     robot: RobotConfig
     """The robot, its model as text."""
     fits: list[MeshFit]
-    """Primitives in place of collision meshes."""
+    """Primitives in place of collision meshes and ellipsoids."""
     lost: list[str]
     """Links of a URDF with collision meshes that could not be read."""
 
@@ -62,25 +62,25 @@ def portable(robot: RobotConfig) -> RobotConfig:
     effect, and everything that is not below the base are left out; masses are kept. A
     joint without a torque limit has that of its actuators. A cylinder becomes the
     capsule inside it, of the same length and radius, or, if it is flat, a box; a
-    collision mesh the smallest primitives around it; a primitive that MuJoCo fits to a
-    mesh one with a size of its own. Links do not collide with each other if they
-    overlap in the default pose and one of them had a collision mesh. The base of a URDF
-    floats. Margins of contacts are zero. If the file does not use this package's
-    collision bits (see ``egoskin/assets/h1_2.xml``), self-collision stays as in the
-    file, and balls and floor collide with all shapes.
+    collision mesh or ellipsoid the smallest primitives around it; a primitive that
+    MuJoCo fits to a mesh one with a size of its own. Links do not collide with each
+    other if they overlap in the default pose and one of them had a collision mesh or
+    ellipsoid. The base of a URDF floats. Margins of contacts are zero. If the file does
+    not use this package's collision bits (see ``egoskin/assets/h1_2.xml``),
+    self-collision stays as in the file, and balls and floor collide with all shapes.
 
     Args:
         robot: A robot of the task; `RobotConfig.model_path` is read.
 
     Raises:
-        ValueError: If a collision shape is of another kind (ellipsoid, height field),
-            or the model contains other elements that cannot be kept as data.
+        ValueError: If a collision shape is of another kind (height field), or the
+            model contains other elements that cannot be kept as data.
     """
     return make_portable(robot).robot
 
 
 def make_portable(robot: RobotConfig) -> Portable:
-    """Return a robot as of `portable`, and what became of its meshes."""
+    """Return a robot as of `portable`, and what became of meshes and ellipsoids."""
     if robot.model_xml is not None:
         return Portable(robot=robot, fits=[], lost=[])
     spec, model = robot.spec(), robot.model
@@ -128,8 +128,9 @@ def make_portable(robot: RobotConfig) -> Portable:
                 f"{robot.name}: link {geom.parent.name!r} has a collision shape, "
                 f"{geom.name or 'unnamed'}, of kind "
                 f"{geom.type.name.removeprefix('mjGEOM_').lower()}; a robot stored as "
-                "data may have spheres, capsules, boxes, cylinders and meshes: replace "
-                'it, or make it visual only (contype="0" conaffinity="0")'
+                "data may have spheres, capsules, boxes, cylinders, ellipsoids and "
+                "meshes: replace it, or make it visual only "
+                '(contype="0" conaffinity="0")'
             )
     for each in (*spec.geoms, *spec.pairs):
         # A ball within the margin would count as a touch.

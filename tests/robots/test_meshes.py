@@ -138,6 +138,36 @@ def test_a_collision_mesh_of_an_mjcf_becomes_a_primitive(tmp_path):
     assert robot.model.geom_conaffinity[geom] & 3 == 3
 
 
+@pytest.mark.parametrize(
+    ("size", "kinds"),
+    [
+        ((0.1, 0.1, 0.1), ["sphere"]),
+        ((0.05, 0.05, 0.3), ["capsule"]),
+        ((0.02, 0.2, 0.3), ["box"]),
+    ],
+)
+def test_an_ellipsoid_becomes_a_primitive_around_it(size, kinds, tmp_path):
+    geom = (
+        '<geom type="ellipsoid" mass="1" pos="0.1 0 0.4" euler="0 30 0" '
+        f'size="{size[0]} {size[1]} {size[2]}"/>'
+    )
+    model = MODEL.replace('<body name="left_arm"', f'{geom}<body name="left_arm"')
+    before = read_folder(write_robot(tmp_path / "walker", model=model))
+    made = make_portable(before)
+    np.testing.assert_allclose(made.robot.model.body_mass, before.model.body_mass, 1e-5)
+    (fit,) = made.fits
+    assert fit.link == "trunk"
+    assert [each.kind for each in fit.primitives] == kinds
+    own = before.model.geom_type == mujoco.mjtGeom.mjGEOM_ELLIPSOID
+    rotation = Rotation.from_quat(before.model.geom_quat[own][0], scalar_first=True)
+    sphere = trimesh.creation.icosphere(subdivisions=4).vertices
+    points = rotation.apply(sphere * size) + before.model.geom_pos[own]
+    # It touches a polyhedron that is 1 % larger.
+    assert -0.012 * max(size) < outside(fit, points) <= 0
+    # A box around an ellipsoid has 1.91 times its volume.
+    assert 1 < fit.excess < 1.95
+
+
 def test_two_parts_of_a_mesh_collide_alike(tmp_path):
     # A trunk and a narrow head.
     head = trimesh.creation.box(bounds=[(0, 0, 0.6), (0.02, 0.03, 0.9)])

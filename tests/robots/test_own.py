@@ -283,10 +283,11 @@ def test_shapes_that_only_look_are_dropped_and_their_masses_stay(tmp_path):
         np.testing.assert_allclose(getattr(after.model, name)[1:], own, atol=1e-5)
     assert "mesh" not in (after.model_xml or "mesh")
     touching = text.replace(
-        'type="mesh" mesh="t" contype="0" conaffinity="0"',
-        'type="ellipsoid" size=".1 .1 .2"',
+        "<asset>", '<asset><hfield name="h" nrow="2" ncol="2" size=".2 .2 .1 .1"/>'
+    ).replace(
+        'type="mesh" mesh="t" contype="0" conaffinity="0"', 'type="hfield" hfield="h"'
     )
-    refused = r"link .trunk. has a collision shape.* of kind ellipsoid"
+    refused = r"link .trunk. has a collision shape.* of kind hfield"
     with pytest.raises(ValueError, match=refused):
         portable(read_folder(write_robot(tmp_path, model=touching)))
 
