@@ -197,9 +197,12 @@ class DodgeballGym(gymnasium.Env[np.ndarray, np.ndarray]):
         """Return observation, reward, terminated, truncated and info.
 
         Raises:
+            ResetNeeded: Before the first reset.
             ValueError: If the action has another shape, or a value that is NaN or
                 infinite.
         """
+        if self._env is None:
+            raise gymnasium.error.ResetNeeded("call reset before step")
         self._root["action"] = _checked(action, self._rows.action_space.shape)[None]
         step = self._env.step(self._root)
         self._root, after = self._env.step_mdp(step), step["next"]

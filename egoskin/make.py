@@ -144,8 +144,8 @@ def make_worker_env(
 
     Raises:
         ValueError: If the skin does not fit the robot, part of ``mask`` has no effect,
-            ``sparse`` is combined with a history or a mask of some links, or the engine
-            is not installed.
+            ``sparse`` is combined with a history or a mask of some links, a number is
+            out of bounds, or there is no such engine or device.
     """
     if sparse and config.history > 1:
         raise ValueError(
@@ -167,7 +167,7 @@ def make_worker_env(
         # Read only from the raw state.
         tactile=keep_raw,
         engine=engine_of(engine),
-        device=device,
+        device=device_of(str(device)),
     )
     transforms: list[Transform] = []
     if not bare:

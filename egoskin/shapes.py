@@ -37,6 +37,7 @@ from typing import Protocol, runtime_checkable
 import mujoco
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from egoskin.hints import did_you_mean
 from egoskin.rounding import exact_sqrt
@@ -481,13 +482,22 @@ def _slab_interval(half: float, p: Tensor, d: Tensor) -> Interval:
     # away in all other cases. It also makes the face belong to the slab.
     low, high, inverse = -half - p - _TINY, half - p + _TINY, 1.0 / d
     first, second = low * inverse, high * inverse
-    if first.requires_grad:
+    if first.requires_grad or is_dual(first):
         # The infinite ends of a parallel line are constant, not of gradient 0 * inf.
         parallel = d == 0
         inverse = 1.0 / d.masked_fill(parallel, 1.0)
         first = torch.where(parallel, first.detach(), low * inverse)
         second = torch.where(parallel, second.detach(), high * inverse)
     return first.minimum(second), first.maximum(second)
+
+
+def is_dual(x: Tensor) -> bool:
+    """Whether a tensor has a forward-mode derivative, or belongs to `torch.func`.
+
+    Neither is seen in its data.
+    """
+    wrapped = torch._C._functorch.is_functorch_wrapped_tensor(x)
+    return wrapped or forward_ad.unpack_dual(x).tangent is not None
 
 
 def _overlap(a: Interval, b: Interval) -> Interval:

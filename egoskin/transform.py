@@ -200,8 +200,8 @@ class StatefulTransform(_KeyedTransform):
     The state is a subset of the results. It is kept in the tensordict (in the
     observation *and* in the state spec, so that it is sent to workers and back), is
     never written in place, and is initialised again in rows that reset. Everything
-    continues bit for bit from a stored tensordict. Later transforms must not exclude a
-    state key.
+    continues bit for bit from a stored tensordict. Later transforms must neither drop
+    nor change a state key: give `ObservationNorm` out keys of its own.
 
     It works inside a worker, around a ParallelEnv, and when called on a stored
     TensorDict, see `forward`.
@@ -224,11 +224,14 @@ class StatefulTransform(_KeyedTransform):
         # Reference to the last state written. On a reset after a step, TorchRL only
         # passes which rows reset; this is the state at the end of their episodes.
         self._last: list[Tensor] | None = None
+        # Observation spec of the environment that was found to hold the state keys.
+        self._checked: TensorSpec | None = None
 
     def clone(self) -> Self:
         """Return a copy for another environment, where it starts at the beginning."""
         new = super().clone()
         new._last = None
+        new._checked = None
         return new
 
     @abstractmethod
@@ -277,6 +280,22 @@ class StatefulTransform(_KeyedTransform):
                 state_spec[key] = _on_device_of(state_spec, spec)
         return state_spec
 
+    def _check_kept(self) -> None:
+        """Raise ValueError if a later transform drops a state key.
+
+        TorchRL would give every step the state of the last reset.
+        """
+        env = self.container
+        if env is None or env.observation_spec is self._checked:
+            return
+        held = env.observation_spec.keys(True)
+        if dropped := [key for key in self.state_keys if key not in held]:
+            raise ValueError(
+                f"a transform after {type(self).__name__} drops {dropped}, which the "
+                f"next step reads back: keep its state_keys, {self.state_keys}"
+            )
+        self._checked = env.observation_spec
+
     def _state_of(self, values: Sequence[Tensor]) -> list[Tensor]:
         """Return the values of the state keys."""
         by_key = dict(zip(self.out_keys, values, strict=True))
@@ -296,6 +315,7 @@ class StatefulTransform(_KeyedTransform):
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
+        self._check_kept()
         total = tensordict_reset.batch_size.numel()
         inputs = self._read(tensordict_reset, self.in_keys)
         before = self._last
@@ -348,7 +368,7 @@ class StatefulTransform(_KeyedTransform):
         The entries under ``next`` are not changed.
 
         Raises:
-            ValueError: If there is no batch dimension.
+            ValueError: If there is no batch dimension, or no step.
             KeyError: If ``is_init`` and ``done`` are both missing, or an in key is.
         """
         batch = tensordict.batch_size
@@ -356,6 +376,10 @@ class StatefulTransform(_KeyedTransform):
             raise ValueError(
                 f"{type(self).__name__} needs steps in order: a tensordict whose last "
                 "batch dimension is time, got one without a batch"
+            )
+        if not batch[-1]:
+            raise ValueError(
+                f"{type(self).__name__} needs at least one step, got {list(batch)}"
             )
         inputs = [
             x.reshape(batch[:-1].numel(), batch[-1], *x.shape[1:])

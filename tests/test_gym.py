@@ -88,6 +88,14 @@ def test_an_action_that_is_not_finite_is_refused(value):
         env.close()
 
 
+@pytest.mark.parametrize("method", ["step", "render"])
+def test_what_needs_a_reset_says_so(method):
+    env = gymnasium.make(ENV_ID, render_mode="rgb_array").unwrapped
+    arguments = [np.zeros(21, dtype=np.float32)] if method == "step" else []
+    with pytest.raises(gymnasium.error.ResetNeeded, match=f"reset before {method}"):
+        getattr(env, method)(*arguments)
+
+
 def test_an_action_of_another_shape_is_refused():
     one, many = gymnasium.make(ENV_ID).unwrapped, make_vec(2, num_workers=1)
     wrong = {one: [(1,), (20,), (1, 21)], many: [(21, 2), (42,), (21,), (1, 21)]}

@@ -663,3 +663,15 @@ def test_the_actor_sees_nothing_that_it_may_not(random_state, signal):
         torch.testing.assert_close(seen_changed[key], seen[key], atol=1e-5, rtol=0)
     key = "privileged_observation"
     assert not torch.isclose(seen_changed[key], seen[key]).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"engine": "MuJoCo"}, "engine must be one of mujoco, warp, got 'MuJoCo'"),
+        ({"device": "cuda:99"}, "no device 'cuda:99'"),
+    ],
+)
+def test_an_unknown_engine_or_device_is_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        make_worker_env(EnvConfig(), num_envs=2, seed=0, **options)

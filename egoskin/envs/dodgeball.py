@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from egoskin.bounds import Interval, check_bounds
+from egoskin.bounds import COUNT, Interval, check_bounds
 from egoskin.envs.balls import Balls
 from egoskin.envs.physics import (
     DEFAULT_ENGINE,
@@ -26,7 +26,7 @@ from egoskin.envs.randomization import Randomization, RandomizationConfig
 from egoskin.envs.rewards import TERMS, RewardConfig, reward_terms
 from egoskin.envs.state import STATE, state_spec, state_table
 from egoskin.envs.throws import ThrowConfig, Thrower
-from egoskin.rng import Stream, uniform
+from egoskin.rng import Stream, stream_key, uniform
 from egoskin.robots.config import RobotConfig
 from egoskin.robots.kinematics import axis_vectors, rotate_inverse
 from egoskin.rounding import pad_rows
@@ -119,7 +119,8 @@ class DodgeballEnv(EnvBase):
         device: Device of the simulation and of all tensors.
 
     Raises:
-        ValueError: If the robot's base does not float, or a joint is not a hinge.
+        ValueError: If the robot's base does not float, or a joint is not a hinge, or a
+            number is out of bounds.
     """
 
     def __init__(
@@ -137,6 +138,15 @@ class DodgeballEnv(EnvBase):
         device: torch.device | str = "cpu",
     ) -> None:
         robot.check_floating_base()
+        stream_key(seed, Stream.START)
+        bounds = {
+            "num_envs": (num_envs, COUNT),
+            "num_threads": (num_threads, COUNT),
+            "row_offset": (row_offset, Interval(ge=0, le=2**32 - num_envs)),
+        }
+        for name, (number, interval) in bounds.items():
+            if wrong := interval.violation(number):
+                raise ValueError(f"{name} must {wrong}, got {number}")
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         device = self.device
         self.robot, self.config = robot, config

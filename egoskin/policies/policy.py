@@ -93,14 +93,20 @@ class PolicySpec:
         Args:
             sources: Sparse sources of the keys that its environment does not output.
         """
-        return Agent(
-            self.sizes,
-            self.env.actor_keys,
-            self.env.critic_keys,
-            self.num_actions,
-            self.network,
-            sources,
-        )
+        default = torch.get_default_dtype()
+        # The environments are float32 whatever the default of the user's program is.
+        torch.set_default_dtype(torch.float32)
+        try:
+            return Agent(
+                self.sizes,
+                self.env.actor_keys,
+                self.env.critic_keys,
+                self.num_actions,
+                self.network,
+                sources,
+            )
+        finally:
+            torch.set_default_dtype(default)
 
     def check_claims(self, tensors: Mapping[str, Tensor], what: str) -> None:
         """Raise ValueError unless tensors match an agent with these sizes.

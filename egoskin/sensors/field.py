@@ -37,7 +37,8 @@ class FieldSensor(ProximitySensor):
     A sensor with a half angle below 180 degrees sees an object if the object's
     closest point lies within that angle of the normal.
 
-    Finite readings are differentiable with respect to poses and joint positions.
+    Finite readings above 0 are differentiable with respect to poses and joint
+    positions, in reverse and forward mode (not under `torch.vmap`).
 
     Args:
         skin: The sensors. A coverage or range set in the skin takes precedence.

@@ -252,7 +252,8 @@ class ProximitySensor(RowTransform):
             sensors: Indices of the masked sensors, or ``[S]`` bool.
 
         Raises:
-            ValueError: If there are flags, but not one for each sensor.
+            ValueError: If there are flags, but not one for each sensor, or an index
+                of no sensor.
         """
         sensors = indices(sensors, self.num_sensors)
         self._range.copy_(self._skin_range)
@@ -430,9 +431,9 @@ class ProximitySensor(RowTransform):
 
         Raises:
             ValueError: If the number of objects or of joint positions is wrong, a pose
-                does not have seven numbers, the inputs are not all of one floating type
-                (active flags: bool), or ``out`` has a wrong shape, layout, dtype or
-                device.
+                does not have seven numbers, the inputs are not all float32 or all
+                float64 (active flags: bool), or ``out`` has a wrong shape, layout,
+                dtype or device.
         """
         self._check(inputs)
         batch, objects = inputs[3].shape
@@ -475,10 +476,10 @@ class ProximitySensor(RowTransform):
                     f"{key!r} holds {tensor.shape[1]}"
                 )
         types = [x.dtype for x in numbers]
-        if len({*types}) > 1 or not types[0].is_floating_point:
+        if len({*types}) > 1 or types[0] not in (torch.float32, torch.float64):
             raise ValueError(
-                f"{', '.join(map(repr, self.in_keys[:3]))} must have the same "
-                f"floating-point type, got {', '.join(map(str, types))}"
+                f"{', '.join(map(repr, self.in_keys[:3]))} must all be float32 or all "
+                f"float64, got {', '.join(map(str, types))}"
             )
         if active.dtype != torch.bool:
             raise ValueError(f"{self.in_keys[3]!r} must be bool, got {active.dtype}")

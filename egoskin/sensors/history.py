@@ -17,7 +17,8 @@ class History(StatefulTransform):
     """The latest values of some entries, concatenated, oldest first.
 
     Reads any entries ``[*B, ..., F]`` and writes ``[*B, ..., length F]`` for each. At
-    the start of an episode the history is filled with the first value.
+    the start of an episode the history is filled with the first value. The next step
+    reads the histories back: later transforms must neither drop nor change them.
 
     Args:
         length: Number of values, including the current one.
@@ -87,7 +88,8 @@ class KeepLast(StatefulTransform):
 
     Reads ``signal [*B, F]`` (for example from `Localization`) and any number of
     ``object_detected [*B, O]`` (a detection in any of them counts); writes
-    ``last_signal [*B, F]``, zero until the first detection of the episode.
+    ``last_signal [*B, F]``, zero until the first detection of the episode. The next
+    step reads it back: later transforms must neither drop nor change it.
 
     Args:
         in_keys: Keys of the signal and of the detections (one or more).

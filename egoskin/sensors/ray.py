@@ -24,7 +24,7 @@ from egoskin.sensors.kernels.binding import VECTOR
 from egoskin.sensors.signals import Binary, Proximity
 from egoskin.sensors.skin.coverage import Ray
 from egoskin.sensors.skin.skin import Skin
-from egoskin.shapes import Solid, first_hit
+from egoskin.shapes import Solid, first_hit, is_dual
 from egoskin.sparse import SparseRows
 
 # Margin for rounding when pairs of sensor and object are culled [m].
@@ -46,7 +46,8 @@ class RaySensor(ProximitySensor):
     Only pairs of sensor and object for which the object's bounding sphere reaches into
     the field of view are computed (a few per cent); the result is the same.
 
-    Finite readings are differentiable with respect to poses and joint positions.
+    Finite readings above 0 are differentiable with respect to poses and joint
+    positions, in reverse and forward mode (not under `torch.vmap`).
 
     Args:
         skin: The sensors. A coverage or range set in the skin takes precedence; all
@@ -349,7 +350,9 @@ def _padded(directions: np.ndarray) -> np.ndarray:
 
 def _numpy_serves(x: Tensor) -> bool:
     """Whether NumPy may operate on a tensor's memory."""
-    return x.is_cpu and not x.requires_grad and not torch.compiler.is_compiling()
+    if torch.compiler.is_compiling():
+        return False
+    return x.is_cpu and not x.requires_grad and not is_dual(x)
 
 
 def _nonzero(x: Tensor) -> Tensor:
@@ -368,7 +371,7 @@ def _items(x: Tensor) -> np.ndarray:
 
 def _put(grid: Tensor, rows: Tensor, values: Tensor) -> None:
     """Write some rows of a grid."""
-    if _numpy_serves(grid) and not values.requires_grad:
+    if _numpy_serves(grid) and _numpy_serves(values):
         # Rows are short. NumPy copies each as one item; PyTorch copies number by
         # number, which takes twice as long.
         _items(grid)[rows.numpy()] = _items(values.contiguous())

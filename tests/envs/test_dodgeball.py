@@ -778,3 +778,18 @@ def test_position_targets_of_an_action_by_hand(scale):
     joint = H1_2.joints.index("left_ankle_roll_joint")
     # Ankle roll, gain set "real": 40 N m at 40 N m/rad; not clipped to its +-0.26 rad.
     assert env.physics._ctrl[0, joint] == pytest.approx(0.5 * scale * 40 / 40, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"num_envs": 0}, "num_envs must be at least 1, got 0"),
+        ({"num_threads": 0}, "num_threads must be at least 1, got 0"),
+        ({"row_offset": -1}, "row_offset must not be negative, got -1"),
+        ({"row_offset": 2**32 - 1}, "row_offset must be at most 4,294,967,294"),
+        ({"seed": -1}, r"seed must be in \[0, 2\*\*32\), got -1"),
+    ],
+)
+def test_numbers_out_of_bounds_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        make(**{"num_envs": 2, **options})

@@ -395,3 +395,14 @@ def test_a_shipped_policy_loses_little_at_480_hz(name):
         for c in (config, finer)
     ]
     assert success[0] - success[1] <= 0.05
+
+
+def test_a_policy_loads_whatever_the_default_type_is(policy):
+    try:
+        torch.set_default_dtype(torch.float64)
+        loaded = egoskin.load_policy("field_proximity")
+        assert torch.get_default_dtype() == torch.float64
+    finally:
+        torch.set_default_dtype(torch.float32)
+    td = given(5)
+    assert torch.equal(loaded(td.clone())["action"], policy(td.clone())["action"])

@@ -8,6 +8,7 @@ from functools import partial
 import pytest
 import torch
 from tensordict import TensorDict
+from torch.autograd import forward_ad
 
 from egoskin.robots.builtin import H1_2
 from egoskin.robots.kinematics import rotate
@@ -104,6 +105,37 @@ def test_gradients_are_those_of_finite_differences(skin, random_state, kind, sha
     assert all(x.grad is not None and x.grad.isfinite().all() for x in poses)
 
 
+# Of PyTorch, at the first dual tensor.
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script")
+@pytest.mark.parametrize("compile", [False, True])
+@pytest.mark.parametrize("shape", SHAPES)
+@every_kind
+def test_forward_derivatives_are_those_of_finite_differences(
+    skin, random_state, kind, shape, compile
+):
+    state = random_state(6, seed=1, objects=1)
+    state["object_active"][:] = True
+    sensor = kind(skin.select(range(0, 64, 4)), H1_2.chain, shape, 0.9, compile=compile)
+    inputs = [state[key] for key in KEYS]
+    change = torch.randn_like(inputs[1])
+
+    def at(joint_pos):
+        return sensor.compute(inputs[0], joint_pos, *inputs[2:])[0]
+
+    with forward_ad.dual_level():
+        dual = forward_ad.make_dual(inputs[1], change)
+        primal, tangent = forward_ad.unpack_dual(at(dual))
+    ends = [at(inputs[1] + sign * 1e-3 * change) for sign in (1, -1)]
+    smooth = (ends[0] > 0) & (ends[1] > 0) & ends[0].isfinite() & ends[1].isfinite()
+    assert smooth.sum() > 10
+    assert torch.equal(primal, at(inputs[1]))
+    expected = (ends[0] - ends[1])[smooth] / 2e-3
+    # A few readings change the face that they see.
+    error = (tangent[smooth] - expected).abs()
+    assert error.quantile(0.9) < 2e-3
+    assert expected.abs().quantile(0.5) > 0.01
+
+
 @every_kind
 def test_a_sensor_used_in_inference_mode_has_gradients_later(skin, random_state, kind):
     sensor = kind(skin, H1_2.chain, Sphere(radius=0.15), 5.0, compile=False)
@@ -121,8 +153,9 @@ def test_a_sensor_used_in_inference_mode_has_gradients_later(skin, random_state,
 @pytest.mark.parametrize(
     ("key", "change", "message"),
     [
-        ("joint_pos", torch.Tensor.double, "floating-point type, got torch.float32, t"),
-        ("joint_pos", torch.Tensor.int, "the same floating-point type"),
+        ("joint_pos", torch.Tensor.double, "float64, got torch.float32, t"),
+        ("joint_pos", torch.Tensor.half, "must all be float32 or all float64"),
+        ("joint_pos", torch.Tensor.int, "must all be float32 or all float64"),
         ("object_active", torch.Tensor.float, "'object_active' must be bool"),
         ("object_active", lambda x: x[:, :1], "2 objects, but 'object_active' holds 1"),
         ("object_pose", lambda x: x[:, :1], "2 objects, but 'object_pose' holds 1"),

@@ -10,6 +10,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tensordict import TensorDict
 
 from egoskin.evaluation.throw_set import play_throws
 from egoskin.make import EnvConfig, make_env, make_worker_env
@@ -24,6 +25,8 @@ from egoskin.sensors import (
     place_sensors,
 )
 from egoskin.sensors.config import SensorConfig
+from egoskin.sensors.imperfections.corruption import Corruption
+from egoskin.sensors.imperfections.models import Noise
 from egoskin.sensors.kernels.compilation import SETTING, can_compile
 from egoskin.shapes import Box, Sphere
 from sensing import SEED, assert_same_bits, measure
@@ -400,3 +403,25 @@ def test_a_link_without_sensors_in_this_skin_is_refused():
     skin, _ = without(SKIN, SENSING.masked(("torso_link",)))
     with pytest.raises(ValueError, match="no sensor on 'torso_link'"):
         EnvConfig().pipeline(skin).check_mask(("torso_link",))
+
+
+@pytest.mark.parametrize(
+    ("mask", "message"),
+    [([3, 99], "no sensor 99: there are 24"), ([True, False], "flags of sensors")],
+)
+def test_a_mask_that_does_not_fit_is_refused_and_changes_nothing(mask, message):
+    sensor = FieldSensor(SKIN, H1_2.chain, Sphere(radius=0.15), 2.0)
+    sensor.mask([1])
+    before = sensor._range.clone()
+    with pytest.raises(ValueError, match=message):
+        sensor.mask(mask)
+    assert torch.equal(sensor._range, before)
+    corruption = Corruption([Noise(constant=0.1)], dt=0.02, seed=0)
+    corruption.mask(mask)
+    stored = TensorDict(
+        distance=torch.ones(2, 3, 24),
+        is_init=torch.zeros(2, 3, 1, dtype=torch.bool),
+        batch_size=[2, 3],
+    )
+    with pytest.raises(ValueError, match=message):
+        corruption(stored)

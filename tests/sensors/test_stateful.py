@@ -12,8 +12,8 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import (
     EnvBase,
-    ExcludeTransform,
     ParallelEnv,
+    SelectTransform,
     SerialEnv,
     TransformedEnv,
 )
@@ -320,15 +320,6 @@ def test_stored_data_must_say_where_episodes_start(build):
 
 
 @every_transform
-def test_a_missing_state_is_named(build):
-    env = make(build, 3)
-    key = build().state_keys[0]
-    env = env.append_transform(ExcludeTransform(key))
-    with pytest.raises(KeyError, match=f"reads '{key}', which the tensordict lacks"):
-        run(env, steps=1)
-
-
-@every_transform
 def test_nested_keys_and_float64_change_no_value(build):
     plain = build()
     data = make(build, 5).rollout(STEPS, break_when_any_done=False)
@@ -427,5 +418,25 @@ def test_stored_data_may_have_no_rows():
         "is_init": torch.zeros(0, 6, 1, dtype=torch.bool),
     }
     stored = TensorDict(data, batch_size=[0, 6])
-    read = Corruption(EVERYTHING[:1], dt=0.02, seed=0)(stored)
+    read = Corruption(EVERYTHING[:2], dt=0.02, seed=0)(stored)
     assert read["reading"].shape == (0, 6, SENSORS)
+
+
+@every_transform
+def test_a_later_transform_that_drops_the_state_is_refused(build):
+    env = make(build, 3)
+    env.rollout(3)
+    kept = env.transform.state_keys
+    env.append_transform(SelectTransform("joint_vel", *kept[1:]))
+    with pytest.raises(ValueError, match=rf"drops \['{kept[0]}'\], which the next"):
+        env.rollout(3)
+    env = make(build, 3)
+    env.append_transform(SelectTransform("joint_vel", *kept))
+    env.rollout(3)
+
+
+@every_transform
+def test_stored_data_without_steps_is_refused(build):
+    td = make(build, 3).rollout(3, break_when_any_done=False)
+    with pytest.raises(ValueError, match=r"at least one step, got \[3, 0\]"):
+        build()(td[:, :0])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 from egoskin.envs.physics.contract import (
     OBJECT_MASS,
@@ -25,8 +25,12 @@ def engine_of(name: Engine) -> type[Physics]:
     """Return the class of an engine.
 
     Raises:
-        ValueError: If its package is not installed.
+        ValueError: If there is no such engine, or its package is not installed.
     """
+    if name not in get_args(Engine):
+        raise ValueError(
+            f"engine must be one of {', '.join(get_args(Engine))}, got {name!r}"
+        )
     if name == "mujoco":
         return MujocoPhysics
     try:

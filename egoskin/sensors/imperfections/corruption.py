@@ -381,6 +381,8 @@ class Corruption(StatefulTransform):
         ]
         super().__init__(in_keys or needed, [out, *state_keys], state_keys)
         self.register_buffer("_masked", torch.empty(0, dtype=torch.int64), False)
+        # The mask as given, until its length is checked.
+        self._mask: Indices | None = None
 
     def restart(self, seed: int | None = None) -> None:
         """Start again at episode 0, from the next reset of all rows.
@@ -403,11 +405,13 @@ class Corruption(StatefulTransform):
         Without it, sensors that measure nothing still have false positives.
 
         Args:
-            sensors: Indices of the masked sensors, or ``[S]`` bool.
+            sensors: Indices of the masked sensors, or ``[S]`` bool. Whether they fit
+                the number of sensors is checked at the next reading (ValueError).
         """
         self._masked = torch.tensor(
             indices(sensors), dtype=torch.int64, device=self._masked.device
         )
+        self._mask = sensors
 
     def _moment(self, rows: Tensor, clock: Tensor, joint_vel: list[Tensor]) -> Moment:
         """Return the moment of some rows, from their clocks ``[B, 2]``."""
@@ -445,6 +449,9 @@ class Corruption(StatefulTransform):
             before,
             self._moment(rows, clock, joint_vel),
         )
+        if self._mask is not None:
+            indices(self._mask, distance.shape[1])
+            self._mask = None
         if len(self._masked):
             # Specs are made of a dummy reading on the CPU.
             masked = self._masked.to(reading.device)

@@ -131,9 +131,9 @@ class Drift(_Spread, FrameModel):
                 torch.arange(calls, device=reading.device).repeat(rows),
             )
         ).to(torch.int32)
-        half = half.reshape(rows, -1)[:, : -(-sensors // 16), None]
+        half = half.reshape(rows, 8 * calls)[:, : -(-sensors // 16), None]
         coin = (half >> torch.arange(16, dtype=half.dtype, device=half.device)) & 1
-        coin = coin.reshape(rows, -1)[:, :sensors].to(reading.dtype)
+        coin = coin.flatten(1)[:, :sensors].to(reading.dtype)
         walk = state["walk"] + math.sqrt(moment.dt) * (2 * coin - 1)
         distance, places = find(reading)
         drift = self.std(distance) * walk.take(

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from egoskin.robots.kinematics import LinkKinematics
 from egoskin.sensors.kernels.compilation import load_library
-from egoskin.shapes import Sphere
+from egoskin.shapes import Sphere, is_dual
 
 if TYPE_CHECKING:
     from egoskin.sensors.kernels.warp import WarpKernels
@@ -118,13 +118,15 @@ class Kernels:
         self._warp.clear()
 
     def can(self, *inputs: Tensor) -> bool:
-        """Whether the kernels support these inputs: float32, without gradients.
+        """Whether the kernels support these inputs: float32, without derivatives.
 
         Always False under ``torch.compile``.
         """
         if torch.compiler.is_compiling():
             return False
         if torch.is_grad_enabled() and any(x.requires_grad for x in inputs):
+            return False
+        if any(is_dual(x) for x in inputs):
             return False
         if any(x.dtype != torch.float32 for x in inputs):
             return False

@@ -57,7 +57,8 @@ def indices(sensors: Indices, number: int | None = None) -> list[int]:
         number: Number of sensors ``S``, if known.
 
     Raises:
-        ValueError: If there are flags, but not one for each sensor.
+        ValueError: If there are flags, but not one for each sensor, or an index of no
+            sensor.
     """
     array = np.asarray(sensors)
     if array.dtype == bool:
@@ -66,7 +67,11 @@ def indices(sensors: Indices, number: int | None = None) -> list[int]:
                 f"flags of sensors must be ({number},), one for each, got {array.shape}"
             )
         array = np.flatnonzero(array)
-    return [operator.index(i) for i in array.tolist()]
+    result = [operator.index(i) for i in array.tolist()]
+    for index in result:
+        if number is not None and not -number <= index < number:
+            raise ValueError(f"no sensor {index}: there are {number}")
+    return result
 
 
 def _is_vector(value: object) -> bool:
@@ -345,8 +350,8 @@ class Skin:
             index: Indices of the sensors, or ``[S]`` bool.
 
         Raises:
-            ValueError: If there are flags, but not one for each sensor, or none is
-                chosen.
+            ValueError: If there are flags, but not one for each sensor, an index of no
+                sensor, or none is chosen.
         """
         index = indices(index, len(self))
         arrays = ("position", "normal", "range", "roll_deg", "radius")

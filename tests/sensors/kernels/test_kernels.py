@@ -125,7 +125,7 @@ def test_hits_of_wrong_inputs_are_refused(skin, random_state):
     for i, wrong in enumerate((inputs[0][:, :6], inputs[1][:, :3], inputs[2][:2])):
         with pytest.raises(ValueError, match=r"must|rows"):
             fast.hits(*inputs[:i], wrong, *inputs[i + 1 :])
-    with pytest.raises(ValueError, match="must have the same floating-point type"):
+    with pytest.raises(ValueError, match="must all be float32 or all float64"):
         fast.hits(inputs[0].double(), *inputs[1:])
 
 
