@@ -675,3 +675,13 @@ def test_the_actor_sees_nothing_that_it_may_not(random_state, signal):
 def test_an_unknown_engine_or_device_is_refused(options, message):
     with pytest.raises(ValueError, match=message):
         make_worker_env(EnvConfig(), num_envs=2, seed=0, **options)
+
+
+@pytest.mark.parametrize(
+    ("flight", "gravity"), [("straight", 0.0), ("ballistic", GRAVITY)]
+)
+def test_the_critic_knows_how_balls_fly(flight, gravity):
+    task = replace(TASK, throws=replace(TASK.throws, flight=flight))
+    env = make_worker_env(EnvConfig(task=task), SKIN, num_envs=2, seed=0)
+    (privileged,) = (t for t in env.transform if isinstance(t, Privileged))
+    assert privileged._gravity == gravity

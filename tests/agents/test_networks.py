@@ -117,6 +117,17 @@ def test_signals_weigh_as_much_however_many_they_are(size: int):
     assert len(signal.unique()) == size + 1
 
 
+def test_a_rare_detection_among_many_beams_is_not_clipped():
+    norm = SignalNorm(4096)
+    signal = torch.ones(2_000, 1)
+    signal[0] = 0.2
+    norm.update(signal)
+    std = signal.double().std(correction=0)
+    expected = (0.2 - signal.double().mean()) / std * (64 / 4096) ** 0.5
+    assert expected < -5
+    assert float(norm(signal)[0]) == pytest.approx(float(expected), rel=1e-3)
+
+
 def test_the_actor_does_not_see_what_only_the_critic_observes():
     agent, batch = make_agent(), make_batch()
     changed = batch.clone()

@@ -18,6 +18,7 @@ from egoskin.make import EnvConfig
 from egoskin.rng import held_out
 from egoskin.robots.builtin import H1_2
 from egoskin.robots.own import find_robot
+from egoskin.sensors import MASK_ALL
 from egoskin.sensors.config import SensorConfig
 from owning import MODEL, write_robot
 from throwing import AT_ONCE
@@ -383,6 +384,10 @@ def test_watching_changes_no_figure():
     which = {"throw_set": 3, "episodes": 16}
     result, behaviour = behave(Module(), config, skin, **which)
     assert result == evaluate(Module(), config, skin, **which)
+    masked = {**which, "mask": MASK_ALL}
+    blind, _ = behave(Module(), config, skin, **masked)
+    assert blind == evaluate(Module(), config, skin, **masked)
+    assert blind != result
     first = [g for g in behaviour.throws["direction"] if g.first_hits is not None]
     assert first
     assert behaviour.motion.power > behaviour.motion_zero_action.power > 0

@@ -154,6 +154,21 @@ def test_an_operating_map_is_the_success_on_each_throw(monkeypatch):
     assert alone.points[0].success.mean > alone.points[1].success.mean
 
 
+def test_the_mask_reaches_what_is_played(monkeypatch):
+    masks = []
+
+    def play(*args, mask, **kwargs):
+        masks.append(mask)
+        return play_throws(*args, mask=mask, **kwargs)
+
+    monkeypatch.setattr(maps, "play_throws", play)
+    monkeypatch.setattr(maps, "_MAPS", ((maps._speed((4.0, 9.0)),),))
+    options = {"throw_set": 5, "episodes": 4}
+    operating_map(None, CONFIG, SKIN, **options, mask=("torso_link",))
+    operating_map(None, CONFIG, SKIN, **options)
+    assert masks == [("torso_link",)] * 2 + [()] * 2
+
+
 @pytest.mark.parametrize("suffix", [".png", ".svg", ".pdf"])
 def test_a_map_is_drawn_with_its_numbers(suffix, tmp_path):
     pytest.importorskip("matplotlib")

@@ -82,6 +82,13 @@ def test_pairs_are_those_of_the_seeds_that_all_cells_have():
     )
 
 
+def test_a_single_seed_is_compared_with_the_same_seed():
+    table = {"a": {0: 90.0}, "b": {0: 10.0, 1: 20.0}}
+    effect = contrast(DIFFERENCE, table)
+    assert effect is not None
+    assert (effect.mean, effect.seeds) == (80.0, 1)
+
+
 def test_cells_that_share_no_seeds_are_compared_by_welch():
     apart = {"a": TABLE["a"], "b": {k + 10: v for k, v in TABLE["b"].items()}}
     effect = contrast(DIFFERENCE, apart)
