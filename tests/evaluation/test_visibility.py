@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -338,6 +339,51 @@ def test_cells_differ_by_more_than_a_control_step_or_not():
     torch.testing.assert_close(
         analysis.warning.float(), torch.tensor([[0.03, 0.03], [0.014, 0.012]])
     )
+
+
+def test_warnings_are_grouped_by_hand():
+    # From the front, the left, behind and the right, and a throw that misses; seen by
+    # 1, 2, 3 and 2 sensors.
+    seen = torch.zeros(1, 5, 20, dtype=torch.int16)
+    for throw, (first, count) in enumerate([(5, 1), (7, 2), (9, 3), (11, 2), (0, 5)]):
+        seen[0, throw, first:15] = count
+    # The third point of the surface cannot be reached along its normal.
+    surface = torch.zeros(1, 3, 20, dtype=torch.int16)
+    surface[0, 0, 10:] = 1
+    everywhere = direction_grid()[0].size
+    analysis = Analysis(
+        cells=(Cell(coverage="a", range=1.0),),
+        directions=hand_made(torch.ones(1, everywhere, 3).tolist(), [2] * everywhere),
+        surface=hand_made(surface.tolist(), [19, 19, 3]),
+        surface_link=("arm", "leg", "leg"),
+        throws=hand_made(seen.tolist(), [15, 15, 15, 15, 20]),
+        throw_azimuth=torch.tensor([0.0, 0.5, 1.0, -0.5, 0.0]) * math.pi,
+        contact_height=torch.tensor([0.5, 1.3, 1.5, 1.7, 0.1]),
+        control_period=1 / 60,
+    )
+    (cell,) = analysis.report()["cells"]
+
+    def times(group: dict[str, Any]) -> list[float]:
+        assert group["seen"] == 1.0
+        return [group["hits"], *(1e3 * group[key] for key in ("5%", "median", "95%"))]
+
+    # Steps of 2 ms; levels are interpolated between 8, 12, 16 and 20 ms.
+    assert times(cell["warning"]) == pytest.approx([4, 8.6, 14.0, 19.4])
+    assert {k: times(v) for k, v in cell["warning_by_azimuth"].items()} == {
+        "front": pytest.approx([1, 20, 20, 20]),
+        "left": pytest.approx([1, 16, 16, 16]),
+        "back": pytest.approx([1, 12, 12, 12]),
+        "right": pytest.approx([1, 8, 8, 8]),
+    }
+    by_height = cell["warning_by_height"]
+    assert times(by_height["0-0.8"]) == pytest.approx([1, 20, 20, 20])
+    assert by_height["0.8-1.2"] == {"hits": 0}
+    assert times(by_height["1.2-1.6"]) == pytest.approx([2, 12.2, 14, 15.8])
+    assert times(by_height["1.6-inf"]) == pytest.approx([1, 8, 8, 8])
+    # 10 + 8 + 6 + 4 steps with a detection.
+    assert cell["sensors_at_once"] == {"median": 2.0, "one": 10 / 28}
+    assert cell["surface_blind"] == 0.5
+    assert cell["surface_blind_by_link"] == {"arm": 0.0, "leg": 1.0}
 
 
 # --- invariances on the H1-2 ----------------------------------------------------
