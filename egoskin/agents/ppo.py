@@ -175,7 +175,7 @@ class PPO:
             functional=False,
         )
         self.loss.set_keys(sample_log_prob="action_log_prob")
-        self._weights = [*_weights(agent.actor), *_weights(agent.critic)]
+        self._weights = [*agent.actor.parameters(), *agent.critic.parameters()]
         self._actor, self._critic = _as_vector(agent.actor), _as_vector(agent.critic)
         self.optimizer = torch.optim.Adam(
             [self._actor, self._critic], lr=config.learning_rate, eps=1e-5, fused=True
@@ -395,11 +395,6 @@ def gaussian_kl(loc0: Tensor, scale0: Tensor, loc1: Tensor, scale1: Tensor) -> T
     return ((scale1 / scale0).log() + ratio - 0.5).sum(-1)
 
 
-def _weights(network: nn.Module) -> list[nn.Parameter]:
-    """Return the trainable parameters of a network."""
-    return [p for p in network.parameters() if p.requires_grad]
-
-
 def _as_vector(network: nn.Module) -> nn.Parameter:
     """Return the trainable parameters of a network as one vector.
 
@@ -407,7 +402,7 @@ def _as_vector(network: nn.Module) -> nn.Parameter:
     instead of one per layer, each of which wakes its threads; this saves a twelfth of
     the time of an update.
     """
-    weights = _weights(network)
+    weights = list(network.parameters())
     vector = nn.Parameter(nn.utils.parameters_to_vector(weights).detach())
     nn.utils.vector_to_parameters(vector.detach(), weights)
     vector.grad = torch.zeros_like(vector)

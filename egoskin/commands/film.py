@@ -127,9 +127,8 @@ def main(args: list[str]) -> None:
         skin = env_config.skin.build(env_config.robot_config)
     else:
         policy = load_policy(config.policy)
-        env_config, skin = policy.env_config, policy.skin
-    if config.policy is not None:
-        env_config = standard_task(env_config, config.standard)
+        env_config = standard_task(policy.env_config, config.standard)
+        skin = policy.skin
     hz = env_config.task.physics.control_hz
     fps = min(_FPS, hz) if config.fps is None else config.fps
     check_film(hz, fps, config.seconds)

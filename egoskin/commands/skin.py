@@ -40,10 +40,8 @@ from egoskin.viewer.offscreen import CameraConfig, Painter
 _MANY = 10_000
 # Sensors farther than this from the robot's surface cause a warning [m].
 _FAR_OFF = 0.15
-# Picture: size of each of its two views [px]; length and radius of normals [m].
+# Size of each of the two views of the picture [px].
 _VIEW_SIZE = (640, 960)
-_NORMAL_LENGTH, _NORMAL_RADIUS = 0.08, 0.003
-_NORMAL_RGBA = (0.1, 0.95, 1.0, 1.0)
 
 
 def _pairs(values: Sequence[str], option: str) -> dict[str, str]:
@@ -281,7 +279,7 @@ def views(robot: RobotConfig, skin: Skin) -> np.ndarray:
         painter = Painter(robot, skin, (), size=_VIEW_SIZE, camera=camera)
         with painter:
             painter.draw(state, time=0.0)
-            painter.draw_normals(_NORMAL_LENGTH, _NORMAL_RADIUS, _NORMAL_RGBA)
+            painter.draw_normals()
             images.append(painter.image())
     return np.concatenate(images, axis=1)
 

@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase
 from egoskin.bounds import COUNT, Interval, check_bounds
 from egoskin.envs.balls import Balls
 from egoskin.envs.physics import (
-    DEFAULT_ENGINE,
+    MujocoPhysics,
     Physics,
     PhysicsConfig,
     PhysicsState,
@@ -134,7 +134,7 @@ class DodgeballEnv(EnvBase):
         num_threads: int = 1,
         hold: bool = False,
         tactile: bool = True,
-        engine: type[Physics] = DEFAULT_ENGINE,
+        engine: type[Physics] = MujocoPhysics,
         device: torch.device | str = "cpu",
     ) -> None:
         robot.check_floating_base()
@@ -243,7 +243,7 @@ class DodgeballEnv(EnvBase):
         out = self._state_td(self.physics.read())
         for key in self.state_rows:
             if key.of_step:
-                out[key.name] = key.zeros(self.batch_size[0], self._sizes, self.device)
+                out[key.name] = self.observation_spec[key.name].zero()
         for key in self.done_keys:
             out[key] = torch.zeros_like(mask).reshape(-1, 1)
         return out

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from torch import Tensor
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 
 Reader = Literal["sensors", "observations", "trainer", "evaluation"]
@@ -45,24 +44,14 @@ class StateKey:
         """Whether it is read only inside the worker."""
         return not set(_PARENT) & set(self.read_by)
 
-    def zeros(
-        self, num_envs: int, sizes: Mapping[str, int], device: torch.device
-    ) -> Tensor:
-        """Return zeros, ``[B, ...]``."""
-        shape = self._shape(num_envs, sizes)
-        return torch.zeros(shape, dtype=self.dtype, device=device)
-
     def spec(
         self, num_envs: int, sizes: Mapping[str, int], device: torch.device
     ) -> TensorSpec:
         """Return the spec, ``[B, ...]``."""
         kind = Binary if self.dtype == torch.bool else Unbounded
-        shape = self._shape(num_envs, sizes)
-        return kind(shape=shape, dtype=self.dtype, device=device)
-
-    def _shape(self, num_envs: int, sizes: Mapping[str, int]) -> torch.Size:
         own = (sizes[n] if isinstance(n, str) else n for n in self.shape)
-        return torch.Size((num_envs, *own))
+        shape = torch.Size((num_envs, *own))
+        return kind(shape=shape, dtype=self.dtype, device=device)
 
 
 def _event(

@@ -9,7 +9,6 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from types import TracebackType
 
 from egoskin.progress import note
 
@@ -39,8 +38,7 @@ class FilmMaker:
     def __exit__(
         self,
         kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
+        *_: object,
     ) -> None:
         """Finish the last film if training ended normally; otherwise stop it."""
         if kind is not None:

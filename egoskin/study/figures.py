@@ -295,7 +295,7 @@ def learning_curves(manifest: Manifest, results: Sequence[Result]) -> Figure | N
                 shown[cell.name] = colour
         for name, colour in shown.items():
             if name in by_cell:
-                label = _legend(name, grid)
+                label = grid[name].signal if name in grid else name
                 _draw_curves(axes, by_cell[name], colour, label)
         axes.set_title(title, fontsize=10)
         axes.set_ylim(0, 100)
@@ -308,10 +308,6 @@ def learning_curves(manifest: Manifest, results: Sequence[Result]) -> Figure | N
     figure.supxlabel("environment steps [millions]", fontsize=10)
     figure.supylabel("success at 3 s in training [%]", fontsize=10)
     return figure
-
-
-def _legend(name: str, grid: Mapping[str, Place]) -> str:
-    return grid[name].signal if name in grid else name
 
 
 @mpl.rc_context({"path.simplify_threshold": _SIMPLIFY})

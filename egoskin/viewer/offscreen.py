@@ -38,6 +38,8 @@ _RAY_LINE_RGB = (1.0, 0.8, 0.0)
 _BALL_RGBA = (0.95, 0.35, 0.08, 1.0)
 # Drawn radii [m]: an idle sensor, a detecting sensor, a line.
 _IDLE_RADIUS, _LIT_RADIUS, _LINE_RADIUS = 0.017, 0.03, 0.006
+_NORMAL_LENGTH, _NORMAL_RADIUS = 0.08, 0.003
+_NORMAL_RGBA = (0.1, 0.95, 1.0, 1.0)
 # Opacity of lines falls linearly with length, to 0 at this [m], but not below this.
 _FADE_LENGTH, _FAINTEST = 2.5, 0.25
 # The camera's look-at point follows the base with this time constant [s]; its height,
@@ -212,35 +214,22 @@ class Painter:
             ending=ending,
         )
 
-    def draw_line(
+    def _draw_line(
         self, start: np.ndarray, end: np.ndarray, radius: float, rgba: Sequence[float]
     ) -> None:
-        """Add a line to the state drawn last; the next `draw` removes it.
-
-        Args:
-            start: One end in the world [m], ``[3]``.
-            end: The other.
-            radius: Radius of the line [m].
-            rgba: Colour and opacity.
-        """
+        """Add a line between two points of the world to the state drawn last."""
         kind = mujoco.mjtGeom.mjGEOM_CAPSULE
         geom = self._add(kind, rgba, glows=True)
         mujoco.mjv_connector(geom, kind, radius, start, end)
 
-    def draw_normals(self, length: float, radius: float, rgba: Sequence[float]) -> None:
-        """Add the sensors' normals to the state drawn last, as `draw_line` does.
-
-        Args:
-            length: Length of the lines [m].
-            radius: Radius of the lines [m].
-            rgba: Colour and opacity.
-        """
+    def draw_normals(self) -> None:
+        """Add the sensors' normals to the state drawn last, until the next `draw`."""
         if self._skin is None:
             return
         starts = self._in_world(self._skin.position)
-        ends = self._in_world(self._skin.position + length * self._skin.normal)
+        ends = self._in_world(self._skin.position + _NORMAL_LENGTH * self._skin.normal)
         for start, end in zip(starts, ends, strict=True):
-            self.draw_line(start, end, radius, rgba)
+            self._draw_line(start, end, _NORMAL_RADIUS, _NORMAL_RGBA)
 
     def image(self) -> np.ndarray:
         """Return the picture of the state drawn last, ``[H, W, 3]`` uint8."""
@@ -307,7 +296,7 @@ class Painter:
         for i, point in enumerate(points):
             fade = max(1 - length[nearest[i], i] / _FADE_LENGTH, _FAINTEST)
             end, rgba = ends[nearest[i], i], (*colours[i], fade)
-            self.draw_line(point, end, _LINE_RADIUS, rgba)
+            self._draw_line(point, end, _LINE_RADIUS, rgba)
 
     def _in_world(self, points: np.ndarray) -> np.ndarray:
         """Return one point of each sensor's link in the world [m], ``[S, 3]``."""

@@ -294,7 +294,7 @@ def test_an_evaluation_tells_what_a_policy_bears(
 
 
 def test_the_workers_of_an_evaluation_are_those_of_all_its_parts(
-    trained: Path, tmp_path: Path, monkeypatch
+    trained: Path, monkeypatch
 ):
     used = []
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
-from egoskin.envs.physics import DEFAULT_ENGINE, PhysicsConfig
+from egoskin.envs.physics import MujocoPhysics, PhysicsConfig
 from egoskin.envs.randomization import RandomizationConfig
 from egoskin.envs.throws import ThrowConfig
 from egoskin.robots.builtin import H1_2
@@ -60,7 +60,7 @@ def test_an_engine_of_a_loop_over_single_simulations_gives_the_same_bits(
     kwargs = {"num_envs": 8, "seed": 1, "row_offset": 3, "hold": hold}
     fast, simple = (
         DodgeballEnv(H1_2, config, engine=engine, **kwargs)
-        for engine in (DEFAULT_ENGINE, SimplePhysics)
+        for engine in (MujocoPhysics, SimplePhysics)
     )
     # Half of the robots are driven to the ground, the others flail.
     down = torch.tensor(["hip_pitch" in name for name in H1_2.joints]).float()

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
-from egoskin.envs.physics import DEFAULT_ENGINE, PhysicsConfig, Scene
+from egoskin.envs.physics import MujocoPhysics, PhysicsConfig, Scene
 from egoskin.envs.throws import Release, ThrowConfig, Thrower
 from egoskin.rng import Stream, uniform
 from egoskin.robots.builtin import H1_2
@@ -68,7 +68,7 @@ def fly(release: Release, config: ThrowConfig, steps: int = 240) -> torch.Tensor
         hold=True,
     )
     n = len(release.position)
-    physics, rows = DEFAULT_ENGINE(scene, n), torch.arange(n)
+    physics, rows = MujocoPhysics(scene, n), torch.arange(n)
     away = torch.tensor([100.0, 0, 3, 1, 0, 0, 0])
     joint_pos = DEFAULT.expand(n, -1)
     physics.reset(rows, away.expand(n, 7), joint_pos)

@@ -369,7 +369,7 @@ def test_curves_of_a_long_training_make_a_small_picture(tmp_path: Path):
     assert max(path.count("L") for path in paths) < 250
 
 
-def test_an_infinite_range_is_left_out_of_the_figure_over_ranges(manifest: Manifest):
+def test_an_infinite_range_is_left_out_of_the_figure_over_ranges():
     names = ("field-proximity-1m", "field-proximity-infm")
     cells = ({"sensor.range": 1.0}, {"sensor.range": math.inf})
     mine = resolve(dataclasses.replace(FINDINGS, name="mine", cells=cells))
@@ -480,9 +480,7 @@ def test_a_run_without_an_episode_long_enough_to_tell_has_used_its_whole_budget(
     assert sample_efficiency(manifest, results) is not None
 
 
-def test_seeds_that_never_learn_do_not_make_a_cell_look_fast(
-    manifest: Manifest, tmp_path: Path
-):
+def test_seeds_that_never_learn_do_not_make_a_cell_look_fast(tmp_path: Path):
     folder = StudyFolder(tmp_path)
     more = resolve(dataclasses.replace(FINDINGS, seeds=(0, 1, 2, 3, 4)))
     results = []

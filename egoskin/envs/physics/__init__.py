@@ -17,8 +17,6 @@ from egoskin.envs.physics.mujoco import MujocoPhysics
 
 Engine = Literal["mujoco", "warp"]
 """Engines by name: MuJoCo on the CPU; MuJoCo Warp, on a GPU or, slowly, on the CPU."""
-DEFAULT_ENGINE: type[Physics] = MujocoPhysics
-"""The engine used by default."""
 
 
 def engine_of(name: Engine) -> type[Physics]:
@@ -44,9 +42,9 @@ def engine_of(name: Engine) -> type[Physics]:
 
 
 __all__ = [
-    "DEFAULT_ENGINE",
     "OBJECT_MASS",
     "Engine",
+    "MujocoPhysics",
     "Physics",
     "PhysicsConfig",
     "PhysicsState",
