@@ -191,9 +191,11 @@ def find_upper_bound(
         cost += _SIZE_COST * plans.square().mean((2, 3))
         if iteration == 1:
             own = Outcome(avoided=avoided[:, 0], stood=stood[:, 0])
-        chosen = cost.argmin(1)
-        better = cost[every, chosen] < least
-        least = torch.minimum(least, cost[every, chosen])
+        # The longest plan may end before the ball has passed.
+        rank = torch.where(avoided, cost, cost + 4.0)
+        chosen = rank.argmin(1)
+        better = rank[every, chosen] < least
+        least = torch.minimum(least, rank[every, chosen])
         best = Outcome(
             avoided=torch.where(better, avoided[every, chosen], best.avoided),
             stood=torch.where(better, stood[every, chosen], best.stood),

@@ -227,6 +227,27 @@ def test_a_search_ends_when_nothing_is_left_to_improve(
     assert (iterations, bound.best.stood.tolist()) == ([1], [True, True])
 
 
+def test_the_best_is_never_worse_than_the_policy(
+    policy: Policy, monkeypatch: pytest.MonkeyPatch
+):
+    # The policy avoids the ball and falls half-way; plans run ahead of it to the end.
+    def play(env, policy, start, plan, steps, ball) -> tuple[torch.Tensor, ...]:
+        is_policy = ~plan.flatten(1).any(1)
+        age = torch.where(is_policy, steps // 2, steps)
+        return torch.ones_like(is_policy), is_policy, age
+
+    monkeypatch.setattr(upper_bound, "_play", play)
+    bound = find_upper_bound(
+        policy,
+        task(policy),
+        SearchConfig(samples=4, iterations=2),
+        throw_set=0,
+        throws=2,
+        reach=2.0,
+    )
+    assert bound.policy.avoided.tolist() == bound.best.avoided.tolist() == [True, True]
+
+
 @pytest.mark.slow
 def test_an_age_limit_is_no_fall(policy: Policy, bound: UpperBound):
     # Every plan crosses it: the balls come into reach after about 0.35 to 1 s.
