@@ -26,8 +26,8 @@ from `egoskin.sensors.imperfections.corruption.Corruption`
 ``reading_i_*``             any            state of an imperfection      itself
 from `egoskin.sensors.Proximity`, ``Binary`` or ``Localization``
 ---------------------------------------------------------------------------------------
-``signal``                  ``[*B, S]``    or ``[*B, 3]`` (localization) actor, critic
-from `egoskin.sensors.history`
+``signal``                  ``[*B, S K]``  or ``[*B, 3]`` (localization) actor, critic
+from `egoskin.sensors.history` (`make_env` writes them as ``signal``, ``observation``)
 ---------------------------------------------------------------------------------------
 ``last_signal``             as signal      last one with a detection     actor, critic
 ``signal_history``          ``[*B, ...]``  the latest signals            actor, critic

@@ -1,8 +1,7 @@
 """Object shapes: MuJoCo geom, signed distance and ray intersection of each shape.
 
-Shapes do not depend on sensors or tasks. A new shape is added in this file alone: its
-simulation and its measurement by sensors are both here. All shapes have the same
-methods:
+Shapes do not depend on sensors or tasks: the simulation of a shape and its measurement
+by sensors are both here. All shapes have the same methods:
 
 - ``signed_distance(x, y, z)``: distance from points to the surface [m], negative
   inside.

@@ -91,10 +91,11 @@ def summary_of(trainer: Trainer, metrics: Mapping[str, float]) -> str:
         if not math.isnan(success := metrics["episode/success"]):
             summary += f"{success:.1%} untouched for {task.success_age_s:g} s, "
         summary += f"survival {metrics['episode/survival_s']:.2f} s"
+    own = " --standard run" * (trainer.config.env.standard == "custom")
     return (
         f"{summary}\n"
-        f"evaluate it with: egoskin evaluate {path}\n"
-        f"film it with:     egoskin film {path} --longest-of 16\n"
+        f"evaluate it with: egoskin evaluate {path}{own}\n"
+        f"film it with:     egoskin film {path} --longest-of 16{own}\n"
         f"view it with:     egoskin view {path}"
     )
 

@@ -72,7 +72,7 @@ class VisibilityConfig:
     occlusion: bool = False
     """Whether the robot's own body hides what lies behind it."""
     throws: ThrowConfig = dataclasses.field(default_factory=ThrowConfig)
-    """The balls and how they are thrown."""
+    """The balls (only spheres) and how they are thrown."""
     num_throws: int = 2000
     """Number of throws."""
     seed: int = 0

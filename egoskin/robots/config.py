@@ -115,14 +115,16 @@ class RobotConfig:
     """A robot: a base, and the hinges and slides below it.
 
     Sensors can be placed on any robot. The task requires a floating base, only hinges,
-    gains, and a file of the robot only: no floor, actuators or sensors.
+    gains, and the result of `egoskin.robots.portable.portable`, which leaves out the
+    floor, actuators and sensors.
     """
 
     name: str
     """Name by which configurations refer to the robot."""
     model_path: Path | None = None
     """MJCF or URDF; only the base and the bodies below it are used. In a URDF, links on
-    fixed joints are kept, and meshes, whose paths are seldom valid, are left out."""
+    fixed joints are kept, and meshes, whose paths are seldom valid, are left out
+    (`portable` puts primitives around those that it finds)."""
     model_xml: str | None = None
     """Instead of a path, an MJCF as text that refers to no other file, as saved with
     policies and runs (`egoskin.robots.portable.portable`)."""
@@ -462,8 +464,10 @@ def _primitive(model: mujoco.MjModel, geom: int) -> tuple[str, np.ndarray]:
         name = model.geom(geom).name or geom
         raise ValueError(
             f"link {link!r} has a collision shape, geom {name!r}, of kind {kind}; it "
-            "must be a sphere, capsule, box or cylinder: replace it, or place sensors "
-            f"on the link's meshes with meshes={{{link!r}: [...]}} (--meshes)"
+            "must be a sphere, capsule, box or cylinder: use "
+            "egoskin.robots.portable.portable(robot), or a folder with robot.toml, "
+            "which put one around meshes and ellipsoids; or place sensors on the "
+            f"link's meshes with meshes={{{link!r}: [...]}} (--meshes)"
         )
     return kind, size
 

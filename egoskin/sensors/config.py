@@ -67,7 +67,8 @@ class SensorConfig:
 
     coverage: Literal["field", "ray", "none", "oracle"] = "field"
     """Spherical field, grid of beams, none (a blind robot), or oracle: the true
-    position and velocity of every ball instead of sensors, for comparison."""
+    position and velocity of every ball instead of sensors, for comparison. None and
+    oracle ignore signal and range."""
     signal: Literal["localization", "proximity", "closeness", "binary"] = "proximity"
     """localization: position of the nearest detected ball; proximity: distance / range
     (d / (d + 1 m) with range inf); closeness: 1 - proximity; binary: 1 if in range."""

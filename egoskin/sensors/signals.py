@@ -91,7 +91,7 @@ class Proximity(_Reading):
     """Distance over range: 0 is contact, 1 is at the range or no detection.
 
     Reads ``distance [*B, S]`` or ``[*B, S, K]`` [m]; writes ``signal [*B, S K]``,
-    sensor by sensor.
+    sensor by sensor. With ``per_object``, each reading's objects follow one another.
 
     Args:
         max_range: Sensor transform whose ranges are used, or ranges [m], one for all or
@@ -134,7 +134,8 @@ class Proximity(_Reading):
 class Binary(_Reading):
     """Whether each measurement is in range: 1 or 0.
 
-    Reads ``distance [*B, S]`` or ``[*B, S, K]`` [m]; writes ``signal [*B, S K]``.
+    Reads ``distance [*B, S]`` or ``[*B, S, K]`` [m]; writes ``signal [*B, S K]``,
+    in the order of `Proximity`.
 
     Args:
         max_range: Sensor transform whose ranges are used, or ranges [m], one for all or
