@@ -156,6 +156,8 @@ def make_worker_env(
         raise ValueError("sparse sources cannot mask only some links: turn sparse off")
     sensors, robot = config.pipeline(skin), config.robot_config
     sensors.check_mask(mask)
+    # On "meta" there are specs, but no data.
+    place = torch.device("meta") if str(device) == "meta" else device_of(str(device))
     env = DodgeballEnv(
         robot,
         config.task,
@@ -167,7 +169,7 @@ def make_worker_env(
         # Read only from the raw state.
         tactile=keep_raw,
         engine=engine_of(engine),
-        device=device_of(str(device)),
+        device=place,
     )
     transforms: list[Transform] = []
     if not bare:

@@ -493,8 +493,11 @@ def _slab_interval(half: float, p: Tensor, d: Tensor) -> Interval:
 def is_dual(x: Tensor) -> bool:
     """Whether a tensor has a forward-mode derivative, or belongs to `torch.func`.
 
-    Neither is seen in its data.
+    Neither is seen in its data. Under ``torch.compile``, where neither can be known, it
+    is taken for granted.
     """
+    if torch.compiler.is_compiling():
+        return True
     wrapped = torch._C._functorch.is_functorch_wrapped_tensor(x)
     return wrapped or forward_ad.unpack_dual(x).tangent is not None
 

@@ -350,8 +350,6 @@ def _padded(directions: np.ndarray) -> np.ndarray:
 
 def _numpy_serves(x: Tensor) -> bool:
     """Whether NumPy may operate on a tensor's memory."""
-    if torch.compiler.is_compiling():
-        return False
     return x.is_cpu and not x.requires_grad and not is_dual(x)
 
 

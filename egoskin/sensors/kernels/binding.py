@@ -122,8 +122,6 @@ class Kernels:
 
         Always False under ``torch.compile``.
         """
-        if torch.compiler.is_compiling():
-            return False
         if torch.is_grad_enabled() and any(x.requires_grad for x in inputs):
             return False
         if any(is_dual(x) for x in inputs):
