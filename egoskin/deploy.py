@@ -31,8 +31,8 @@ class Controller:
         max_change: Largest change of targets per control step, in the same unit.
 
     Raises:
-        ValueError: If it is no exported policy, or reads positions of balls, or a limit
-            is negative or NaN, or `max_missing` above 1.
+        ValueError: If it is no exported policy, or newer than this file, or reads
+            positions of balls, or if a limit is out of bounds.
         OSError: If it cannot be read.
     """
 
@@ -62,6 +62,9 @@ class Controller:
             raise ValueError(f"{path} was not written by `egoskin export`")
         self.metadata: dict[str, Any] = json.loads(text)
         data, self._sensor = self.metadata, (sensor := self.metadata["sensor"])
+        known = ("localization", "proximity", "closeness", "binary")
+        if data["format"] != 1 or sensor["signal"] not in known:
+            raise ValueError(f"{path} was written by a newer egoskin: update deploy.py")
         if "oracle" in sensor.values() or "localization" in sensor.values():
             raise ValueError(f"{path} reads positions of balls, which needs a tracker")
         self._default = np.array(data["default_joint_pos"])

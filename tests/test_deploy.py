@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import json
 import re
 import runpy
 import subprocess
@@ -333,6 +334,19 @@ def test_what_needs_a_tracker_is_refused_in_one_line(name, tmp_path):
         policy = egoskin.load_policy(name)
     with pytest.raises(ValueError, match=r"reads positions of balls, which needs a tr"):
         deploy(policy, tmp_path)
+
+
+@pytest.mark.parametrize("new", [{"format": 2}, {"sensor": {"signal": "echo"}}])
+def test_a_newer_file_is_refused(new, tmp_path):
+    model = onnx.load_from_string(export_onnx(egoskin.load_policy("blind"))[0])
+    (entry,) = model.metadata_props
+    data = json.loads(entry.value)
+    for key, value in new.items():
+        data[key] = data[key] | value if key == "sensor" else value
+    entry.value = json.dumps(data)
+    onnx.save(model, tmp_path / "new.onnx")
+    with pytest.raises(ValueError, match=r"new\.onnx was written by a newer egoskin"):
+        Controller(tmp_path / "new.onnx")
 
 
 def test_a_file_of_others_is_refused(tmp_path):

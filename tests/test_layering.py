@@ -56,6 +56,7 @@ MUJOCO = {
     "robots.chains",
     "robots.config",
     "robots.meshes",
+    "robots.model",
     "robots.portable",
     "robots.spec",
     "shapes",

@@ -14,53 +14,13 @@ import pytorch_kinematics as pk
 import torch
 from pytorch_kinematics import frame as pk_frame
 
-from egoskin.hints import did_you_mean
+from egoskin.robots.model import body_id, body_name, joint_name, unique_name
 
 JOINT_TYPES = {
     mujoco.mjtJoint.mjJNT_HINGE: "revolute",
     mujoco.mjtJoint.mjJNT_SLIDE: "prismatic",
 }
 """Joint types of pytorch-kinematics by MuJoCo joint type."""
-
-
-_BODY, _JOINT = mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_JOINT
-
-
-def body_name(model: mujoco.MjModel, body: int) -> str:
-    """Return the name of a body; a generated one if it is unnamed in the model.
-
-    A generated name is ``body2``, or ``body2_`` if another body has that name.
-    """
-    return model.body(body).name or _made_name(model, _BODY, f"body{body}")
-
-
-def joint_name(model: mujoco.MjModel, joint: int) -> str:
-    """Return the name of a joint; a generated one if it is unnamed in the model.
-
-    A generated name is ``joint3``, or ``joint3_`` if another joint has that name.
-    """
-    return model.joint(joint).name or _made_name(model, _JOINT, f"joint{joint}")
-
-
-def _made_name(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str) -> str:
-    """Return a name, with underscores appended until it is unique."""
-    while mujoco.mj_name2id(model, kind, name) >= 0:
-        name += "_"
-    return name
-
-
-def body_id(model: mujoco.MjModel, name: str) -> int:
-    """Return the index of the body with a name, which may be a generated one.
-
-    Raises:
-        ValueError: If no body has the name.
-    """
-    names = [body_name(model, body) for body in range(model.nbody)]
-    if name not in names:
-        known = ", ".join(map(repr, sorted(names)))
-        hint = did_you_mean(name, names)
-        raise ValueError(f"the model has no body {name!r}{hint}; it has {known}")
-    return names.index(name)
 
 
 def _body_frames(
@@ -104,7 +64,7 @@ def _body_frames(
         mujoco.mju_mulPose(position, quat, position.copy(), quat.copy(), before, turn)
         append(
             # Frame names must be unique and differ from all body names.
-            _made_name(model, _BODY, f"{name}:{own_name}"),
+            unique_name(model, mujoco.mjtObj.mjOBJ_BODY, f"{name}:{own_name}"),
             pk_frame.Joint(
                 own_name,
                 axis=torch.tensor(joint.axis),

@@ -20,13 +20,8 @@ import numpy as np
 import pytorch_kinematics as pk
 
 from egoskin.bounds import is_number
-from egoskin.robots.chains import (
-    JOINT_TYPES,
-    body_id,
-    body_name,
-    build_chain,
-    joint_name,
-)
+from egoskin.robots.chains import JOINT_TYPES, build_chain
+from egoskin.robots.model import body_id, body_name, geom_mesh, joint_name
 from egoskin.robots.model_text import checked_model
 from egoskin.robots.spec import compile_robot, is_urdf, load_spec
 from egoskin.storage.files import check_regular
@@ -482,9 +477,8 @@ def _extent(
     """
     z_row = data.geom_xmat[geom].reshape(3, 3)[2]
     if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
-        mesh = model.geom_dataid[geom]
-        first, number = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
-        heights = model.mesh_vert[first : first + number] @ z_row
+        vertices, _ = geom_mesh(model, geom)
+        heights = vertices @ z_row
         heights += data.geom_xpos[geom, 2]
         return float(heights.min()), float(heights.max())
     kind, size = _primitive(model, geom)

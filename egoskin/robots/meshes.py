@@ -16,8 +16,8 @@ import mujoco
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from egoskin.robots.chains import body_name
 from egoskin.robots.config import Primitive
+from egoskin.robots.model import body_name, geom_mesh
 
 _MESH = mujoco.mjtGeom.mjGEOM_MESH
 _ELLIPSOID = mujoco.mjtGeom.mjGEOM_ELLIPSOID
@@ -319,14 +319,7 @@ def _fit(model: mujoco.MjModel, geom: int, *, may_cut: bool = True) -> MeshFit:
         unit, faces = _around_unit_sphere()
         vertices = unit * model.geom_size[geom]
     else:
-        mesh = model.geom_dataid[geom]
-        vertices, faces = (
-            each[first[mesh] : first[mesh] + number[mesh]]
-            for each, first, number in (
-                (model.mesh_vert, model.mesh_vertadr, model.mesh_vertnum),
-                (model.mesh_face, model.mesh_faceadr, model.mesh_facenum),
-            )
-        )
+        vertices, faces = geom_mesh(model, geom)
     rotation = np.empty(9)
     mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
     own_axes = rotation.reshape(3, 3)

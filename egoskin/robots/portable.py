@@ -14,7 +14,6 @@ from xml.etree import ElementTree
 import mujoco
 import numpy as np
 
-from egoskin.robots.chains import body_id, body_name
 from egoskin.robots.config import RobotConfig, round_off
 from egoskin.robots.meshes import (
     MeshFit,
@@ -23,6 +22,7 @@ from egoskin.robots.meshes import (
     set_shape,
     type_of,
 )
+from egoskin.robots.model import body_id, body_name
 from egoskin.robots.spec import set_inertia
 
 # Collision bits of balls and floor; a robot's own bits are above them.

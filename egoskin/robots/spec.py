@@ -12,7 +12,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from egoskin.robots.chains import body_id, body_name, joint_name
+from egoskin.robots.model import body_id, body_name, joint_name
 from egoskin.storage.files import read_regular
 
 # Settings of MuJoCo's compiler that change the masses of all bodies of a model.

@@ -28,7 +28,7 @@ from egoskin.envs.physics.contract import (
     Variation,
 )
 from egoskin.envs.physics.model import MAX_SPEED, PARKING, build_scene
-from egoskin.robots.chains import body_id
+from egoskin.robots.model import body_id
 
 SETTING = "EGOSKIN_WARP_CONTACTS"
 """Environment variable: capacity of the buffers, in contacts per robot."""

@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
-from egoskin.robots.chains import body_name
 from egoskin.robots.config import RobotConfig
+from egoskin.robots.model import body_name, geom_mesh
 from egoskin.robots.surface import (
     Patch,
     Surface,
@@ -134,20 +134,20 @@ def meshes_of_mjcf(path: Path, group: int | None = None) -> dict[str, list[Trime
         raise ValueError(f"MuJoCo cannot load {path}: {text}") from error
     meshes: dict[str, list[Trimesh]] = {}
     seen = set()
-    for geom in np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH):
+    is_mesh = model.geom_type == mujoco.mjtGeom.mjGEOM_MESH
+    for geom in map(int, np.flatnonzero(is_mesh)):
         asset, body = model.geom_dataid[geom], model.geom_bodyid[geom]
         position, quat = model.geom_pos[geom], model.geom_quat[geom]
         placed = (asset, body, *position, *quat)
         if placed in seen or group not in (None, model.geom_group[geom]):
             continue
         seen.add(placed)
-        vertex, face = model.mesh_vertadr[asset], model.mesh_faceadr[asset]
         turn = np.empty(9)
         mujoco.mju_quat2Mat(turn, quat)
-        local = model.mesh_vert[vertex : vertex + model.mesh_vertnum[asset]]
+        vertices, faces = geom_mesh(model, geom)
         mesh = trimesh.Trimesh(
-            local @ turn.reshape(3, 3).T + position,
-            model.mesh_face[face : face + model.mesh_facenum[asset]],
+            vertices @ turn.reshape(3, 3).T + position,
+            faces,
             metadata={"name": _asset_name(model, asset)},
         )
         meshes.setdefault(body_name(model, body), []).append(mesh)

@@ -10,8 +10,8 @@ import mujoco
 import numpy as np
 import trimesh
 
-from egoskin.robots.chains import body_name, joint_name
 from egoskin.robots.config import RobotConfig
+from egoskin.robots.model import body_name, geom_mesh, joint_name
 from egoskin.sensors import Skin
 from egoskin.shapes import Shape
 
@@ -195,12 +195,7 @@ def _mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh | None:
     elif kind == kinds.mjGEOM_BOX:
         mesh = make.box(2 * size)
     elif kind == kinds.mjGEOM_MESH:
-        which = model.geom_dataid[geom]
-        first, number = model.mesh_vertadr[which], model.mesh_vertnum[which]
-        vertices = model.mesh_vert[first : first + number]
-        first, number = model.mesh_faceadr[which], model.mesh_facenum[which]
-        faces = model.mesh_face[first : first + number]
-        mesh = trimesh.Trimesh(vertices, faces, process=False)
+        mesh = trimesh.Trimesh(*geom_mesh(model, geom), process=False)
     else:
         return None
     # Edges are shaded sharp if faces share no vertices.
