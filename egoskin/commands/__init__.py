@@ -86,6 +86,7 @@ def begin(name: str) -> None:
     _check_address_space()
     if name in _PICTURES:
         draw_without_display()
+    _check_opengl()
 
 
 def run(name: str) -> None:
@@ -117,6 +118,25 @@ def _check_address_space() -> None:
             file=sys.stderr,
         )
         raise SystemExit(2)
+
+
+def _check_opengl() -> None:
+    """Exit if MuJoCo cannot be imported with the OpenGL that ``MUJOCO_GL`` names.
+
+    MuJoCo loads that library whatever the command; the error text comes from PyOpenGL
+    and does not mention it.
+    """
+    try:
+        import mujoco  # noqa: F401
+    except (AttributeError, ImportError, RuntimeError) as fault:
+        backend = os.environ.get("MUJOCO_GL", "")
+        print(
+            f"error: MuJoCo cannot be imported with MUJOCO_GL={backend!r} ({fault}); "
+            "install the library (Debian: `apt-get install libegl1` for egl, `apt-get "
+            "install libosmesa6` for osmesa), or unset MUJOCO_GL",
+            file=sys.stderr,
+        )
+        raise SystemExit(2) from None
 
 
 def _page() -> str:

@@ -39,7 +39,7 @@ from egoskin.policies.policy import load_policy
 from egoskin.progress import StatusLine, counted
 from egoskin.rng import check_seed
 from egoskin.sensors import MASK_ALL
-from egoskin.storage.files import check_output
+from egoskin.storage.files import check_output, write_output
 
 PICTURE_SUFFIXES = (".png", ".svg", ".pdf")
 
@@ -89,6 +89,8 @@ class EvaluateConfig:
         check_output(self.json, "--json")
         check_output(self.map, "--map", PICTURE_SUFFIXES)
         if self.map is not None:
+            if self.json is not None and self.json.resolve() == self.map.resolve():
+                raise ValueError(f"--json and --map are the same file: {self.map}")
             check_packages("--map", "plot", "matplotlib")
         engine_of(self.engine)
         if self.engine == "mujoco" and device_of(self.device).type != "cpu":
@@ -331,9 +333,12 @@ def main(args: list[str]) -> None:
             on_point=counting("map"),
         )
         line.finish()
-        draw_map(config.map, lines, title_of(episodes), task.success_age_s)
+        form = config.map.suffix[1:]
+        picture = draw_map(lines, title_of(episodes), task.success_age_s, form)
+        write_output(config.map, picture)
         content["map_episodes"] = episodes
         content["map"] = [dataclasses.asdict(line) for line in lines]
         print(f"\n{config.map}: success against speed, interval, height and direction")
     if config.json is not None:
-        config.json.write_text(json.dumps(content, indent=2) + "\n")
+        text = json.dumps(content, indent=2) + "\n"
+        write_output(config.json, text.encode())

@@ -7,27 +7,11 @@ egoskin film --hold --sensor.range 1 --out rigid.gif
 
 from __future__ import annotations
 
-import os
-import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
-
-try:
-    import mujoco  # noqa: F401
-except (AttributeError, ImportError, RuntimeError) as fault:
-    # MuJoCo loads the library named by MUJOCO_GL when it is imported; the error text
-    # comes from PyOpenGL and does not mention it.
-    backend = os.environ.get("MUJOCO_GL", "")
-    print(
-        f"error: MuJoCo cannot be imported with MUJOCO_GL={backend!r} ({fault}); "
-        "install the library (Debian: `apt-get install libegl1` for egl, `apt-get "
-        "install libosmesa6` for osmesa)",
-        file=sys.stderr,
-    )
-    raise SystemExit(2) from None
 
 from egoskin.bounds import COUNT, NOT_NEGATIVE, Interval, check_bounds
 from egoskin.evaluation.throw_set import standard_task

@@ -49,7 +49,10 @@ def _pairs(values: Sequence[str], option: str) -> dict[str, str]:
     for value in values:
         if not all(value.rpartition("=")[::2]):
             raise ValueError(f"{option} takes name=value, got {value!r}")
-    return {v.rpartition("=")[0]: v.rpartition("=")[2] for v in values}
+    pairs = {v.rpartition("=")[0]: v.rpartition("=")[2] for v in values}
+    if len(pairs) < len(values):
+        raise ValueError(f"{option} has a name twice: {', '.join(values)}")
+    return pairs
 
 
 def _meshes(path: Path, robot: RobotConfig) -> Meshes:

@@ -69,7 +69,7 @@ def requested(name: str | None, folder: Path | None) -> Manifest:
         if name is None:
             raise ValueError("a study or the --dir of an existing one is required")
         return find_study(name)
-    check_parent(folder)
+    check_folder(folder, "--dir")
     store = StudyFolder(folder)
     if name is None:
         return store.manifest()
@@ -120,10 +120,13 @@ def show(text: str, stays: bool) -> None:
     print(f"{start}{text}", end=end, flush=True)
 
 
-def check_parent(folder: Path) -> None:
-    """Raise ValueError if the parent folder of a study's folder does not exist."""
-    if not folder.absolute().parent.is_dir():
-        raise ValueError(f"--dir: there is no folder {folder.absolute().parent}")
+def check_folder(folder: Path, option: str) -> None:
+    """Raise ValueError if a folder cannot be made, or a file has its name."""
+    parent = folder.absolute().parent
+    if not parent.is_dir():
+        raise ValueError(f"{option}: there is no folder {parent}")
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"{option}: {folder} is a file, not a folder")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -321,6 +324,8 @@ class Run:
     def _where(self) -> type[Runner]:
         """Return the runner for the study."""
         if self.on == "local":
+            if self.ray_address != Run.ray_address:
+                raise ValueError("--ray-address has no effect without --on ray")
             return LocalRunner
         check_packages("--on ray", "ray", "ray")
         # Imported here, because only this option needs Ray.
@@ -409,8 +414,7 @@ class Report:
         folder = StudyFolder(self.dir)
         folder.manifest()  # a wrong folder is named before --out
         out = self.out or self.dir / "report"
-        if not out.absolute().parent.is_dir():
-            raise ValueError(f"--out: there is no folder {out.absolute().parent}")
+        check_folder(out, "--out")
         write_report(folder, out)
         print(f"{out / 'report.md'}, {out / 'index.html'}, {out / 'runs.csv'}")
 

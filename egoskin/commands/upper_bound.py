@@ -36,7 +36,7 @@ from egoskin.evaluation.upper_bound import (
 from egoskin.policies.policy import load_policy
 from egoskin.progress import counted
 from egoskin.rng import check_seed
-from egoskin.storage.files import check_output
+from egoskin.storage.files import check_output, write_output
 
 # Bounds of the groups by the height that the throw is aimed at [m].
 BOUNDS = (0.0, 0.7, 0.9, 1.1, 1.3, 2.0)
@@ -161,4 +161,5 @@ def main(args: list[str]) -> None:
             "all": _total(result),
             "by_height_m": groups(result),
         }
-        config.json.write_text(json.dumps(content, indent=2) + "\n")
+        text = json.dumps(content, indent=2) + "\n"
+        write_output(config.json, text.encode())

@@ -14,8 +14,10 @@ by their signals.
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -40,11 +42,11 @@ except ImportError:
 from egoskin.envs.physics import PhysicsConfig
 from egoskin.envs.throws import ThrowConfig
 from egoskin.evaluation.visibility import Analysis, alike, analyse, warning_texts
-from egoskin.progress import counted
+from egoskin.progress import counted, note
 from egoskin.robots.own import find_robot
-from egoskin.sensors import Field, Ray
+from egoskin.sensors import Field, Ray, Skin
 from egoskin.sensors.config import SensorConfig, SkinConfig
-from egoskin.storage.files import check_output
+from egoskin.storage.files import check_output, write_output
 from egoskin.storage.serialization import to_plain
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".svg", ".pdf")
@@ -83,12 +85,26 @@ class VisibilityConfig:
     """JSON file to write all results to."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for options of sensors that are not compared."""
+        """Raise ValueError for options without effect."""
         for name, default in (("field", Field()), ("ray", Ray())):
             if name not in self.coverages and getattr(self, name) != default:
                 raise ValueError(
                     f"--{name} has no effect without {name} among --coverages"
                 )
+        for name in ("num_balls", "first_delay", "interval", "lead"):
+            if getattr(self.throws, name) != getattr(ThrowConfig, name):
+                raise ValueError(
+                    f"--throws.{name} has no effect: each ball is thrown alone, at a "
+                    "standing robot"
+                )
+
+
+def notes(skin: Skin) -> Iterator[str]:
+    """Yield which cells see alike because the skin file sets what they differ in."""
+    own = {"range": not np.isnan(skin.range).any(), "type": None not in skin.coverage}
+    for what, option in (("range", "--ranges"), ("type", "--coverages")):
+        if own[what]:
+            yield f"{option} has no effect: the skin sets the {what} of each sensor"
 
 
 def show_progress(what: str, share: float) -> None:
@@ -230,6 +246,8 @@ def main(args: list[str]) -> None:
     check_output(config.json, "--json", (".json",))
     robot = find_robot(config.robot)
     skin = config.skin.build(robot)
+    for text in notes(skin):
+        note(f"note: {text}")
     physics = PhysicsConfig()
     own = {"field": {"field": config.field}, "ray": {"ray": config.ray}}
     analysis = analyse(
@@ -250,12 +268,15 @@ def main(args: list[str]) -> None:
     report = analysis.report()
     print_table(analysis, report)
     content = {"config": to_plain(config), "sensors": len(skin), **report}
-    config.json.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+    text = json.dumps(content, indent=2, allow_nan=False) + "\n"
+    write_output(config.json, text.encode())
     verb = "sees" if len(skin) == 1 else "see"
     title = f"What {counted(len(skin), 'sensor')} on {robot.name} {verb}"
     if config.occlusion:
         title += ", occluded by its body"
     figure = draw(analysis, report, title)
-    figure.savefig(config.out, dpi=110)
+    file = io.BytesIO()
+    figure.savefig(file, format=config.out.suffix[1:], dpi=110)
     plt.close(figure)
+    write_output(config.out, file.getvalue())
     print(f"picture {config.out}, results {config.json}")

@@ -7,10 +7,10 @@ varied together. Everything else is as in the task.
 from __future__ import annotations
 
 import dataclasses
+import io
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tensordict.nn import TensorDictModuleBase
@@ -222,15 +222,15 @@ def _grid(properties: Sequence[_Property]) -> list[tuple[float, ...]]:
 
 
 def draw_map(
-    path: Path, lines: Sequence[Line], title: str, success_age_s: float
-) -> None:
-    """Draw an operating map; needs matplotlib.
+    lines: Sequence[Line], title: str, success_age_s: float, form: str
+) -> bytes:
+    """Return the picture of an operating map; needs matplotlib.
 
     Args:
-        path: Picture to write.
         lines: Result of `operating_map`.
         title: Title of the figure.
         success_age_s: Age at which the success counts [s].
+        form: Format of the picture: png, svg or pdf.
     """
     from matplotlib.figure import Figure
 
@@ -246,7 +246,9 @@ def draw_map(
         axis.axis("off")
     handles, labels = axes[0].get_legend_handles_labels()
     axes[-1].legend(handles, labels, loc="center", frameon=False)
-    figure.savefig(path, dpi=110)
+    file = io.BytesIO()
+    figure.savefig(file, format=form, dpi=110)
+    return file.getvalue()
 
 
 def _draw_line(axis: Axes, line: Line, age: float) -> None:

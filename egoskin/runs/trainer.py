@@ -21,7 +21,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from egoskin.agents.networks import Agent
+from egoskin.agents.networks import Agent, NetworkConfig
 from egoskin.agents.ppo import PPO, NonFiniteError
 from egoskin.agents.rollout import collect
 from egoskin.bounds import NOT_NEGATIVE, POSITIVE, check_bounds
@@ -118,6 +118,12 @@ class Trainer:
             load_agent_tensors(self.agent, initial, str(self.config.init_from))
             # They may be of other bounds.
             self.agent.head.bound_std()
+            if self.config.ppo.network.init_std != NetworkConfig.init_std:
+                print(
+                    "note: ppo.network.init_std has no effect with init_from: "
+                    f"{self.config.init_from} has its own standard deviation",
+                    file=sys.stderr,
+                )
             if not has_critic(initial):
                 print(
                     f"note: {self.config.init_from} is of an older version and has no "

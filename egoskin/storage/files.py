@@ -121,6 +121,24 @@ def write_file(path: Path, content: bytes) -> None:
         raise named(error, path) from error
 
 
+def write_output(path: Path, content: bytes) -> None:
+    """Write a file that an option names, as `check_output` allows it.
+
+    A file is written as by `write_file`; a pipe, a device or a link, as /dev/stdout, is
+    written to.
+
+    Raises:
+        OSError: If it cannot be written; the text names the file.
+    """
+    if not path.is_symlink() and (path.is_file() or not path.exists()):
+        write_file(path, content)
+        return
+    try:
+        path.write_bytes(content)
+    except OSError as error:
+        raise named(error, path) from error
+
+
 def append(path: Path, content: bytes) -> None:
     """Append to an existing file that is not a link.
 

@@ -240,6 +240,7 @@ def test_an_evaluation_may_mask_all_sensors_or_those_of_some_links(
         (["--standard", "3"], "--standard"),
         (["--map", "map.txt"], ".png"),
         (["--map", "no/map.png"], "no folder no"),
+        (["--map", "a.png", "--json", "./a.png"], "--json and --map are the same"),
         (["--throw-set", str(2**32)], "throw_set must be in [0, 2**32)"),
         (["--episodes", "0"], "episodes must be at least 1"),
         (["--check-substeps", "0"], "check_substeps must be at least 1, got 0"),

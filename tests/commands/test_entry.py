@@ -248,3 +248,20 @@ def test_too_little_memory_to_import_is_one_line():
     assert done.returncode == 2
     assert done.stderr.startswith("error: too little memory")
     assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "command", [("-m", "egoskin", "evaluate", "blind"), (str(SCRIPTS / "ppo.py"),)]
+)
+def test_an_opengl_that_is_not_installed_is_one_line_of_any_command(command):
+    done = subprocess.run(
+        [sys.executable, *command],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        env={**os.environ, "MUJOCO_GL": "no_such_backend"},
+    )
+    assert done.returncode == 2
+    assert "MUJOCO_GL='no_such_backend'" in done.stderr
+    assert done.stderr.endswith(", or unset MUJOCO_GL\n")
+    assert done.stderr.count("\n") == 1

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from calling import fail
 from egoskin.commands.errors import clear_errors
 from egoskin.make import device_of
 from egoskin.parallel import WorkerError
@@ -190,3 +191,26 @@ def test_a_closed_stream_is_no_fault(stream, tmp_path):
     )
     assert (done.returncode, done.stderr) == (0, "")
     assert (tmp_path / "a.json").is_file()
+
+
+@pytest.mark.parametrize(
+    "args",
+    [
+        ("evaluate", "blind", "--episodes", "2", "--num-workers", "1"),
+        ("upper-bound", "blind", "--throws", "1", "--search.iterations", "1"),
+        ("visibility", "--num-throws", "2", "--coverages", "field", "--ranges", "1"),
+    ],
+    ids=lambda args: args[0],
+)
+def test_results_that_cannot_be_written_leave_the_old_ones(args, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    old = Path("old.json")
+    old.write_text("old")
+
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    assert "No space left on device: 'old.json'" in fail(*args, "--json", "old.json")
+    assert old.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [tmp_path / "old.json"]

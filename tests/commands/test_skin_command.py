@@ -285,6 +285,10 @@ def test_meshes_that_are_not_the_robots_are_left_out():
         ),
         (["show", "alien.json", "--picture", "a.jpg"], "must end in .png"),
         (["place", "--density", "torso_link=x", "--out", "a.json"], "must be a number"),
+        (
+            ["place", "--density", "torso_link=1", "torso_link=5", "--out", "a.json"],
+            "--density has a name twice",
+        ),
         (["place", "--links", "torso_lnk", "--out", "a.json"], "torso_lnk"),
         (["place", "--num-sensors", "0", "--out", "a.json"], "0"),
         (["place", "--meshes", "none", "--out", "a.json"], "none"),

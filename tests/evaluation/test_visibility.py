@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import replace
 from typing import Any
+from unittest.mock import Mock
 
 import mujoco
 import numpy as np
@@ -537,6 +539,27 @@ def test_the_command_has_the_body_in_the_way_if_asked(monkeypatch):
 
 
 @pytest.mark.parametrize(
+    ("own", "without_effect"),
+    [
+        ({}, []),
+        ({"range": np.ones(64)}, ["--ranges"]),
+        ({"coverage": (Field(),) * 64}, ["--coverages"]),
+    ],
+)
+def test_the_command_tells_what_the_skin_file_sets(
+    own, without_effect, skin: Skin, tmp_path, monkeypatch
+):
+    pytest.importorskip("matplotlib")
+    monkeypatch.setattr(
+        "egoskin.commands.visibility.analyse", Mock(side_effect=SystemExit)
+    )
+    replace(skin, **own).save(tmp_path / "skin.json")
+    monkeypatch.chdir(tmp_path)
+    told = call("visibility", "--skin.path", "skin.json").stderr
+    assert re.findall(r"(--\w+) has no effect", told) == without_effect
+
+
+@pytest.mark.parametrize(
     ("args", "message"),
     [
         (["--ranges", "-1"], "ranges must be positive"),
@@ -544,6 +567,8 @@ def test_the_command_has_the_body_in_the_way_if_asked(monkeypatch):
             ["--coverages", "ray", "--field.half-angle-deg", "30"],
             "--field has no effect without field",
         ),
+        (["--throws.interval", "2", "3"], "--throws.interval has no effect"),
+        (["--throws.num-balls", "1"], "--throws.num_balls has no effect"),
         (["--out", "visibility.mp4"], "visibility.mp4 must end in .png or .jpg"),
         (["--json", "none/visibility.json"], "there is no folder none"),
     ],

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 import egoskin
+from egoskin.agents.networks import NetworkConfig
 from egoskin.robots.builtin import H1_2
 from egoskin.robots.portable import portable
 from egoskin.runs.config import parse_config
@@ -71,6 +72,22 @@ def test_an_old_policy_has_no_critic_to_go_on_from(
     assert critic == on.keys() - networks_of(policy).keys()
     for name, value in {**networks_of(policy), **{n: new[n] for n in critic}}.items():
         assert torch.equal(on[name], value), name
+
+
+def test_an_initial_deviation_is_not_that_of_networks_to_start_from(
+    finished: Trainer, tmp_path: Path, capfd
+):
+    config = replace(blind_run(tmp_path / "run", 64), init_from=finished.run.path)
+    ppo = replace(config.ppo, network=NetworkConfig(init_std=0.3))
+    run = Run.create(replace(config, ppo=ppo))
+    with open_trainer(run):
+        pass
+    (note,) = capfd.readouterr().err.splitlines()
+    assert note.startswith("note: ppo.network.init_std has no effect with init_from")
+    start, before = map(
+        networks_of, (run.checkpoint_path, finished.run.policy_path(64))
+    )
+    assert torch.equal(start["agent/head.log_std"], before["agent/head.log_std"])
 
 
 def test_a_resumed_run_needs_no_longer_what_it_started_from(

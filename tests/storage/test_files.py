@@ -1,14 +1,15 @@
-"""Reading files from given paths: what is read, and what is refused at once."""
+"""Files of given paths: what is read or refused at once, and what is written."""
 
 from __future__ import annotations
 
+import errno
 import os
 import socket
 from pathlib import Path
 
 import pytest
 
-from egoskin.storage.files import check_regular, read_regular
+from egoskin.storage.files import check_regular, read_regular, write_output
 
 
 def test_a_file_is_read_whole_and_through_a_link(tmp_path: Path):
@@ -73,3 +74,35 @@ def test_a_file_may_be_as_large_as_the_limit_and_no_larger(use, tmp_path: Path):
 def test_a_missing_file_is_named(use, tmp_path: Path):
     with pytest.raises(FileNotFoundError, match="nowhere"):
         use(tmp_path / "nowhere")
+
+
+def test_an_output_that_cannot_be_written_leaves_the_old_file(
+    tmp_path: Path, monkeypatch
+):
+    path = tmp_path / "a.json"
+    write_output(path, b"old")
+    assert path.read_bytes() == b"old"
+
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match=rf"No space left on device: '{path}'"):
+        write_output(path, b"new")
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_an_output_is_written_through_a_link_and_into_a_pipe(tmp_path: Path):
+    (tmp_path / "link").symlink_to("file")
+    write_output(tmp_path / "link", b"content")
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "file").read_bytes() == b"content"
+    # As /dev/stdout in a pipeline.
+    read, write = os.pipe()
+    write_output(Path(f"/dev/fd/{write}"), b"piped")
+    assert os.read(read, 9) == b"piped"
+    os.close(read)
+    os.close(write)
+    with pytest.raises(OSError, match="No space left on device: '/dev/full'"):
+        write_output(Path("/dev/full"), b"lost")

@@ -1052,6 +1052,11 @@ def test_the_command_tells_what_is_left_and_what_is_not_tried_again(
             ("run", "smoke", "--dir", "{0}/new", "--only", "blind-seed9"),
             "no run 'blind",
         ),
+        (("plan", "smoke", "--dir", __file__), "test_study_runner.py is a file, not"),
+        (
+            ("run", "smoke", "--dir", "{0}/new", "--ray-address", "1.2.3.4:5"),
+            "--ray-address has no effect without --on ray",
+        ),
         (("plan", "smoke", "--dir", "{0}/no/where"), "there is no folder {0}/no"),
         (("status", "{0}"), "is not a study folder"),
         (("run", "--dir", "{0}"), "is not a study folder"),

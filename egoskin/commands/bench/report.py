@@ -9,6 +9,8 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from egoskin.storage.files import write_output
+
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
@@ -45,4 +47,4 @@ def report(rows: list[Row], path: Path | None) -> None:
         print(f"{row.name:<36} {number:>10} {row.unit}  ratio {row.ratio:.3f}")
     if path is not None:
         content = {"rows": [asdict(row) for row in rows]}
-        path.write_text(json.dumps(content, indent=2) + "\n")
+        write_output(path, (json.dumps(content, indent=2) + "\n").encode())
