@@ -37,7 +37,7 @@ from egoskin.storage.tensor_file import part, prefixed
 from egoskin.transform import StatefulTransform
 
 # Larger numbers are taken to be typing errors.
-MOST_AGENTS, _MOST_WORKERS = 2**20, 1024
+AGENTS, _WORKERS = Interval(ge=1, le=2**20), Interval(ge=1, le=1024)
 # Memory of the simulation of one agent, and the memory that workers share besides the
 # tensors (at least a page for each tensor) [bytes].
 _SIMULATION, _SHARED_EXTRA = 12_000, 2**20
@@ -327,10 +327,9 @@ def check_num_workers(
             "engine warp simulates in one process: leave out num_workers, got "
             f"{num_workers}"
         )
-    agents, processes = (num_envs, MOST_AGENTS), (num_workers, _MOST_WORKERS)
-    for what, (number, most) in {name: agents, "num_workers": processes}.items():
-        wrong = number is not None and Interval(ge=1, le=most).violation(number)
-        if wrong:
+    agents, processes = (num_envs, AGENTS), (num_workers, _WORKERS)
+    for what, (number, valid) in {name: agents, "num_workers": processes}.items():
+        if number is not None and (wrong := valid.violation(number)):
             raise ValueError(f"{what} must {wrong}, got {number}")
     if num_workers is None:
         return default_num_workers(num_envs)

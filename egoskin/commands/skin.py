@@ -147,6 +147,10 @@ class Import:
     def run(self) -> None:
         """Write the skin."""
         check_output(self.out, "--out", (".json",))
+        if len({file.resolve() for file in self.files}) < len(self.files):
+            raise ValueError(
+                f"a file is given twice: {', '.join(map(str, self.files))}"
+            )
         robot = find_robot(self.robot)
         skin = load_gentact(
             self.files,

@@ -21,11 +21,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
 
-from egoskin.bounds import COUNT, Interval, check_bounds
+from egoskin.bounds import COUNT, check_bounds
 from egoskin.envs.standards import Standard, training_task
 from egoskin.evaluation.throw_set import standard_task
 from egoskin.hints import did_you_mean
-from egoskin.make import MOST_AGENTS, EnvConfig
+from egoskin.make import AGENTS, EnvConfig
 from egoskin.policies.policy import load_networks
 from egoskin.rng import check_seed
 from egoskin.robots.checks import check_trainable
@@ -78,7 +78,7 @@ class EvaluationPlan:
     """Version of the standard throw."""
     throw_set: int = 1000
     """Seed of the throw set, which was not used for any tuning."""
-    episodes: Annotated[int, Interval(ge=1, le=MOST_AGENTS)] = 4096
+    episodes: Annotated[int, AGENTS] = 4096
     """Throw sequences in the set."""
     masked: bool = True
     """Whether to evaluate it also with all its sensors masked."""

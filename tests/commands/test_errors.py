@@ -65,6 +65,12 @@ def test_what_is_no_whole_number_is_refused(text, capsys):
     assert f"expected a whole number, got {text}" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("name", ["physics", "sensors"])
+def test_too_many_agents_are_refused_before_their_memory_is_taken(name):
+    told = fail("bench", name, "--num-envs", "1e9")
+    assert "num_envs must be at most 1,048,576, got 1000000000" in told
+
+
 @pytest.mark.parametrize(
     ("args", "message"),
     [

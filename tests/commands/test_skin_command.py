@@ -264,6 +264,7 @@ def test_meshes_that_are_not_the_robots_are_left_out():
         (["import", "bad.csv", "--out", "no/a.json"], "there is no folder"),
         (["import", "bad.csv", "--link-map", "arm", "--out", "a.json"], "name=value"),
         (["import", "--out", "a.json"], "at least one file"),
+        (["import", "bad.csv", "./bad.csv", "--out", "a.json"], "file is given twice"),
         (["import", "pipe", "--out", "a.json"], "pipe must be a file"),
         (
             ["import", "bad.csv", "--robot", "h1", "--out", "a.json"],

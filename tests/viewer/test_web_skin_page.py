@@ -200,6 +200,13 @@ def test_a_robot_whose_shapes_are_all_left_out_is_shown(tmp_path):
         page.close()
 
 
+def test_a_model_without_bodies_is_refused(tmp_path):
+    path = tmp_path / "empty.xml"
+    path.write_text("<mujoco><worldbody/></mujoco>")
+    with pytest.raises(ValueError, match="the model of empty has no bodies to show"):
+        SkinPage(read_robot(path), None)
+
+
 @pytest.mark.parametrize(
     ("args", "text"),
     [

@@ -17,7 +17,7 @@ from egoskin.envs.physics import PhysicsConfig, Scene
 from egoskin.envs.physics.model import build_scene
 from egoskin.envs.physics.mujoco import MujocoPhysics
 from egoskin.envs.throws import ThrowConfig
-from egoskin.make import EnvConfig
+from egoskin.make import AGENTS, EnvConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,7 +28,7 @@ class PhysicsBench:
     (standard deviation 0.4 rad) in every control step and falls.
     """
 
-    num_envs: Annotated[int, COUNT] = 256
+    num_envs: Annotated[int, AGENTS] = 256
     """Simulations."""
     steps: Annotated[int, COUNT] = 30
     """Control steps in each measurement."""

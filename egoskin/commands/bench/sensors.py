@@ -13,7 +13,7 @@ from torch import Tensor
 
 from egoskin.bounds import COUNT, check_bounds
 from egoskin.commands.bench.report import Row, median_row, show
-from egoskin.make import EnvConfig, make_worker_env
+from egoskin.make import AGENTS, EnvConfig, make_worker_env
 from egoskin.parallel import keep_freed_memory
 from egoskin.robots.builtin import H1_2
 from egoskin.sensors import FieldSensor, Proximity, RaySensor, Skin
@@ -36,7 +36,7 @@ class SensorBench:
     the field 24 bytes per sensor, for the minimum of the rays as many as their grid.
     """
 
-    num_envs: Annotated[int, COUNT] = 4096
+    num_envs: Annotated[int, AGENTS] = 4096
     """Agents."""
     snapshots: Annotated[int, COUNT] = 6
     """States of the rollout to measure on, in turn."""

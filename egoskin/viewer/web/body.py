@@ -44,12 +44,17 @@ class Body:
 
     Args:
         robot: The robot; its base may be fixed.
+
+    Raises:
+        ValueError: If the robot's model has no bodies.
     """
 
     def __init__(self, robot: RobotConfig) -> None:
         self.robot, self.model = robot, robot.model
         self.data = mujoco.MjData(self.model)
         model = self.model
+        if model.nbody == 1:
+            raise ValueError(f"the model of {robot.name} has no bodies to show")
         self._bodies = {body_name(model, i): i for i in range(1, model.nbody)}
         joints = {joint_name(model, i): i for i in range(model.njnt)}
         self._joint = model.jnt_qposadr[[joints[name] for name in robot.joints]]
