@@ -683,5 +683,6 @@ def test_an_unknown_engine_or_device_is_refused(options, message):
 def test_the_critic_knows_how_balls_fly(flight, gravity):
     task = replace(TASK, throws=replace(TASK.throws, flight=flight))
     env = make_worker_env(EnvConfig(task=task), SKIN, num_envs=2, seed=0)
+    assert isinstance(env.transform, Compose)
     (privileged,) = (t for t in env.transform if isinstance(t, Privileged))
     assert privileged._gravity == gravity
