@@ -11,7 +11,6 @@ egoskin evaluate runs/NAME --perturbed
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,6 +39,7 @@ from egoskin.progress import StatusLine, counted
 from egoskin.rng import check_seed
 from egoskin.sensors import MASK_ALL
 from egoskin.storage.files import check_output, write_output
+from egoskin.storage.serialization import write_json
 
 PICTURE_SUFFIXES = (".png", ".svg", ".pdf")
 
@@ -340,5 +340,4 @@ def main(args: list[str]) -> None:
         content["map"] = [dataclasses.asdict(line) for line in lines]
         print(f"\n{config.map}: success against speed, interval, height and direction")
     if config.json is not None:
-        text = json.dumps(content, indent=2) + "\n"
-        write_output(config.json, text.encode())
+        write_json(config.json, content)

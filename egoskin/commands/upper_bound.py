@@ -13,7 +13,6 @@ the policy does worse, it lacks training, or its sensors lack information.
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 import sys
 import time
@@ -36,7 +35,8 @@ from egoskin.evaluation.upper_bound import (
 from egoskin.policies.policy import load_policy
 from egoskin.progress import counted
 from egoskin.rng import check_seed
-from egoskin.storage.files import check_output, write_output
+from egoskin.storage.files import check_output
+from egoskin.storage.serialization import write_json
 
 # Bounds of the groups by the height that the throw is aimed at [m].
 BOUNDS = (0.0, 0.7, 0.9, 1.1, 1.3, 2.0)
@@ -161,5 +161,4 @@ def main(args: list[str]) -> None:
             "all": _total(result),
             "by_height_m": groups(result),
         }
-        text = json.dumps(content, indent=2) + "\n"
-        write_output(config.json, text.encode())
+        write_json(config.json, content)

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import dataclasses
 import io
-import json
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -47,7 +46,7 @@ from egoskin.robots.own import find_robot
 from egoskin.sensors import Field, Ray, Skin
 from egoskin.sensors.config import SensorConfig, SkinConfig
 from egoskin.storage.files import check_output, write_output
-from egoskin.storage.serialization import to_plain
+from egoskin.storage.serialization import to_plain, write_json
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".svg", ".pdf")
 BLIND, NOWHERE = "#c1272d", "#e6e6e6"
@@ -268,8 +267,7 @@ def main(args: list[str]) -> None:
     report = analysis.report()
     print_table(analysis, report)
     content = {"config": to_plain(config), "sensors": len(skin), **report}
-    text = json.dumps(content, indent=2, allow_nan=False) + "\n"
-    write_output(config.json, text.encode())
+    write_json(config.json, content, allow_nan=False)
     verb = "sees" if len(skin) == 1 else "see"
     title = f"What {counted(len(skin), 'sensor')} on {robot.name} {verb}"
     if config.occlusion:

@@ -23,7 +23,7 @@ import dacite
 
 from egoskin.bounds import BoundsError, path_to
 from egoskin.hints import did_you_mean
-from egoskin.storage.files import read_regular
+from egoskin.storage.files import read_regular, write_output
 
 T = TypeVar("T")
 # Deeper than anything that egoskin writes, and safe for recursive functions.
@@ -53,6 +53,22 @@ def read_json(path: Path) -> Any:
         return value
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not JSON: {error}") from error
+
+
+def write_json(path: Path, content: Any, *, allow_nan: bool = True) -> None:
+    """Write a JSON file that an option names; see `write_output`.
+
+    Args:
+        path: File to write.
+        content: JSON values.
+        allow_nan: Whether NaN and infinity may occur, which JSON does not have.
+
+    Raises:
+        ValueError: If they occur but may not.
+        OSError: If it cannot be written; the text names the file.
+    """
+    text = json.dumps(content, indent=2, allow_nan=allow_nan) + "\n"
+    write_output(path, text.encode())
 
 
 def _depth(value: Any) -> int:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import statistics
 import sys
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from egoskin.storage.files import write_output
+from egoskin.storage.serialization import write_json
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,4 +46,4 @@ def report(rows: list[Row], path: Path | None) -> None:
         print(f"{row.name:<36} {number:>10} {row.unit}  ratio {row.ratio:.3f}")
     if path is not None:
         content = {"rows": [asdict(row) for row in rows]}
-        write_output(path, (json.dumps(content, indent=2) + "\n").encode())
+        write_json(path, content)
