@@ -38,7 +38,7 @@ from egoskin.policies.policy import load_policy
 from egoskin.progress import StatusLine, counted
 from egoskin.rng import check_seed
 from egoskin.sensors import MASK_ALL
-from egoskin.storage.files import check_output, write_output
+from egoskin.storage.files import check_output, write_figure
 from egoskin.storage.serialization import write_json
 
 PICTURE_SUFFIXES = (".png", ".svg", ".pdf")
@@ -333,9 +333,8 @@ def main(args: list[str]) -> None:
             on_point=counting("map"),
         )
         line.finish()
-        form = config.map.suffix[1:]
-        picture = draw_map(lines, title_of(episodes), task.success_age_s, form)
-        write_output(config.map, picture)
+        figure = draw_map(lines, title_of(episodes), task.success_age_s)
+        write_figure(config.map, figure, dpi=110)
         content["map_episodes"] = episodes
         content["map"] = [dataclasses.asdict(line) for line in lines]
         print(f"\n{config.map}: success against speed, interval, height and direction")

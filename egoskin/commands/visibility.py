@@ -14,7 +14,6 @@ by their signals.
 from __future__ import annotations
 
 import dataclasses
-import io
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -25,10 +24,7 @@ import numpy as np
 import tyro
 
 try:
-    import matplotlib
-
-    matplotlib.use("Agg")  # no display is needed
-    from matplotlib import pyplot as plt
+    from matplotlib import colormaps
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 except ImportError:
@@ -45,7 +41,7 @@ from egoskin.progress import counted, note
 from egoskin.robots.own import find_robot
 from egoskin.sensors import Field, Ray, Skin
 from egoskin.sensors.config import SensorConfig, SkinConfig
-from egoskin.storage.files import check_output, write_output
+from egoskin.storage.files import check_output, write_figure
 from egoskin.storage.serialization import to_plain, write_json
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".svg", ".pdf")
@@ -142,7 +138,7 @@ def print_table(analysis: Analysis, report: dict[str, Any]) -> None:
 
 def draw_map(axes: Axes, analysis: Analysis, cell: int, seen: float | None) -> Any:
     """Draw the world map of a cell; return its image, for the colour bar."""
-    colours = plt.get_cmap("viridis").with_extremes(bad=NOWHERE, under=BLIND)
+    colours = colormaps["viridis"].with_extremes(bad=NOWHERE, under=BLIND)
     # Negative where nothing is seen before the contact.
     share = analysis.clearance_map(cell) / analysis.cells[cell].range
     share = np.where(share <= 0, -1.0, share)
@@ -170,7 +166,7 @@ def draw_map(axes: Axes, analysis: Analysis, cell: int, seen: float | None) -> A
 
 def draw_warnings(axes: Axes, analysis: Analysis, ranges: int) -> None:
     """Draw the share of hits with at least a given warning time."""
-    palette = plt.get_cmap("plasma")(np.linspace(0.0, 0.8, ranges))
+    palette = colormaps["plasma"](np.linspace(0.0, 0.8, ranges))
     for cell, warning in enumerate(analysis.warning.numpy()):
         time = np.append(0.0, np.sort(warning))
         share = np.linspace(1.0, 0.0, len(time))
@@ -192,7 +188,7 @@ def draw_table(
     axes: Axes, values: np.ndarray, rows: list[str], columns: list[str], title: str
 ) -> None:
     """Draw shares as a coloured table; NaN stays grey."""
-    colours = plt.get_cmap("Reds").with_extremes(bad=NOWHERE)
+    colours = colormaps["Reds"].with_extremes(bad=NOWHERE)
     axes.imshow(values, cmap=colours, vmin=0, vmax=1, aspect="auto")
     for (i, j), value in np.ndenumerate(values):
         if np.isfinite(value):
@@ -209,7 +205,7 @@ def draw(analysis: Analysis, report: dict[str, Any], title: str) -> Figure:
     """Return the picture: maps above, warnings and tables below."""
     names = list(dict.fromkeys(c.coverage for c in analysis.cells))
     ranges = len(analysis.cells) // len(names)
-    figure = plt.figure(figsize=(16, 2.4 * len(names) + 5.6), layout="constrained")
+    figure = Figure(figsize=(16, 2.4 * len(names) + 5.6), layout="constrained")
     figure.suptitle(title, fontsize=12)
     heights = [2.2 * len(names), 5.0]
     above, below = figure.subfigures(2, 1, height_ratios=heights, squeeze=False).flat
@@ -273,8 +269,5 @@ def main(args: list[str]) -> None:
     if config.occlusion:
         title += ", occluded by its body"
     figure = draw(analysis, report, title)
-    file = io.BytesIO()
-    figure.savefig(file, format=config.out.suffix[1:], dpi=110)
-    plt.close(figure)
-    write_output(config.out, file.getvalue())
+    write_figure(config.out, figure, dpi=110)
     print(f"picture {config.out}, results {config.json}")

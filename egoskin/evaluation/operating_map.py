@@ -7,7 +7,6 @@ varied together. Everything else is as in the task.
 from __future__ import annotations
 
 import dataclasses
-import io
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -24,6 +23,7 @@ from egoskin.sensors import Skin
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 # Speed [m/s], time between throws [s], height aimed at [m] and direction [deg].
 _SPEEDS = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 10.0, 12.0)
@@ -221,16 +221,13 @@ def _grid(properties: Sequence[_Property]) -> list[tuple[float, ...]]:
     return grid
 
 
-def draw_map(
-    lines: Sequence[Line], title: str, success_age_s: float, form: str
-) -> bytes:
-    """Return the picture of an operating map; needs matplotlib.
+def draw_map(lines: Sequence[Line], title: str, success_age_s: float) -> Figure:
+    """Return the figure of an operating map; needs matplotlib.
 
     Args:
         lines: Result of `operating_map`.
         title: Title of the figure.
         success_age_s: Age at which the success counts [s].
-        form: Format of the picture: png, svg or pdf.
     """
     from matplotlib.figure import Figure
 
@@ -246,9 +243,7 @@ def draw_map(
         axis.axis("off")
     handles, labels = axes[0].get_legend_handles_labels()
     axes[-1].legend(handles, labels, loc="center", frameon=False)
-    file = io.BytesIO()
-    figure.savefig(file, format=form, dpi=110)
-    return file.getvalue()
+    return figure
 
 
 def _draw_line(axis: Axes, line: Line, age: float) -> None:

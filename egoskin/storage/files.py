@@ -5,11 +5,16 @@ Contract: no function here waits for a named pipe, opens a device or fills memor
 
 from __future__ import annotations
 
+import io
 import os
 import stat
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 TEXT_LIMIT = 64 * 2**20
 """Maximum size of a text file: a skin, a robot, a configuration [bytes]."""
@@ -137,6 +142,22 @@ def write_output(path: Path, content: bytes) -> None:
         path.write_bytes(content)
     except OSError as error:
         raise named(error, path) from error
+
+
+def write_figure(path: Path, figure: Figure, **options: Any) -> None:
+    """Write a picture of a figure, in the format of its suffix; see `write_output`.
+
+    Args:
+        path: File to write.
+        figure: matplotlib's figure.
+        **options: Further options of its ``savefig``.
+
+    Raises:
+        OSError: If it cannot be written; the text names the file.
+    """
+    file = io.BytesIO()
+    figure.savefig(file, format=path.suffix[1:], **options)
+    write_output(path, file.getvalue())
 
 
 def append(path: Path, content: bytes) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from egoskin.storage.files import write_figure
 from egoskin.study.findings import MARGIN, SAME, Judged
 from egoskin.study.manifest import Cell, Manifest
 from egoskin.study.metrics import frames_to
@@ -93,8 +94,9 @@ def _unskinned(manifest: Manifest, coverage: str) -> Cell | None:
 def save(figure: Figure, folder: Path, name: str) -> None:
     """Write a figure as PNG and SVG; equal figures give equal bytes."""
     with mpl.rc_context({"svg.hashsalt": name, "svg.fonttype": "path"}):
-        figure.savefig(folder / f"{name}.png", dpi=130, metadata={"Software": None})
-        figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
+        png, svg = folder / f"{name}.png", folder / f"{name}.svg"
+        write_figure(png, figure, dpi=130, metadata={"Software": None})
+        write_figure(svg, figure, metadata={"Date": None})
 
 
 def _plain(axes: Axes) -> None:

@@ -16,6 +16,7 @@ from egoskin.make import EnvConfig
 from egoskin.robots.builtin import H1_2
 from egoskin.sensors import MASK_ALL, place_sensors
 from egoskin.sensors.config import SensorConfig
+from egoskin.storage.files import write_figure
 from throwing import TASK
 
 SKIN = place_sensors(H1_2, 8, seed=0)
@@ -200,13 +201,13 @@ def test_a_map_is_drawn_with_its_numbers(suffix, tmp_path):
         ),
     ]
     path = tmp_path / f"map{suffix}"
-    path.write_bytes(draw_map(lines, "a policy", 2.0, suffix[1:]))
+    write_figure(path, draw_map(lines, "a policy", 2.0))
     assert path.stat().st_size > 1000
     if suffix == ".svg":
         import matplotlib as mpl
 
         with mpl.rc_context({"svg.fonttype": "none"}):
-            path.write_bytes(draw_map(lines, "a policy", 2.0, "svg"))
+            write_figure(path, draw_map(lines, "a policy", 2.0))
         text = path.read_text()
         for shown in (
             "a policy",
