@@ -107,7 +107,11 @@ class Place:
                     f"--density: the weight of {link} must be a number, got {weight!r}"
                 ) from None
         robot = find_robot(self.robot)
-        if self.num_sensors is None or self.num_sensors >= _MANY:
+        if self.num_sensors is None:
+            many = self.spacing is not None
+        else:
+            many = self.num_sensors >= _MANY
+        if many:
             print("placing many sensors: this may take some minutes", flush=True)
         skin = place_sensors(
             robot,
