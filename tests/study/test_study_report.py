@@ -369,6 +369,32 @@ def test_curves_of_a_long_training_make_a_small_picture(tmp_path: Path):
     assert max(path.count("L") for path in paths) < 250
 
 
+def test_a_run_that_has_not_learnt_has_a_mark_of_its_own(tmp_path: Path):
+    folder, mine = StudyFolder(tmp_path), resolve(SMOKE)
+    for run in mine.runs:
+        learns = run.cell.name != "blind" and run.seed == 0
+        store(folder, mine, run, 60.0 if learns else 1.0)
+    results = folder.results(mine)
+    figure = sample_efficiency(mine, results)
+    assert figure is not None
+    (axes,) = figure.axes
+    end = results[0].run.end / 1e6
+    crosses = [x for x in axes.lines if x.get_marker() == "x" and len(x.get_xdata())]
+    found = [np.transpose(x.get_data()).tolist() for x in crosses]
+    # Of two blind seeds, and of the second with a skin.
+    assert found == [[[end, 0]], [[end, 1], [end, 1]]]
+    # A cell of which no run has learnt has no mean.
+    means = [x for x in axes.lines if x.get_marker() == "o" and len(x.get_xdata())]
+    assert {y for x in means for y in np.asarray(x.get_ydata()).tolist()} == {0}
+
+
+def test_a_success_of_zero_is_not_cut_at_the_axis(manifest: Manifest):
+    figure = success_by_range(manifest, {"field-proximity-1m": {0: 0.0}})
+    assert figure is not None
+    (axes,) = figure.axes
+    assert not any(x.get_clip_on() for x in axes.lines if x.get_marker() == "s")
+
+
 def test_an_infinite_range_is_left_out_of_the_figure_over_ranges():
     names = ("field-proximity-1m", "field-proximity-infm")
     cells = ({"sensor.range": 1.0}, {"sensor.range": math.inf})
