@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from egoskin.storage.files import write_figure
 from egoskin.study.findings import MARGIN, SAME, Judged
 from egoskin.study.manifest import Cell, Manifest
-from egoskin.study.metrics import frames_to
+from egoskin.study.metrics import frames_to, has_learnt
 from egoskin.study.statistics import Effect, Table, contrast, spread
 from egoskin.study.store import Result
 
@@ -39,6 +39,8 @@ _GEOMETRIES = {
     ("ray", "none"): "ray, all beams",
     ("ray", "min"): "ray, closest beam",
 }
+RAYS = tuple(name for (coverage, _), name in _GEOMETRIES.items() if coverage == "ray")
+"""Names of the geometries of rays, that of all beams first."""
 # Fields that place a cell in the paper's grid.
 _GRID = {f"env.sensor.{name}" for name in ("coverage", "signal", "range", "reduce")}
 
@@ -73,12 +75,11 @@ def places(manifest: Manifest) -> dict[str, Place]:
 
 def _geometry(name: str, grid: Mapping[str, Place]) -> dict[tuple[str, float], str]:
     """Return the cells of a geometry by signal and range."""
-    ray = {p for p in _GEOMETRIES.values() if p.startswith("ray")}
     return {
         (place.signal, place.range): cell
         for cell, place in grid.items()
         if place.geometry == name
-        or (place.signal == "localization" and {place.geometry, name} <= ray)
+        or (place.signal == "localization" and {place.geometry, name} <= set(RAYS))
     }
 
 
@@ -187,13 +188,17 @@ def _draw_signal(
     x = [reach * shift for reach in by_range]
     all_seeds = [spread(values) for values in by_range.values()]
     mean = [s.iqm for s in all_seeds]
-    axes.plot(x, mean, marker=mark, color=colour, label=label, linewidth=2)
+    # Not cut at the axis at 0.
+    whole: dict[str, Any] = {"clip_on": False, "zorder": 3}
+    line = {"color": colour, "label": label, "linewidth": 2}
+    axes.plot(x, mean, marker=mark, **line, **whole)
     for at, own, values in zip(x, all_seeds, by_range.values(), strict=True):
         if own.seeds == 1:
-            axes.plot(at, own.iqm, mark, color=colour, markerfacecolor="white")
+            axes.plot(at, own.iqm, mark, color=colour, mfc="white", **whole)
         else:
             axes.vlines(at, own.low, own.high, color=colour, linewidth=6, alpha=0.4)
-            axes.plot([at] * own.seeds, values, ".", color="black", markersize=3)
+            dot = {"color": "black", "markersize": 3}
+            axes.plot([at] * own.seeds, values, ".", **dot, **whole)
 
 
 def _warnings(
@@ -449,20 +454,25 @@ def equivalence(manifest: Manifest, table: Table) -> Figure | None:
 def sample_efficiency(manifest: Manifest, results: Sequence[Result]) -> Figure | None:
     """Draw the frames to 50 % and 90 % of a run's final success, by cell and seed."""
     grid = places(manifest)
-    rows: list[tuple[str, str, list[float], list[float]]] = []
+    rows: list[tuple[str, str, list[float], list[float], list[float]]] = []
     for cell in manifest.cells:
         own = [r for r in results if r.run.cell == cell]
         half, most = ([frames_to(r, s) / 1e6 for r in own] for s in (0.5, 0.9))
         if own:
             signal = grid[cell.name].signal if cell.name in grid else ""
             colour = _STYLES.get(signal, (_BLIND, ""))[0]
-            rows.append((cell.name, colour, half, most))
+            # Runs that have not learnt are drawn at their end.
+            lost = [r.run.end / 1e6 for r in own if not has_learnt(r)]
+            rows.append((cell.name, colour, half, most, lost))
     if not rows:
         return None
     rows.sort(key=lambda row: spread(row[3]).iqm)
     figure = Figure(figsize=(8.5, 1.2 + 0.26 * len(rows)), layout="constrained")
     axes = figure.subplots()
-    for y, (_, colour, half, most) in enumerate(rows):
+    for y, (_, colour, half, most, lost) in enumerate(rows):
+        axes.plot(lost, [y] * len(lost), "x", color=colour, markersize=7)
+        if len(lost) == len(most):
+            continue
         ends = [spread(half).iqm, spread(most).iqm]
         axes.plot(ends, [y, y], color=colour, linewidth=2)
         axes.plot(ends[0], y, "o", color=colour, markerfacecolor="white", markersize=6)
@@ -473,6 +483,8 @@ def sample_efficiency(manifest: Manifest, results: Sequence[Result]) -> Figure |
             axes.plot([], [], "o-", color=colour, label=signal)
     axes.plot([], [], "o", color="black", markerfacecolor="white", label="50 %")
     axes.plot([], [], "o", color="black", label="90 % (bars: seeds)")
+    if any(row[4] for row in rows):
+        axes.plot([], [], "x", color="black", label="not learnt (< 5 %)")
     figure.legend(loc="outside upper center", ncols=5, frameon=False, fontsize=9)
     axes.set_yticks(range(len(rows)), [row[0] for row in rows], fontsize=8)
     axes.set_ylim(len(rows) - 0.4, -0.6)

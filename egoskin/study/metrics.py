@@ -34,6 +34,18 @@ class Metric:
     """Function that computes it; None if a run has no value."""
 
 
+def has_learnt(result: Result) -> bool:
+    """Return whether a run's final success in training is at least 5 %."""
+    return _final_success(result) >= _LEAST_END
+
+
+def _final_success(result: Result) -> float:
+    frames, success = result.stored.frames, result.stored.success
+    late = frames > (1 - _END_SHARE) * frames[-1:]
+    # The curve is empty if no episode was ever long enough to tell.
+    return float(success[late].mean()) if len(frames) else 0.0
+
+
 def frames_to(result: Result, share: float) -> float:
     """Return the frames until success in training reaches a share of its final value.
 
@@ -41,9 +53,7 @@ def frames_to(result: Result, share: float) -> float:
     out, it would make its cell look fast.
     """
     frames, success = result.stored.frames, result.stored.success
-    late = frames > (1 - _END_SHARE) * frames[-1:]
-    # The curve is empty if no episode was ever long enough to tell.
-    end = float(success[late].mean()) if len(frames) else 0.0
+    end = _final_success(result)
     if end < _LEAST_END:
         return float(result.run.end)
     first = int(np.argmax(success >= share * end))

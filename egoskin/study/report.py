@@ -20,9 +20,11 @@ from egoskin.storage.serialization import read_json
 from egoskin.study.differences import Difference, differences
 from egoskin.study.fields import settings
 from egoskin.study.figures import (
+    RAYS,
     equivalence,
     forest,
     learning_curves,
+    places,
     sample_efficiency,
     save,
     success_by_range,
@@ -43,6 +45,11 @@ from egoskin.study.store import Result, StudyFolder
 
 # The budget is the same for all runs: the share of it adds nothing to the frames.
 _SHOWN = [m for m in METRICS if m.name != "share_to_90"]
+_ASSUMED = (
+    "(The spread of cells with one seed is taken to be the largest of any cell, which "
+    "is too large for cells near 0 or 100 %.) *Needs more*: a cell has no run, no "
+    "spread is known, or 1,000 seeds are not enough."
+)
 
 
 def write_report(folder: StudyFolder, out: Path) -> None:
@@ -99,11 +106,17 @@ def _pictures(
         "Below: time from the first detection of a ball to its contact with a standing "
         "robot, median and 5 to 95 %. "
     )
+    grid = {(p.geometry, p.signal) for p in places(manifest).values()}
+    shared = (
+        "With rays localization is one cell, drawn for all beams and the closest one. "
+    )
+    if not {g for g, _ in grid} >= set(RAYS) or (RAYS[0], "localization") not in grid:
+        shared = ""
     drawn = {
         "success-by-range": (
             success_by_range(manifest, success, seen),
             "Success against range: interquartile mean (hollow: one seed) and range "
-            f"(bars) over seeds; each dot is a seed. {warnings if seen else ''}"
+            f"(bars) over seeds; each dot is a seed. {shared}{warnings if seen else ''}"
             "Infinite ranges are left out.",
         ),
         "findings": (
@@ -120,12 +133,13 @@ def _pictures(
         "learning-curves": (
             learning_curves(manifest, results),
             "Success in training, with exploration. Thin: each seed; thick: their "
-            "mean.",
+            f"mean. {shared}".rstrip(),
         ),
         "sample-efficiency": (
             sample_efficiency(manifest, results),
-            "Environment steps until a run reaches 50 and 90 % of its final success; "
-            "all its steps if that is below 5 %.",
+            "Environment steps until a run reaches 50 and 90 % of its final success. "
+            "Cross: a run that has not learnt, as that is below 5 %; it counts with "
+            "all its steps.",
         ),
     }
     return {k: (f, text) for k, (f, text) in drawn.items() if f is not None}
@@ -158,6 +172,7 @@ def _blocks(
         return
     if judged:
         yield _answer(judged)
+        yield from _why_undecided(judged, values["success_3s"])
     if "success-by-range" in shown:
         yield shown["success-by-range"]
     if judged:
@@ -169,9 +184,8 @@ def _blocks(
             "the deciding claim; an undecided finding has the p-value of the verdict "
             "it is nearer to. *Seeds* is the number it is based on and, if it is "
             "undecided, the total that would decide it with a power of 80 % if effect "
-            "and spread stay as observed. (The spread of cells with one seed is taken "
-            "to be the largest of any cell.) Findings about another budget are tested "
-            "by a stand-in."
+            f"and spread stay as observed. {_ASSUMED} Findings about another budget "
+            "are tested by a stand-in."
         )
         yield _finding_rows(judged, results)
     if "findings" in shown:
@@ -187,8 +201,7 @@ def _blocks(
             "compared seed by seed if they share two or more seeds. Two-sided "
             "p-values, corrected for the number of cells (Holm). *Seeds* is the number "
             "it is based on and, if p is above 0.05, the total that would decide it "
-            "with a power of 80 % if effect and spread stay as observed. (The spread "
-            "of cells with one seed is taken to be the largest of any cell.)"
+            f"with a power of 80 % if effect and spread stay as observed. {_ASSUMED}"
         )
         yield _difference_rows(found)
     yield "## The cells"
@@ -196,7 +209,8 @@ def _blocks(
         "Interquartile mean and range over seeds; in brackets the mean with its 95 % "
         "t interval, which needs two seeds or more and, assuming that they are "
         "normally distributed, may leave 0 to 100 %; n: if only some seeds have a "
-        "value."
+        "value. A run that has not learnt (final success in training below 5 %) counts "
+        "with all its frames."
     )
     yield _cell_rows(manifest, values)
     for name in ("equivalence", "learning-curves", "sample-efficiency"):
@@ -281,6 +295,16 @@ def _answer(judged: Sequence[Judged]) -> str:
     return f"**Of the paper's findings {'; '.join(parts)}.**"
 
 
+def _why_undecided(judged: Sequence[Judged], success: Table) -> Iterator[str]:
+    """Yield how many cells have too few seeds for any verdict, if there are any."""
+    fewer = sum(len(success.get(name, {})) < 2 for name in CELLS)
+    if fewer and any(j.verdict == "undecided" for j in judged):
+        yield (
+            "A verdict needs at least two seeds of the cells it rests on: "
+            f"{fewer} of {len(CELLS)} cells have fewer."
+        )
+
+
 def _deciding(judged: Judged) -> Tested:
     """Return the claim that decides a verdict: the least certain or the refuted one."""
     if judged.verdict == "refuted":
@@ -313,7 +337,7 @@ def _finding_rows(judged: Sequence[Judged], results: Sequence[Result]) -> str:
         known = sum(c.effect is not None for c in j.claims)
         claims = f"{known} of {len(j.claims)}"
         if not known:
-            none = (f"**{j.verdict}**", "", "no runs yet", "0", claims, "")
+            none = ("**untested**", "", "no runs yet", "0", claims, "")
             rows.append((j.finding.label, text, *none))
             continue
         claim = _deciding(j)
@@ -322,7 +346,7 @@ def _finding_rows(judged: Sequence[Judged], results: Sequence[Result]) -> str:
         more = cost = ""
         if j.verdict == "undecided":
             cells = {name for c in j.deciding for name in c.claim.weights}
-            more = _more(j.seeds_needed)
+            more = _more(effect.seeds, j.seeds_needed)
             if j.seeds_needed is not None and hours:
                 runs = sum(max(j.seeds_needed - have[c], 0) for c in cells)
                 cost = f"{runs * fmean(hours):,.0f}"
@@ -355,7 +379,7 @@ def _difference_rows(found: Sequence[Difference]) -> str:
     rows = []
     for each in found:
         open_ = each.p_value > ALPHA
-        more = _more(each.seeds_needed) if open_ else ""
+        more = _more(each.effect.seeds, each.seeds_needed) if open_ else ""
         seeds = f"{each.effect.seeds}{more}"
         rows.append((each.cell, _effect(each.effect), _p_value(each.p_value), seeds))
     return table(("cell", "difference [points] (95 %)", "p", "seeds"), rows)
@@ -368,9 +392,10 @@ def _effect(effect: Effect) -> str:
     return f"{effect.mean:+.1f}" + f" ({low:+.1f} to {high:+.1f})" * known
 
 
-def _more(needed: int | None) -> str:
+def _more(have: int, needed: int | None) -> str:
     """Return how many seeds would decide, after the number that there are."""
-    return ", needs more" if needed is None else f" of {needed}"
+    # Fewer than there are only if their differences have no spread.
+    return f" of {needed}" if needed is not None and needed > have else ", needs more"
 
 
 def _p_value(p: float) -> str:
@@ -406,9 +431,26 @@ def _spread(values: Sequence[float]) -> str:
 
 
 def _seen(folder: StudyFolder) -> list[dict[str, Any]]:
-    """Return the cells of the analysis of visibility, none if there is none."""
+    """Return the cells of the analysis of visibility, none if there is none.
+
+    Raises:
+        ValueError: If the file is not such an analysis.
+    """
     path = folder.path / "visibility.json"
-    return read_json(path)["cells"] if path.is_file() else []
+    if not path.is_file():
+        return []
+    try:
+        rows = read_json(path)["cells"]
+        for row in rows:
+            float(row["range"])
+            str(row["coverage"])
+            warning_texts(row)
+        return rows
+    except (KeyError, TypeError) as error:
+        raise ValueError(
+            f"{path} is damaged; write it again with: egoskin study plan --dir "
+            f"{folder.path} --visibility"
+        ) from error
 
 
 def _seen_rows(seen: Sequence[Mapping[str, Any]]) -> str:

@@ -243,6 +243,21 @@ class StudyFolder:
         """Return whether a run has been trained and evaluated."""
         return any(self.result_path(name).glob(_EVALUATION))
 
+    def _evaluation_path(self, name: str) -> Path:
+        """Return the evaluation of a finished run.
+
+        Raises:
+            ValueError: If there are several, as after copying from two studies.
+        """
+        folder = self.result_path(name)
+        files = sorted(folder.glob(_EVALUATION))
+        if len(files) > 1:
+            raise ValueError(
+                f"{folder} has {len(files)} evaluations, but only one can be right: "
+                + ", ".join(file.name for file in files)
+            )
+        return files[0]
+
     def finish(self, planned: PlannedRun, evaluation: Mapping[str, Any]) -> None:
         """Store the small files of a trained run, and mark it as finished.
 
@@ -298,7 +313,7 @@ class StudyFolder:
                 f"{folder} does not match the manifest: it differs in "
                 + ", ".join(differs)
             )
-        (file,) = folder.glob(_EVALUATION)
+        file = self._evaluation_path(planned.name)
         evaluation = stored.evaluation
         if evaluation["frames"] != planned.end:
             raise ValueError(
@@ -365,13 +380,16 @@ class StudyFolder:
     # --- progress -------------------------------------------------------------
 
     def status(self, runs: Iterable[PlannedRun]) -> list[RunStatus]:
-        """Return the status of each of some runs."""
+        """Return the status of each of some runs.
+
+        Raises:
+            ValueError: If a result is damaged.
+        """
         return [self._status(run) for run in runs]
 
     def _status(self, run: PlannedRun) -> RunStatus:
         if self.is_finished(run.name):
-            (file,) = self.result_path(run.name).glob(_EVALUATION)
-            content, _ = read_sealed(file)
+            content, _ = read_sealed(self._evaluation_path(run.name))
             success = content["success"]["mean"]
             return RunStatus(run=run, state="done", frames=run.end, success=success)
         row = _last_row(self.run_path(run.name) / "metrics.csv")

@@ -168,13 +168,8 @@ def load_run(path: Path) -> StoredRun:
             raise ValueError(f"{path} is incomplete: it has no {file.name}")
     if not evaluations:
         raise ValueError(f"{path} is incomplete: it has no evaluation")
-    with open(path / "metrics.csv", newline="") as source:
-        rows = list(csv.DictReader(source))
-    curve = np.array(
-        [(float(r["frames"]), float(r["episode/success"])) for r in rows]
-    ).reshape(-1, 2)
-    # There is no estimate before an episode can have lasted that long.
-    curve = curve[np.isfinite(curve[:, 1])]
+    made = from_plain(Record, read_json(what), str(what))
+    curve = _curve(path / "metrics.csv", made.frames)
     evaluation, _ = read_sealed(evaluations[-1])
     file = path / "config.json"
     # No note about a missing seal: stored runs are under version control.
@@ -182,11 +177,37 @@ def load_run(path: Path) -> StoredRun:
     return StoredRun(
         config=from_plain(TrainConfig, config, str(file)),
         hashes=hashes,
-        record=from_plain(Record, read_json(what), str(what)),
+        record=made,
         frames=curve[:, 0],
         success=curve[:, 1],
         evaluation=evaluation,
     )
+
+
+def _curve(path: Path, end: int) -> np.ndarray:
+    """Return frames and success of the learning curve, ``[n, 2]``.
+
+    Args:
+        path: The metrics of a finished run.
+        end: Environment steps of its policy.
+
+    Raises:
+        ValueError: If they end before: a part of a file may look like a slow run.
+    """
+    text = path.read_text()
+    try:
+        rows = [
+            (float(row["frames"]), float(row["episode/success"]))
+            for row in csv.DictReader(io.StringIO(text))
+        ]
+        whole = text.endswith("\n") and rows[-1][0] >= end
+    except (KeyError, TypeError, ValueError, IndexError):
+        whole, rows = False, []
+    if not whole:
+        raise ValueError(f"{path} is not whole: copy it again")
+    curve = np.array(rows)
+    # There is no estimate before an episode can have lasted that long.
+    return curve[np.isfinite(curve[:, 1])]
 
 
 def to_json(value: Record) -> str:

@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 from calling import fail
 from egoskin.commands.study import what_is_seen
 from egoskin.runs.run import Run
+from egoskin.study.differences import differences
 from egoskin.study.figures import (
     _draw_curves,
     equivalence,
@@ -33,7 +34,7 @@ from egoskin.study.findings import judge_findings
 from egoskin.study.manifest import Manifest, resolve
 from egoskin.study.metrics import METRICS, frames_to, runs_csv, tables
 from egoskin.study.page import page, table
-from egoskin.study.report import write_report
+from egoskin.study.report import _difference_rows, write_report
 from egoskin.study.shipped import FINDINGS, SMOKE
 from egoskin.study.store import StudyFolder
 from studies import expected, store, store_all
@@ -104,7 +105,7 @@ def test_the_answer_comes_first_and_what_is_missing_is_told(folder: StudyFolder)
     assert "blind" not in missing
 
 
-def test_a_finding_without_runs_is_listed_as_undecided(
+def test_a_finding_without_runs_is_listed_as_untested(
     manifest: Manifest, tmp_path: Path, without_pictures
 ):
     folder = StudyFolder(tmp_path)
@@ -114,11 +115,11 @@ def test_a_finding_without_runs_is_listed_as_undecided(
     text = (tmp_path / "report" / "report.md").read_text()
     verdicts = "refuted: 6b; untested: 1a, 1b, 1c, 2, 3, 4, 5, 6a"
     assert f"**Of the paper's findings {verdicts}.**" in text
+    # Why most of them have no verdict.
+    assert "at least two seeds of the cells it rests on: 27 of 28 cells have" in text
     for label, claims in (("1a", 20), ("3", 1), ("6a", 1)):
         (row,) = (line for line in text.splitlines() if line.startswith(f"| {label} |"))
-        assert row.endswith(
-            f"| **undecided** |  | no runs yet | 0 | 0 of {claims} |  |"
-        )
+        assert row.endswith(f"| **untested** |  | no runs yet | 0 | 0 of {claims} |  |")
 
 
 def test_a_run_that_failed_is_told_among_the_missing(
@@ -316,6 +317,23 @@ def test_the_visibility_of_balls_that_all_miss_is_reported(
     assert "| field 0.5 m | - | - / - / - |" in text
 
 
+@pytest.mark.parametrize("content", [{}, [], {"cells": [{}]}, {"cells": [1]}])
+def test_a_damaged_visibility_is_named(content, tmp_path: Path):
+    folder = StudyFolder(tmp_path)
+    folder.plan(resolve(SMOKE))
+    path = tmp_path / "visibility.json"
+    path.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=f"{path} .* --visibility"):
+        write_report(folder, tmp_path / "report")
+
+
+def test_seeds_without_a_spread_are_not_told_to_be_more_than_enough():
+    # All pairs differ by 60, so nothing is decided; the cells have a spread.
+    table = {"one": {0: 1.0, 1: 2.0, 2: 3.0}, "other": {0: 61.0, 1: 62.0, 2: 63.0}}
+    (row,) = _difference_rows(differences(list(table), table)).splitlines()[2:]
+    assert row == "| other | +60.0 | 1.000 | 3, needs more |"
+
+
 def test_a_study_without_a_purpose_has_a_report(tmp_path: Path, without_pictures):
     folder = StudyFolder(tmp_path)
     folder.plan(resolve(dataclasses.replace(FINDINGS, purpose="")))
@@ -367,6 +385,32 @@ def test_curves_of_a_long_training_make_a_small_picture(tmp_path: Path):
     save(figure, tmp_path, "curves")
     paths = re.findall(r'd="([^"]*)"', (tmp_path / "curves.svg").read_text())
     assert max(path.count("L") for path in paths) < 250
+
+
+def test_a_run_that_has_not_learnt_has_a_mark_of_its_own(tmp_path: Path):
+    folder, mine = StudyFolder(tmp_path), resolve(SMOKE)
+    for run in mine.runs:
+        learns = run.cell.name != "blind" and run.seed == 0
+        store(folder, mine, run, 60.0 if learns else 1.0)
+    results = folder.results(mine)
+    figure = sample_efficiency(mine, results)
+    assert figure is not None
+    (axes,) = figure.axes
+    end = results[0].run.end / 1e6
+    crosses = [x for x in axes.lines if x.get_marker() == "x" and len(x.get_xdata())]
+    found = [np.transpose(x.get_data()).tolist() for x in crosses]
+    # Of two blind seeds, and of the second with a skin.
+    assert found == [[[end, 0]], [[end, 1], [end, 1]]]
+    # A cell of which no run has learnt has no mean.
+    means = [x for x in axes.lines if x.get_marker() == "o" and len(x.get_xdata())]
+    assert {y for x in means for y in np.asarray(x.get_ydata()).tolist()} == {0}
+
+
+def test_a_success_of_zero_is_not_cut_at_the_axis(manifest: Manifest):
+    figure = success_by_range(manifest, {"field-proximity-1m": {0: 0.0}})
+    assert figure is not None
+    (axes,) = figure.axes
+    assert not any(x.get_clip_on() for x in axes.lines if x.get_marker() == "s")
 
 
 def test_an_infinite_range_is_left_out_of_the_figure_over_ranges():

@@ -65,6 +65,33 @@ def test_a_folder_that_is_not_whole_is_named(missing, tmp_path: Path):
         load_run(half)
 
 
+@pytest.mark.parametrize("kept", [0, 500, -100, "rows"])
+def test_metrics_that_were_not_copied_to_their_end_are_refused(kept, tmp_path: Path):
+    # Read as they are, the run would count as one that has not learnt.
+    part = tmp_path / "part"
+    shutil.copytree(ARCHIVE / "results" / "blind-seed0", part)
+    text = (part / "metrics.csv").read_text()
+    lines = text.splitlines(keepends=True)
+    text = "".join(lines[:-1]) if kept == "rows" else text[:kept]
+    (part / "metrics.csv").write_text(text)
+    with pytest.raises(ValueError, match=r"part.*metrics\.csv.*not.*whole"):
+        load_run(part)
+
+
+def test_a_result_with_two_evaluations_is_named(tmp_path: Path):
+    shutil.copytree(ARCHIVE, tmp_path / "study")
+    folder = StudyFolder(tmp_path / "study")
+    manifest = folder.manifest()
+    path = folder.result_path("blind-seed0")
+    (file,) = path.glob("evaluation_*")
+    shutil.copy(file, path / "evaluation_000000065536.json")
+    run = manifest.run("blind-seed0")
+    for ask in (lambda: folder.status([run]), lambda: folder.result(run)):
+        with pytest.raises(ValueError, match="blind-seed0 has 2 evaluations") as error:
+            ask()
+        assert file.name in str(error.value)
+
+
 def test_the_runs_so_far_of_the_study_in_progress_are_read():
     folder = StudyFolder(STUDIES / "findings")
     manifest = folder.manifest()
