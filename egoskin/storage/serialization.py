@@ -127,9 +127,10 @@ def from_plain(kind: type[T], content: Any, what: str) -> T:
         raise ValueError(f"{what}: {error.field_path} is missing") from error
     except dacite.WrongTypeError as error:
         text = f"{what}: {error.field_path} must be {_described(error.field_type)}"
-        # dacite changes a string that is given for a list.
-        if not (isinstance(error.value, str) and "list" in text):
-            text += f", got {json.dumps(to_plain(error.value), default=str)}"
+        given = json.dumps(to_plain(error.value), default=str)
+        # dacite changes a string that is given for a list or an object.
+        if "<generator object" not in given:
+            text += f", got {given}"
         raise ValueError(text) from error
     # ValueError is raised by the checks of the configuration itself.
     except (dacite.DaciteError, ValueError) as error:

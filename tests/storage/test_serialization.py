@@ -53,6 +53,7 @@ def test_a_range_that_is_none_is_named(value: Any):
         ({"standard": 2}, r'standard must be one of "2", "1", "paper", got 2'),
         ({"seeds": ["0"]}, r'seeds must be a list, each item an integer, got \["0"\]'),
         ({"seeds": "all"}, r"seeds must be a list, each item an integer$"),
+        ({"cells": ["a"]}, r"cells must be a list, each item an object$"),
         (
             {"cells": {"sensor.range": 1}},
             r'cells must be a list, each item an object, got \{"sensor.range": 1\}$',
