@@ -553,9 +553,13 @@ def checked(
         kind: Required kind of coverage.
 
     Raises:
-        ValueError: If the range is not a positive number, a sensor has no range, or its
-            coverage is of another kind.
+        ValueError: If the skin is not a `Skin`, the range is not a positive number, a
+            sensor has no range, or its coverage is of another kind.
     """
+    if not isinstance(skin, Skin):
+        raise ValueError(
+            f"skin must be a Skin (Skin.load for a file), got {type(skin).__name__}"
+        )
     if max_range is not None and not isinstance(max_range, Real):
         raise ValueError(
             f"max_range must be one number, got {max_range!r}; a range for each sensor "

@@ -52,7 +52,13 @@ class _Reading(RowTransform):
         )
         if isinstance(max_range, ProximitySensor):
             max_range = max_range.ranges.tolist()
-        limit = torch.as_tensor(max_range, dtype=torch.float64)
+        try:
+            limit = torch.as_tensor(max_range, dtype=torch.float64)
+        except (TypeError, ValueError) as error:
+            raise ValueError(
+                "max_range must be a sensor transform, a number or one for each "
+                f"sensor, got {type(max_range).__name__}"
+            ) from error
         if not limit.numel() or not (limit > 0).all():
             raise ValueError(f"max_range must be positive, got {max_range}")
         self.register_buffer("_range", limit.reshape(-1), persistent=False)
