@@ -173,7 +173,8 @@ class ProximitySensor(RowTransform):
                 "body must hold primitives (RobotConfig.primitives), got "
                 f"{type(body).__name__}"
             )
-        skin.check_links(chain.get_link_names())
+        # The skin's robot may well have the link, if the chain is another robot's.
+        skin.check_links(chain.get_link_names(), "the chain")
         self.num_sensors = len(skin)
         several = isinstance(objects, Iterable)
         self.objects = tuple(objects) if several else (objects,)
