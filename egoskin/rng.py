@@ -14,6 +14,7 @@ from collections.abc import Callable
 from enum import IntEnum
 from functools import cache
 from importlib.util import find_spec
+from numbers import Integral
 
 import torch
 from torch import Tensor
@@ -123,6 +124,8 @@ def stream_key(seed: int, stream: Stream) -> tuple[int, int]:
     Raises:
         ValueError: If the seed is neither of them.
     """
+    if not isinstance(seed, Integral):
+        raise ValueError(f"the seed must be an integer, got {seed!r}")
     own = seed & ~_HELD_OUT
     if not 0 <= own <= _MASK:
         check_seed(seed)

@@ -29,7 +29,7 @@ comparisons are used. Their rounding is unique, so compiled code gives the same 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Sequence, Sized
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -422,7 +422,7 @@ def shape_of(kind: str, size: Sequence[float]) -> Shape:
 
 def _check_lengths(name: str, lengths: Sequence[float], count: int) -> None:
     """Raise ValueError unless there are ``count`` positive, finite lengths."""
-    if len(lengths) != count:
+    if not isinstance(lengths, Sized) or len(lengths) != count:
         raise ValueError(f"{name} must hold {count} lengths, got {lengths}")
     if not all(length > 0 and math.isfinite(length) for length in lengths):
         got = lengths[0] if count == 1 else lengths

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -25,16 +25,39 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 
+def key_list(
+    name: str, keys: Sequence[NestedKey], least: int = 0, most: int | None = None
+) -> list[NestedKey]:
+    """Return keys as a list.
+
+    Args:
+        name: Name of the argument that holds them, for the error text.
+        keys: The keys.
+        least: Number that is needed.
+        most: Number that is allowed; None: any.
+
+    Raises:
+        ValueError: If they are not a list of keys, or too few or too many.
+    """
+    if isinstance(keys, str) or not isinstance(keys, Iterable):
+        raise ValueError(f"{name} must be a list of keys, got {keys!r}")
+    keys = list(keys)
+    if len(keys) < least or (most is not None and len(keys) > most):
+        number = f"{least}" if most == least else f"at least {least}"
+        raise ValueError(f"{name} must be a list of {number}, got {keys}")
+    return keys
+
+
 class _KeyedTransform(Transform):
     """A transform that reads some keys and adds others to the observation."""
 
     def __init__(
         self, in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey]
     ) -> None:
-        for name, keys in (("in_keys", in_keys), ("out_keys", out_keys)):
-            if isinstance(keys, str):
-                raise ValueError(f"{name} must be a list of keys, got {keys!r}")
-        super().__init__(in_keys=list(in_keys), out_keys=list(out_keys))
+        super().__init__(
+            in_keys=key_list("in_keys", in_keys),
+            out_keys=key_list("out_keys", out_keys),
+        )
 
     def clone(self) -> Self:
         """Return a copy for another environment, which shares nothing that changes."""
@@ -150,7 +173,7 @@ class RowTransform(_KeyedTransform):
         out_keys: Keys written.
 
     Raises:
-        ValueError: If the keys are a single string.
+        ValueError: If the keys are not a list.
     """
 
     @abstractmethod

@@ -472,6 +472,8 @@ def test_lengths_must_be_positive_and_finite(wrong):
 def test_wrong_kinds_and_sizes_are_told():
     with pytest.raises(ValueError, match="half_extents must hold 3 lengths"):
         Box(half_extents=(0.1, 0.2))  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match=r"must hold 3 lengths, got 0\.1"):
+        Box(half_extents=0.1)  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="did you mean 'ellipsoid'"):
         shape_of("elipsoid", [1, 1, 1])
     with pytest.raises(ValueError, match="sphere, capsule, box, ellipsoid, got 'mesh'"):

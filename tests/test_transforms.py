@@ -24,9 +24,13 @@ from egoskin.make import EnvConfig, make_worker_env
 from egoskin.robots.builtin import H1_2
 from egoskin.sensors import (
     MASK_ALL,
+    BeamMinimum,
     Binary,
+    Corruption,
     Field,
     FieldSensor,
+    History,
+    KeepLast,
     Localization,
     Proximity,
     RaySensor,
@@ -182,6 +186,47 @@ def test_results_that_are_not_one_for_each_key_are_refused(method, given):
     ask, given_to_it = asked[method]
     with pytest.raises(TypeError, match=expected):
         ask(given_to_it)
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        # Only `Proximity` and `Binary` take the sensor.
+        (
+            lambda: Localization(FieldSensor(SKIN, H1_2.chain, BALLS, 1.0)),
+            r"in_keys must be a list of keys, got FieldSensor\(",
+        ),
+        (lambda: History(3, "signal"), "in_keys must be a list of keys, got 'signal'"),
+        (lambda: History(3, ["a"], "b"), "out_keys must be a list of keys, got 'b'"),
+        (
+            lambda: Corruption([], dt=1, seed=0, in_keys="distance"),
+            "in_keys must be a list of keys, got 'distance'",
+        ),
+        (
+            lambda: Corruption([], dt=1, seed=0, out_keys=["a", "b"]),
+            r"out_keys must be a list of 1, got \['a', 'b'\]",
+        ),
+        # A nested key in place of a list of one.
+        (
+            lambda: Proximity(1.0, in_keys=("next", "distance")),
+            r"in_keys must be a list of 1, got \['next', 'distance'\]",
+        ),
+        (lambda: Binary(in_keys=["a", "b"], out_keys=["c", "d"]), "in_keys must be a"),
+        (
+            lambda: Proximity(1.0, out_keys=[]),
+            r"out_keys must be a list of 1, got \[\]",
+        ),
+        (lambda: BeamMinimum(["a", "b"]), "in_keys must be a list of 1, got"),
+        (
+            lambda: Localization(["a"]),
+            r"in_keys must be a list of at least 4, got \['a",
+        ),
+        (lambda: KeepLast(["signal"]), "in_keys must be a list of at least 2, got"),
+    ],
+)
+def test_keys_of_a_wrong_kind_or_number_are_refused(build, message):
+    with pytest.raises(ValueError, match=message):
+        build()
 
 
 def test_a_transform_before_what_it_reads_names_the_key():

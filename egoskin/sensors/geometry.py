@@ -173,7 +173,8 @@ class ProximitySensor(RowTransform):
                 "body must hold primitives (RobotConfig.primitives), got "
                 f"{type(body).__name__}"
             )
-        skin.check_links(chain.get_link_names())
+        # The skin's robot may well have the link, if the chain is another robot's.
+        skin.check_links(chain.get_link_names(), "the chain")
         self.num_sensors = len(skin)
         several = isinstance(objects, Iterable)
         self.objects = tuple(objects) if several else (objects,)
@@ -553,9 +554,13 @@ def checked(
         kind: Required kind of coverage.
 
     Raises:
-        ValueError: If the range is not a positive number, a sensor has no range, or its
-            coverage is of another kind.
+        ValueError: If the skin is not a `Skin`, the range is not a positive number, a
+            sensor has no range, or its coverage is of another kind.
     """
+    if not isinstance(skin, Skin):
+        raise ValueError(
+            f"skin must be a Skin (Skin.load for a file), got {type(skin).__name__}"
+        )
     if max_range is not None and not isinstance(max_range, Real):
         raise ValueError(
             f"max_range must be one number, got {max_range!r}; a range for each sensor "

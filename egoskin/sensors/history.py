@@ -10,7 +10,7 @@ from tensordict import NestedKey
 from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 
-from egoskin.transform import StatefulTransform
+from egoskin.transform import StatefulTransform, key_list
 
 
 class History(StatefulTransform):
@@ -38,9 +38,11 @@ class History(StatefulTransform):
     ) -> None:
         if not isinstance(length, Integral) or length < 1:
             raise ValueError(f"length must be an integer, at least 1, got {length}")
+        in_keys = key_list("in_keys", in_keys)
+        out_keys = key_list("out_keys", out_keys)
         if len(in_keys) != len(out_keys):
             raise ValueError(
-                f"need one out key per in key, got {list(in_keys)} and {list(out_keys)}"
+                f"need one out key per in key, got {in_keys} and {out_keys}"
             )
         super().__init__(in_keys, out_keys, state_keys=out_keys)
         self.length = length
@@ -94,6 +96,9 @@ class KeepLast(StatefulTransform):
     Args:
         in_keys: Keys of the signal and of the detections (one or more).
         out_keys: Key of the last signal.
+
+    Raises:
+        ValueError: If the number of keys is wrong.
     """
 
     def __init__(
@@ -101,6 +106,8 @@ class KeepLast(StatefulTransform):
         in_keys: Sequence[NestedKey] = ("signal", "object_detected"),
         out_keys: Sequence[NestedKey] = ("last_signal",),
     ) -> None:
+        in_keys = key_list("in_keys", in_keys, 2)
+        out_keys = key_list("out_keys", out_keys, 1, 1)
         super().__init__(in_keys, out_keys, state_keys=out_keys)
 
     def start(

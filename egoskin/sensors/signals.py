@@ -18,7 +18,7 @@ from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 
 from egoskin.robots.kinematics import rotate_inverse
 from egoskin.sensors.geometry import ProximitySensor
-from egoskin.transform import RowTransform
+from egoskin.transform import RowTransform, key_list
 
 # An infinite range has no scale: a distance d gives the signal d / (d + 1 m).
 _HALF_DISTANCE = 1.0
@@ -35,7 +35,8 @@ class _Reading(RowTransform):
         out_keys: Key of the signal.
 
     Raises:
-        ValueError: If a range is not positive, or there is none.
+        ValueError: If a range is not positive, or there is none, or there is not one
+            key each.
     """
 
     _range: Tensor
@@ -46,10 +47,18 @@ class _Reading(RowTransform):
         in_keys: Sequence[NestedKey],
         out_keys: Sequence[NestedKey],
     ) -> None:
-        super().__init__(in_keys, out_keys)
+        super().__init__(
+            key_list("in_keys", in_keys, 1, 1), key_list("out_keys", out_keys, 1, 1)
+        )
         if isinstance(max_range, ProximitySensor):
             max_range = max_range.ranges.tolist()
-        limit = torch.as_tensor(max_range, dtype=torch.float64)
+        try:
+            limit = torch.as_tensor(max_range, dtype=torch.float64)
+        except (TypeError, ValueError) as error:
+            raise ValueError(
+                "max_range must be a sensor transform, a number or one for each "
+                f"sensor, got {type(max_range).__name__}"
+            ) from error
         if not limit.numel() or not (limit > 0).all():
             raise ValueError(f"max_range must be positive, got {max_range}")
         self.register_buffer("_range", limit.reshape(-1), persistent=False)
@@ -104,7 +113,7 @@ class Proximity(_Reading):
         out_keys: Key of the signal.
 
     Raises:
-        ValueError: If a range is not positive.
+        ValueError: If a range is not positive, or there is not one key each.
     """
 
     def __init__(
@@ -145,7 +154,7 @@ class Binary(_Reading):
         out_keys: Key of the signal.
 
     Raises:
-        ValueError: If a range is not positive.
+        ValueError: If a range is not positive, or there is not one key each.
     """
 
     def __init__(
@@ -217,6 +226,9 @@ class BeamMinimum(RowTransform):
     Args:
         in_keys: Key of the measurements.
         out_keys: Key of the minima.
+
+    Raises:
+        ValueError: If there is not one key each.
     """
 
     def __init__(
@@ -224,7 +236,9 @@ class BeamMinimum(RowTransform):
         in_keys: Sequence[NestedKey] = ("distance",),
         out_keys: Sequence[NestedKey] = ("sensor_distance",),
     ) -> None:
-        super().__init__(in_keys, out_keys)
+        super().__init__(
+            key_list("in_keys", in_keys, 1, 1), key_list("out_keys", out_keys, 1, 1)
+        )
 
     def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Return the minima, ``[B, S]``."""
@@ -250,6 +264,9 @@ class Localization(RowTransform):
         in_keys: Keys of base pose, object pose, joint positions and detections (one
             or more).
         out_keys: Key of the signal.
+
+    Raises:
+        ValueError: If the number of keys is wrong.
     """
 
     def __init__(
@@ -260,7 +277,9 @@ class Localization(RowTransform):
         ),
         out_keys: Sequence[NestedKey] = ("signal",),
     ) -> None:
-        super().__init__(in_keys, out_keys)
+        super().__init__(
+            key_list("in_keys", in_keys, 4), key_list("out_keys", out_keys, 1, 1)
+        )
 
     def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Return the signal, ``[B, 3]``."""

@@ -431,7 +431,9 @@ def test_a_range_that_is_not_positive_is_refused(skin, max_range):
 
 
 def test_a_skin_of_another_robot_is_refused(small_robot, skin):
-    with pytest.raises(ValueError, match=r"sensor 0 sits on .* \(links: base"):
+    with pytest.raises(
+        ValueError, match=r"which the chain does not have.* \(links: base"
+    ):
         FieldSensor(skin, small_robot("<geom size='1'/>").chain, BALLS, RANGE)
 
 

@@ -182,6 +182,10 @@ def test_inputs_of_a_wrong_form_are_refused(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        (
+            {"skin": "skin.json"},
+            r"skin must be a Skin \(Skin.load for a file\), got str",
+        ),
         ({"chain": H1_2}, r"chain must be .*Chain \(RobotConfig.chain\), got RobotCon"),
         ({"objects": Sphere}, "objects must be shapes"),
         ({"max_range": [1.0] * 64}, "one number, got .* belongs in Skin.range"),
@@ -194,9 +198,9 @@ def test_inputs_of_a_wrong_form_are_refused(
 )
 @pytest.mark.parametrize("kind", [FieldSensor, RaySensor])
 def test_arguments_of_a_wrong_kind_are_refused(skin, kind, arguments, message):
-    valid = {"chain": H1_2.chain, "objects": SHAPES, "max_range": RANGE}
+    valid = {"skin": skin, "chain": H1_2.chain, "objects": SHAPES, "max_range": RANGE}
     with pytest.raises(ValueError, match=message):
-        kind(skin, **{**valid, **arguments})
+        kind(**{**valid, **arguments})
 
 
 class Pair:

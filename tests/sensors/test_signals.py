@@ -11,7 +11,15 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from egoskin.sensors import Binary, FieldSensor, Localization, Proximity, RaySensor
+from egoskin.robots.builtin import H1_2
+from egoskin.sensors import (
+    Binary,
+    FieldSensor,
+    Localization,
+    Proximity,
+    RaySensor,
+    place_sensors,
+)
 from egoskin.sensors.signals import SkinOrder
 from egoskin.shapes import Sphere
 
@@ -41,6 +49,15 @@ def test_proximity_grows_with_distance_and_stays_in_bounds(a, b, max_range):
 @pytest.mark.parametrize("max_range", [0.0, -2.0, math.nan, []])
 def test_proximity_refuses_a_range_that_is_not_positive(max_range):
     with pytest.raises(ValueError, match="max_range must be positive, got"):
+        Proximity(max_range)
+
+
+@pytest.mark.parametrize("max_range", ["2 m", place_sensors(H1_2, 1), ["2"], None])
+def test_proximity_says_what_a_range_may_be(max_range):
+    kind = type(max_range).__name__
+    with pytest.raises(
+        ValueError, match=f"a number or one for each sensor, got {kind}"
+    ):
         Proximity(max_range)
 
 

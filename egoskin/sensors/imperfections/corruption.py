@@ -24,7 +24,7 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 from egoskin.bounds import BoundsError, check_bounds
 from egoskin.rng import Stream, halfwords, random_words, stream_key
 from egoskin.sensors.skin.skin import Indices, indices
-from egoskin.transform import StatefulTransform
+from egoskin.transform import StatefulTransform, key_list
 
 State = dict[str, Tensor]
 """State of a model between steps: tensors ``[B, ...]`` by name."""
@@ -362,9 +362,10 @@ class Corruption(StatefulTransform):
         needed = ["distance"]
         if any(model.per_speed > 0 for model in models):
             needed.append("joint_vel")
-        if in_keys is not None and len(in_keys) != len(needed):
+        in_keys = key_list("in_keys", needed if in_keys is None else in_keys)
+        if len(in_keys) != len(needed):
             raise ValueError(f"in_keys must name {', '.join(needed)}, got {in_keys}")
-        (out,) = out_keys
+        (out,) = key_list("out_keys", out_keys, 1, 1)
         *where, name = out if isinstance(out, tuple) else (out,)
         self._settings = {"seed": seed, "dt": dt, "redraw_traits": redraw_traits}
         self._row_offset, self._models = row_offset, tuple(models)
@@ -379,7 +380,7 @@ class Corruption(StatefulTransform):
         state_keys = [
             (*where, f"{name}_{n}") if where else f"{name}_{n}" for n in names
         ]
-        super().__init__(in_keys or needed, [out, *state_keys], state_keys)
+        super().__init__(in_keys, [out, *state_keys], state_keys)
         self.register_buffer("_masked", torch.empty(0, dtype=torch.int64), False)
         # The mask as given, until its length is checked.
         self._mask: Indices | None = None

@@ -7,6 +7,7 @@ transforms in `egoskin.sensors.field` and `egoskin.sensors.ray`.
 from __future__ import annotations
 
 import math
+from collections.abc import Sized
 from dataclasses import dataclass
 from numbers import Integral
 from typing import Annotated, ClassVar, Literal
@@ -53,7 +54,8 @@ class Ray:
         check_bounds(self)
         if self.measure not in ("beam", "depth"):
             raise ValueError(f"measure must be beam or depth, got {self.measure!r}")
-        if len(self.grid) != 2 or not all(map(_is_positive, self.grid)):
+        pair = isinstance(self.grid, Sized) and len(self.grid) == 2
+        if not pair or not all(map(_is_positive, self.grid)):
             raise ValueError(f"grid must be two positive integers, got {self.grid}")
         # NumPy integers cannot be written to JSON.
         object.__setattr__(self, "grid", tuple(map(int, self.grid)))

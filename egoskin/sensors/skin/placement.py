@@ -253,6 +253,11 @@ def place_sensors(
             the links have no outer surface, a link without meshes has a collision shape
             that is not a primitive, or the sensors do not fit.
     """
+    if not isinstance(robot, RobotConfig):
+        raise ValueError(
+            "robot must be a RobotConfig (read_robot for a file), got "
+            f"{type(robot).__name__}"
+        )
     _check(num_sensors, seed, method, spacing, stand_off)
     covered = tuple(robot.skin_links if links is None else links)
     if not covered:

@@ -557,6 +557,7 @@ def test_names_of_keys_follow_the_reading():
         (lambda: Corruption([], dt=0, seed=0), "dt must be positive, got 0"),
         (lambda: Corruption([], dt=1, seed=-1), r"seed must be in \[0, 2\*\*32\)"),
         (lambda: Corruption([], dt=1, seed=2**33), f"got {2**33}"),
+        (lambda: Corruption([], dt=1, seed=None), "seed must be an integer, got None"),
         (lambda: Corruption([Noise], dt=1, seed=0), "FrameModel instances, got"),
         (lambda: Corruption(Noise(), dt=1, seed=0), "FrameModel instances, got"),
         (lambda: Corruption(ALL * 6, dt=1, seed=0), "at most 64 models, got 66"),

@@ -84,6 +84,7 @@ def test_beams_are_unit_symmetric_and_inside_the_view(rows, columns, angle):
         ),
         (lambda: Ray(grid=(0, 8)), r"grid must be two positive integers, got \(0, 8\)"),
         (lambda: Ray(grid=(8,)), "grid must be two positive integers"),
+        (lambda: Ray(grid=8), "grid must be two positive integers, got 8"),
         (lambda: Ray(fov_deg=180), "fov_deg must be below 180, got 180"),
         (lambda: Ray(fov_deg=math.nan), "fov_deg must be a finite number"),
         (lambda: Ray(grid=(10**9, 1)), "grid must be at most 1,024, got"),

@@ -336,3 +336,8 @@ def test_darts_are_thrown_in_lots_until_there_are_enough(small_robot, monkeypatc
 def test_placement_refuses_what_it_cannot_place(arguments, message):
     with pytest.raises(ValueError, match=message):
         place_sensors(H1_2, **arguments)
+
+
+def test_placement_refuses_the_file_of_a_robot():
+    with pytest.raises(ValueError, match=r"RobotConfig \(read_robot .*\), got str"):
+        place_sensors("arm.urdf", 5)  # pyright: ignore[reportArgumentType]
