@@ -97,6 +97,22 @@ def check_bounds(config: Any) -> None:
                 raise BoundsError(type(config), f"{name} must {wrong}, got {value}")
 
 
+def check_choices(config: Any) -> None:
+    """Raise ValueError if a field of a dataclass is none of its type's literals.
+
+    Values from files and the command line are checked before; those from Python are
+    not.
+
+    Args:
+        config: The dataclass.
+    """
+    for name, choices in _choices(type(config)).items():
+        value = getattr(config, name)
+        if value not in choices:
+            valid = ", ".join(map(str, choices))
+            raise ValueError(f"{name} must be one of {valid}, got {value!r}")
+
+
 def check_ranges(config: Any, other: Collection[str] = ()) -> None:
     """Raise ValueError if a range of a dataclass is not (low, high), low <= high.
 
@@ -124,6 +140,14 @@ def _intervals(kind: type) -> Mapping[str, Interval]:
         own = [what for what in declared if isinstance(what, Interval)]
         found[field.name] = own[0] if own else Interval()
     return found
+
+
+@functools.cache
+def _choices(kind: type) -> Mapping[str, tuple[Any, ...]]:
+    """Return the literals of each field of a dataclass that has some."""
+    hints = typing.get_type_hints(kind)
+    literal = (n for n, x in hints.items() if typing.get_origin(x) is typing.Literal)
+    return {name: typing.get_args(hints[name]) for name in literal}
 
 
 def path_to(owner: type, kind: type) -> str:

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from egoskin.bounds import NOT_NEGATIVE, Interval, check_bounds
+from egoskin.bounds import NOT_NEGATIVE, Interval, check_bounds, check_choices
 from egoskin.robots.config import RobotConfig
-from egoskin.sensors.skin.coverage import Coverage, Field, Ray
+from egoskin.sensors.skin.coverage import KINDS, Coverage, Field, Ray
 from egoskin.sensors.skin.placement import MAX_SENSORS, place_sensors
 from egoskin.sensors.skin.skin import Skin
 
@@ -89,8 +89,9 @@ class SensorConfig:
     """Localization: keep the last position while nothing is detected."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for a range out of bounds or options without effect."""
+        """Raise ValueError for invalid values or options without effect."""
         check_bounds(self)
+        check_choices(self)
         if not self.uses_skin:
             ignored = {
                 "reduce": self.reduce != "none",
@@ -104,8 +105,8 @@ class SensorConfig:
                         f"{name} has no effect with coverage={self.coverage}, which "
                         "has no skin"
                     )
-        for name, default in (("field", Field()), ("ray", Ray())):
-            if name != self.coverage and getattr(self, name) != default:
+        for name, kind in KINDS.items():
+            if name != self.coverage and getattr(self, name) != kind():
                 raise ValueError(
                     f"{name} options need coverage={name}, not {self.coverage} (types "
                     "in a skin file have their own options)"
@@ -126,12 +127,12 @@ class SensorConfig:
     @property
     def uses_skin(self) -> bool:
         """Whether the actor observes measurements of the skin."""
-        return self.coverage in ("field", "ray")
+        return self.coverage in KINDS
 
     @property
     def default_coverage(self) -> Coverage:
         """Coverage of the sensors for which the skin sets none."""
-        return self.ray if self.coverage == "ray" else self.field
+        return getattr(self, self.coverage) if self.uses_skin else self.field
 
     def label(self) -> str:
         """Return a short label of the actor's observation, without spaces."""

@@ -6,8 +6,9 @@ range and group of a sensor from it.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,12 @@ from egoskin.sensors.skin.coverage import Ray
 from egoskin.sensors.skin.skin import Skin
 from egoskin.shapes import Shape
 
+READINGS: dict[str, Callable[..., Proximity | Binary]] = {
+    "proximity": Proximity,
+    "closeness": partial(Proximity, closeness=True),
+    "binary": Binary,
+}
+"""Transforms of the signals of one number for each measurement, by their names."""
 MASK_ALL = ("all",)
 """Mask of all sensors, or of the whole observation of an oracle."""
 
@@ -286,7 +293,7 @@ class SensorPipeline:
             objects: Shapes of the objects.
         """
         config = self.config
-        measured = config.signal != "localization" and config.corruption == "none"
+        measured = config.signal in READINGS and config.corruption == "none"
         grid = config.reduce == "none" and len(self.groups) == 1
         one_range = len(set(self.skin.range.tolist())) == 1
         if not (measured and grid and one_range and self.groups[0].is_ray):
@@ -310,9 +317,7 @@ class SensorPipeline:
 
     def _signal(self, skin: Skin, in_key: str, out_key: str) -> Proximity | Binary:
         """Return the transform from readings of some sensors to their signal."""
-        keys: dict[str, Any] = {"in_keys": [in_key], "out_keys": [out_key]}
         # A corrupted reading can lie beyond the range.
         ranges = skin.range.tolist()
-        if self.config.signal == "binary":
-            return Binary(ranges, **keys)
-        return Proximity(ranges, closeness=self.config.signal == "closeness", **keys)
+        make = READINGS[self.config.signal]
+        return make(ranges, in_keys=[in_key], out_keys=[out_key])

@@ -8,6 +8,7 @@ import torch
 
 import egoskin
 from egoskin.envs.dodgeball import DodgeballEnv
+from egoskin.envs.rewards import TERMS
 from egoskin.envs.state import STATE, keys_read_by, state_table
 from egoskin.make import EnvConfig, make_worker_env
 from egoskin.robots.builtin import H1_2
@@ -62,7 +63,7 @@ def test_what_tells_of_a_step_is_zero_at_a_reset_and_typed_as_declared():
     root = env.rollout(4, break_when_any_done=False)[:, -1].exclude("next")
     root["_reset"] = torch.tensor([[True], [False], [True]])
     after = env.reset(root)
-    sizes = {"J": 21, "L": len(H1_2.links), "O": 2, "R": 7}
+    sizes = {"J": 21, "L": len(H1_2.links), "O": 2, "R": len(TERMS)}
     for key in STATE:
         value = after[key.name]
         assert value.dtype == key.dtype, key.name

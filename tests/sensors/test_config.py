@@ -35,6 +35,8 @@ from egoskin.sensors.config import SensorConfig
             {"signal": "localization", "corruption": "acoustic"},
             "corruption=acoustic needs a measured signal",
         ),
+        ({"signal": "Binary"}, "signal must be one of .*binary, got 'Binary'"),
+        ({"coverage": "rays"}, "coverage must be one of field, .*, got 'rays'"),
         ({"range": 0.0}, "range must be at least 0.001, got 0"),
     ],
 )

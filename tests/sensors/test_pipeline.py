@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from egoskin.sensors import Field, Ray, SensorPipeline, Skin, place_sensors
 from egoskin.sensors.config import SensorConfig
 from egoskin.sensors.imperfections.models import FalsePositives, Latency
 from egoskin.sensors.imperfections.presets import PRESETS
+from egoskin.sensors.pipeline import READINGS
 from egoskin.shapes import Sphere
 from throwing import TASK
 
@@ -103,6 +105,11 @@ def test_a_skin_is_resolved_once_on_its_way_to_the_kernel(options, size, monkeyp
 def test_a_reduction_of_nothing_is_refused():
     with pytest.raises(ValueError, match="reduce=min is for ray sensors, and the skin"):
         EnvConfig(sensor=SensorConfig(reduce="min")).pipeline()
+
+
+def test_every_signal_has_a_transform_of_its_own():
+    signals = get_args(get_type_hints(SensorConfig)["signal"])
+    assert {*READINGS, "localization"} == {*signals}
 
 
 @pytest.mark.parametrize("preset", ["time_of_flight", "acoustic"])

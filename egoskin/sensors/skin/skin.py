@@ -93,7 +93,7 @@ def _coverage(name: str, entry: object) -> Coverage:
         )
     default = KINDS[kind]()
     known = [f.name for f in fields(default)]
-    for field_name, only in _DROPPED[kind].items():
+    for field_name, only in _DROPPED.get(kind, {}).items():
         value = values.pop(field_name, only)
         if value != only:
             raise ValueError(
@@ -388,7 +388,7 @@ class Skin:
         """
         groups: dict[object, list[int]] = {}
         for index, own in enumerate(self.coverage):
-            kind = own.grid if isinstance(own, Ray) else "field"
+            kind = own.grid if isinstance(own, Ray) else type(own)
             groups.setdefault(kind, []).append(index)
         return list(groups.values())
 
