@@ -1,10 +1,10 @@
-"""Bounds of numbers, declared in the type of a configuration field.
+"""Bounds of numbers and names, declared in the type of a configuration field.
 
     mass: Annotated[float, Interval(gt=0, le=1e6)] = 0.4
 
 Contract: every number of a checked configuration lies in the interval of its field;
 this includes each number of a tuple. Numbers without an interval are finite, and
-integers fit into 64 bits.
+integers fit into 64 bits. A name is one of the literals of its field.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ COUNT, SHARE = Interval(ge=1), Interval(ge=0, le=1)
 
 
 class BoundsError(ValueError):
-    """A number of a configuration is out of bounds.
+    """A number of a configuration is out of bounds, or a name is unknown.
 
     Args:
         owner: Class of the configuration.
@@ -80,9 +80,10 @@ class BoundsError(ValueError):
 
 
 def check_bounds(config: Any) -> None:
-    """Raise BoundsError if a number of a dataclass is out of bounds.
+    """Raise BoundsError if a number of a dataclass is out of bounds, or a name unknown.
 
-    Nested dataclasses are not checked; they check their own fields.
+    Numbers are checked against the `Interval` of their field, names against its
+    literals. Nested dataclasses are not checked; they check their own fields.
 
     Args:
         config: The dataclass; it calls this first in its ``__post_init__``.
@@ -95,22 +96,11 @@ def check_bounds(config: Any) -> None:
             # NumPy's numbers are Real too, but no float by their type.
             if wrong := interval.violation(number):  # pyright: ignore
                 raise BoundsError(type(config), f"{name} must {wrong}, got {value}")
-
-
-def check_choices(config: Any) -> None:
-    """Raise ValueError if a field of a dataclass is none of its type's literals.
-
-    Values from files and the command line are checked before; those from Python are
-    not.
-
-    Args:
-        config: The dataclass.
-    """
     for name, choices in _choices(type(config)).items():
         value = getattr(config, name)
         if value not in choices:
-            valid = ", ".join(map(str, choices))
-            raise ValueError(f"{name} must be one of {valid}, got {value!r}")
+            text = f"{name} must be one of {', '.join(choices)}, got {value!r}"
+            raise BoundsError(type(config), text)
 
 
 def check_ranges(config: Any, other: Collection[str] = ()) -> None:
@@ -143,11 +133,14 @@ def _intervals(kind: type) -> Mapping[str, Interval]:
 
 
 @functools.cache
-def _choices(kind: type) -> Mapping[str, tuple[Any, ...]]:
+def _choices(kind: type) -> Mapping[str, tuple[str, ...]]:
     """Return the literals of each field of a dataclass that has some."""
     hints = typing.get_type_hints(kind)
-    literal = (n for n, x in hints.items() if typing.get_origin(x) is typing.Literal)
-    return {name: typing.get_args(hints[name]) for name in literal}
+    return {
+        field.name: typing.get_args(hints[field.name])
+        for field in dataclasses.fields(kind)
+        if typing.get_origin(hints[field.name]) is typing.Literal
+    }
 
 
 def path_to(owner: type, kind: type) -> str:

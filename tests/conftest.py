@@ -41,6 +41,12 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 os.environ[compilation.SETTING] = "0"
 
 
+@pytest.fixture(autouse=True)
+def same_numbers_in_any_order() -> None:
+    """Torch's global generator: without this, its numbers depend on earlier tests."""
+    torch.manual_seed(0)
+
+
 @pytest.fixture(scope="session")
 def robot() -> RobotConfig:
     return H1_2

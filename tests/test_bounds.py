@@ -1,4 +1,4 @@
-"""Bounds of numbers: declared with a field, checked in every configuration."""
+"""Bounds and names: declared with a field, checked in every configuration."""
 
 from __future__ import annotations
 
@@ -89,6 +89,24 @@ def test_each_number_of_a_training_is_checked(kind, name, hint, value):
     is_tuple = typing.get_origin(hint) is tuple
     with pytest.raises(ValueError, match=name):
         kind(**{name: (value, value) if is_tuple else value})
+
+
+def choices(kind: type) -> Iterator[tuple[type, str]]:
+    """Each field of names of a configuration and of all within: class, name."""
+    for name, hint in typing.get_type_hints(kind).items():
+        if dataclasses.is_dataclass(hint):
+            yield from choices(hint)  # pyright: ignore[reportArgumentType]
+        elif typing.get_origin(hint) is typing.Literal:
+            yield kind, name
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"), [*choices(TrainConfig)], ids=lambda x: getattr(x, "__name__", x)
+)
+def test_each_name_of_a_training_is_checked(kind, name):
+    # A name that is none of them would mean the last of them.
+    with pytest.raises(ValueError, match=f"^{name} must be one of .*, got 'typo'"):
+        kind(**{name: "typo"})
 
 
 def test_the_place_of_a_configuration_in_another_is_known():

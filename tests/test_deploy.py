@@ -31,6 +31,7 @@ from egoskin.policies.export import export_onnx, metadata
 from egoskin.policies.policy import Policy
 from egoskin.sensors import Field
 from egoskin.sensors.config import SensorConfig, SkinConfig
+from egoskin.sensors.pipeline import READINGS
 from making import make_policy
 
 # A slow ball that comes near.
@@ -92,6 +93,10 @@ def test_from_raw_states_and_distances_come_our_environments_targets(kind, tmp_p
         np.testing.assert_allclose(target, expected, 1e-4, 1e-4)
     if kind != "blind":
         assert rollout["distance"].isfinite().any()
+
+
+def test_every_signal_of_distances_is_compared():
+    assert {config.sensor.signal for config in KINDS.values()} == {*READINGS}
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from egoskin.bounds import NOT_NEGATIVE, Interval, check_bounds, check_choices
+from egoskin.bounds import NOT_NEGATIVE, Interval, check_bounds
 from egoskin.robots.config import RobotConfig
 from egoskin.sensors.skin.coverage import KINDS, Coverage, Field, Ray
 from egoskin.sensors.skin.placement import MAX_SENSORS, place_sensors
@@ -91,7 +91,6 @@ class SensorConfig:
     def __post_init__(self) -> None:
         """Raise ValueError for invalid values or options without effect."""
         check_bounds(self)
-        check_choices(self)
         if not self.uses_skin:
             ignored = {
                 "reduce": self.reduce != "none",

@@ -478,7 +478,7 @@ def test_every_throw_hits_a_rigid_robot(flight, aim, request, capsys):
         ({"shape": "box"}, r"a box needs 3 sizes, got \[\]"),
         ({"shape": "capsule", "size": (0.1, 0.2, 0.3)}, "a capsule needs 2 sizes"),
         ({"shape": "box", "size": (0.1, 0.0, 0.1)}, "size must be at least 0.001"),
-        ({"shape": "cube", "size": (0.1,)}, "kind must be one of sphere, .*'cube'"),
+        ({"shape": "cube", "size": (0.1,)}, "shape must be one of sphere, .*'cube'"),
     ],
 )
 def test_throws_that_cannot_be_thrown_are_refused(changes, message):

@@ -235,10 +235,6 @@ class RangeLimits(PointModel):
     def __post_init__(self) -> None:
         """Raise ValueError for invalid values."""
         super().__post_init__()
-        if self.below not in ("nothing", "minimum"):
-            raise ValueError(
-                f"RangeLimits.below must be 'nothing' or 'minimum', got {self.below!r}"
-            )
         if not self.minimum < self.maximum:
             raise ValueError(
                 "RangeLimits must have minimum < maximum, got "

@@ -52,8 +52,6 @@ class Ray:
     def __post_init__(self) -> None:
         """Raise ValueError for invalid values."""
         check_bounds(self)
-        if self.measure not in ("beam", "depth"):
-            raise ValueError(f"measure must be beam or depth, got {self.measure!r}")
         pair = isinstance(self.grid, Sized) and len(self.grid) == 2
         if not pair or not all(map(_is_positive, self.grid)):
             raise ValueError(f"grid must be two positive integers, got {self.grid}")

@@ -545,7 +545,7 @@ def test_names_of_keys_follow_the_reading():
         ),
         (
             lambda: replace(RangeLimits(), below="none"),
-            "below must be 'nothing' or 'minimum', got 'none'",
+            "below must be one of nothing, minimum, got 'none'",
         ),
         (lambda: RangeLimits(minimum=-1), "RangeLimits.minimum must not be negative"),
         (lambda: RangeLimits(maximum=NAN), "RangeLimits.maximum must be a finite"),

@@ -88,7 +88,7 @@ def test_beams_are_unit_symmetric_and_inside_the_view(rows, columns, angle):
         (lambda: Ray(fov_deg=180), "fov_deg must be below 180, got 180"),
         (lambda: Ray(fov_deg=math.nan), "fov_deg must be a finite number"),
         (lambda: Ray(grid=(10**9, 1)), "grid must be at most 1,024, got"),
-        (lambda: Ray(measure="distance"), "measure must be beam or depth"),
+        (lambda: Ray(measure="distance"), "measure must be one of beam, depth"),
     ],
 )
 def test_what_is_no_coverage_is_refused(make, message):
