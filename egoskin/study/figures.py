@@ -485,7 +485,7 @@ def sample_efficiency(manifest: Manifest, results: Sequence[Result]) -> Figure |
     axes.plot([], [], "o", color="black", label="90 % (bars: seeds)")
     if any(row[4] for row in rows):
         axes.plot([], [], "x", color="black", label="not learnt (< 5 %)")
-    figure.legend(loc="outside upper center", ncols=5, frameon=False, fontsize=9)
+    figure.legend(loc="outside upper center", ncols=3, frameon=False, fontsize=9)
     axes.set_yticks(range(len(rows)), [row[0] for row in rows], fontsize=8)
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.set_xlim(left=0)

@@ -242,12 +242,13 @@ def _blocks(
         "precision: runs.csv."
     )
     yield table(
-        ("run", "success at 3 s", "wall time", "commit", "machine"),
+        ("run", "success at 3 s", "wall time", "workers", "commit", "machine"),
         [
             (
                 r.run.name,
                 f"{100 * r.stored.evaluation['success']['mean']:.1f} %",
                 f"{r.stored.record.wall_s / 3600:.2f} h",
+                str(r.stored.config.num_workers or "one per core"),
                 r.stored.record.commit,
                 r.stored.record.machine,
             )
