@@ -442,10 +442,7 @@ def _seen(folder: StudyFolder) -> list[dict[str, Any]]:
         return []
     try:
         rows = read_json(path)["cells"]
-        for row in rows:
-            float(row["range"])
-            str(row["coverage"])
-            warning_texts(row)
+        _seen_rows(rows)
         return rows
     except (KeyError, TypeError) as error:
         raise ValueError(
