@@ -30,6 +30,9 @@ from egoskin.policies.export import export_onnx, observation_parts
 from egoskin.robots.builtin import H1_2
 from egoskin.runs.config import TrainConfig, parse_config
 from egoskin.sensors.config import SensorConfig
+from egoskin.study.findings import FINDINGS
+from egoskin.study.manifest import resolve
+from egoskin.study.shipped import PAPER
 from owning import write_robot
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -325,6 +328,35 @@ def test_every_column_of_the_metrics_is_explained(trained):
         logged = next(csv.reader(file))
     rows = table("metrics.md", "Every column of metrics.csv")
     assert [code(name)[0] for name, _, _ in rows] == logged
+
+
+PAPER_PAGE = (DOCS / "paper.md").read_text()
+
+
+def test_the_training_nearest_to_the_paper_is_one_of_its_study():
+    (command,) = re.findall("^    egoskin train (.*)$", PAPER_PAGE, re.MULTILINE)
+    found = parse_config(shlex.split(command))
+    cells = {cell.name: cell.config for cell in resolve(PAPER).cells}
+    expected = cells["field-proximity-2m"]
+    assert (found.env, found.ppo) == (expected.env, expected.ppo)
+    assert found.total_frames == expected.total_frames
+    assert found.num_envs == expected.num_envs
+
+
+def test_the_page_of_the_paper_names_options_that_there_are():
+    values = {"--skin.seed": "1", "--sensor.range": "1", "--sensor.corruption": "none"}
+    options = {text for text in code(PAPER_PAGE) if text.startswith("--")}
+    assert options > {*values}
+    for option in options:
+        args = [*shlex.split(option.replace(" N", " 2")), values.get(option)]
+        # An unknown name or value exits.
+        parse_config([arg for arg in args if arg is not None])
+
+
+def test_the_page_of_the_paper_names_every_finding():
+    rows = table("paper.md", "Findings")
+    named = {word for _, where in rows for word in re.findall(r"\b\w+\b", where)}
+    assert {finding.label for finding in FINDINGS} <= named
 
 
 # --- The site ---------------------------------------------------------------------
