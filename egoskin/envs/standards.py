@@ -15,7 +15,8 @@ from egoskin.envs.throws import ThrowConfig
 
 Standard = Literal["2", "1", "paper"]
 """Name of a version: 2 is the default; ``paper`` is 2 with the first ball at the start
-in training, too; 1 is ``paper`` aimed at the whole body."""
+in training, too, as in the paper (docs/paper.md lists what it leaves open); 1 is
+``paper`` aimed at the whole body."""
 CUSTOM = "custom"
 """Name of a task that matches no version."""
 

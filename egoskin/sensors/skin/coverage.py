@@ -37,8 +37,8 @@ class Field:
 class Ray:
     """A grid of beams in a square pyramid around the normal; each reads its first hit.
 
-    The defaults are the VL53L5CX of the paper: 8 x 8 zones, 63 degrees corner to
-    corner. A beam runs through the centre of its zone.
+    The defaults are the paper's, and those of the VL53L5CX: 8 x 8 zones, 63 degrees
+    corner to corner. A beam runs through the centre of its zone.
     """
 
     grid: Annotated[tuple[int, int], Interval(le=1024)] = (8, 8)
