@@ -39,7 +39,7 @@ class TrainConfig:
     seed: int = 0
     """Seed of all random numbers: throws, starts, networks, actions."""
     total_frames: Annotated[int, COUNT] = 65_536_000
-    """Environment steps of the whole run (the paper's 1000 epochs)."""
+    """Environment steps of the whole run (the default: a third of the paper's)."""
     num_envs: int = 4096
     """Agents simulated in parallel."""
     num_workers: int | None = None

@@ -57,9 +57,9 @@ class Finding:
     """A finding of the paper."""
 
     label: str
-    """Its number in the paper, with a letter if that number makes several claims."""
+    """Our number, with a letter if there are several findings of that number."""
     text: str
-    """Statement of the paper."""
+    """Statement of the paper, as we read it (docs/paper.md)."""
     claims: tuple[Claim, ...]
     """Its testable claims; all must hold."""
     metric: str = "success_3s"
@@ -234,7 +234,7 @@ FINDINGS = (
         ),
     ),
 )
-"""The findings, in the paper's order. Values are percentages."""
+"""The findings. Values are percentages."""
 
 CELLS = frozenset(name for f in FINDINGS for c in f.claims for name in c.weights)
 """Names of the cells that the findings are about."""
