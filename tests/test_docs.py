@@ -30,6 +30,7 @@ from egoskin.policies.export import export_onnx, observation_parts
 from egoskin.robots.builtin import H1_2
 from egoskin.runs.config import TrainConfig, parse_config
 from egoskin.sensors.config import SensorConfig
+from egoskin.storage.serialization import to_plain
 from egoskin.study.findings import FINDINGS
 from egoskin.study.manifest import resolve
 from egoskin.study.shipped import PAPER
@@ -414,6 +415,29 @@ def test_the_site_is_built_without_warnings_and_read_offline(tmp_path):
         assert not re.search(r"url\(['\"]?(?:https?:)?//|@import", path.read_text()), (
             path
         )
+
+
+def option_names(content: dict[str, Any], group: str = "") -> set[str]:
+    """Return the options of a plain configuration, as `sensor.field.half-angle-deg`."""
+    names = set()
+    for name, value in content.items():
+        names.add(option := f"{group}{name}".replace("_", "-"))
+        if isinstance(value, dict):
+            names |= option_names(value, f"{option}.")
+    return names
+
+
+def test_pages_name_options_and_fields_that_there_are():
+    content = to_plain(TrainConfig())
+    known = option_names({**content, **content["env"]})
+    groups = "(?:task|sensor|ppo|skin)"
+    for page in (*PAGES, DOCS.parent / "README.md", DOCS.parent / "CONTRIBUTING.md"):
+        text = page.read_text()
+        options = re.findall(rf"--({groups}\.[\w.-]*\w)", text)
+        # Of studies.
+        fields = re.findall(rf'"({groups}\.[\w.]+)"', text)
+        named = {*options, *(name.replace("_", "-") for name in fields)}
+        assert named <= known, (page.name, named - known)
 
 
 YOUR_ROBOT = (DEPLOY.parent / "your-robot.md").read_text()
