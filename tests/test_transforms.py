@@ -13,6 +13,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from tensordict import TensorDict
+from torchrl.data import Binary as BinarySpec
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import Compose, ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
@@ -152,6 +153,20 @@ def test_a_missing_key_is_named(build, full_state):
     state = select(state, transform.in_keys[:-1])
     with pytest.raises(KeyError, match=f"{name} reads '{missing}', which .* lacks"):
         transform(state)
+
+
+def test_specs_are_by_default_those_of_the_results():
+    class Split(RowTransform):
+        def __init__(self) -> None:
+            super().__init__(in_keys=["x"], out_keys=["y", "flag"])
+
+        def compute(self, *inputs) -> Any:
+            return inputs[0][:, :2].double(), inputs[0][:, 0] > 0
+
+    spec = Composite(x=Unbounded((2, 4, 3)), shape=[2, 4])
+    specs = Split().transform_observation_spec(spec)
+    assert specs["y"] == Unbounded((2, 4, 2), dtype=torch.float64)
+    assert specs["flag"] == BinarySpec(shape=torch.Size((2, 4)), dtype=torch.bool)
 
 
 @pytest.mark.parametrize("given", ["bare", "two"])

@@ -126,8 +126,3 @@ class KeepLast(StatefulTransform):
         signal, *detections = inputs
         detected = torch.stack([d.any(-1, keepdim=True) for d in detections]).any(0)
         return [torch.where(detected, signal, state[0])]
-
-    def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
-        """Return the spec of the last signal."""
-        one = spec[self.in_keys[0]]
-        return [Unbounded(shape=one.shape, dtype=one.dtype)]

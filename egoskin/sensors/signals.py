@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import torch
 from tensordict import NestedKey
 from torch import Tensor
-from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
+from torchrl.data import Bounded, Composite, TensorSpec
 
 from egoskin.robots.kinematics import rotate_inverse
 from egoskin.sensors.geometry import ProximitySensor
@@ -244,11 +244,6 @@ class BeamMinimum(RowTransform):
         """Return the minima, ``[B, S]``."""
         return (inputs[0].amin(-1),)
 
-    def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
-        """Return the spec of the minima."""
-        measured = spec[self.in_keys[0]]
-        return (Unbounded(shape=measured.shape[:-1], dtype=measured.dtype),)
-
 
 class Localization(RowTransform):
     """Position of the detected object nearest to the robot's base, in the base frame.
@@ -298,8 +293,3 @@ class Localization(RowTransform):
         position = position.gather(1, nearest[..., None].expand(-1, -1, 3))[:, 0]
         # NaN remains if an object is detected; poses of inactive objects do not matter.
         return (position.masked_fill(~detected.any(-1, keepdim=True), 0.0),)
-
-    def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
-        """Return the spec of the signal."""
-        dtype = spec[self.in_keys[0]].dtype
-        return (Unbounded(shape=torch.Size((*spec.shape, 3)), dtype=dtype),)
