@@ -43,20 +43,27 @@ def key_list(
         raise ValueError(f"{name} must be a list of keys, got {keys!r}")
     keys = list(keys)
     if len(keys) < least or (most is not None and len(keys) > most):
-        number = f"{least}" if most == least else f"at least {least}"
+        number = {least: f"{least}", None: f"at least {least}"}.get(most)
+        number = number or f"{least} to {most}"
         raise ValueError(f"{name} must be a list of {number}, got {keys}")
     return keys
 
 
 class _KeyedTransform(Transform):
-    """A transform that reads some keys and adds others to the observation."""
+    """A transform that reads some keys and adds others to the observation.
+
+    A subclass states how many keys it needs and how many it allows (None: any).
+    """
+
+    _NUM_IN: tuple[int, int | None] = (0, None)
+    _NUM_OUT: tuple[int, int | None] = (0, None)
 
     def __init__(
         self, in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey]
     ) -> None:
         super().__init__(
-            in_keys=key_list("in_keys", in_keys),
-            out_keys=key_list("out_keys", out_keys),
+            in_keys=key_list("in_keys", in_keys, *self._NUM_IN),
+            out_keys=key_list("out_keys", out_keys, *self._NUM_OUT),
         )
 
     def clone(self) -> Self:

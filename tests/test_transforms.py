@@ -35,6 +35,7 @@ from egoskin.sensors import (
     Localization,
     Proximity,
     RaySensor,
+    Tactile,
     place_sensors,
 )
 from egoskin.sensors.config import SensorConfig
@@ -237,6 +238,8 @@ def test_results_that_are_not_one_for_each_key_are_refused(method, given):
             r"in_keys must be a list of at least 4, got \['a",
         ),
         (lambda: KeepLast(["signal"]), "in_keys must be a list of at least 2, got"),
+        (lambda: Oracle(["base_pose"]), "in_keys must be a list of 5, got"),
+        (lambda: Tactile(1.0, ["a", "b"]), "in_keys must be a list of 1, got"),
     ],
 )
 def test_keys_of_a_wrong_kind_or_number_are_refused(build, message):

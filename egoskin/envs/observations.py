@@ -31,6 +31,7 @@ class Proprioception(RowTransform):
         out_keys: Key of the observation.
     """
 
+    _NUM_IN, _NUM_OUT = (4, 5), (1, 1)
     _default: Tensor
     STATE_KEYS = ("base_pose", "base_ang_vel_b", "joint_pos", "joint_vel")
     """The required inputs."""
@@ -147,6 +148,8 @@ class Oracle(RowTransform):
         in_keys: Keys of the inputs, in the order above.
         out_keys: Key of the signal.
     """
+
+    _NUM_IN, _NUM_OUT = (5, 5), (1, 1)
 
     def __init__(
         self,

@@ -138,6 +138,7 @@ class ProximitySensor(RowTransform):
             not a shape, or another argument is of a wrong kind or number.
     """
 
+    _NUM_IN, _NUM_OUT = (4, 4), (2, 2)
     _link: Tensor
     _offset: Tensor
     _axes: Tensor
@@ -156,11 +157,6 @@ class ProximitySensor(RowTransform):
         out_keys: Sequence[NestedKey],
     ) -> None:
         super().__init__(in_keys, out_keys)
-        if len(in_keys) != 4 or len(out_keys) != 2:
-            raise ValueError(
-                "a proximity sensor has four in_keys and two out_keys, got "
-                f"{list(in_keys)} and {list(out_keys)}"
-            )
         if not isinstance(chain, pk.Chain):
             raise ValueError(
                 "chain must be a pytorch_kinematics.Chain (RobotConfig.chain), got "

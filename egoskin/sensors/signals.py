@@ -18,7 +18,7 @@ from torchrl.data import Bounded, Composite, TensorSpec
 
 from egoskin.robots.kinematics import rotate_inverse
 from egoskin.sensors.geometry import ProximitySensor
-from egoskin.transform import RowTransform, key_list
+from egoskin.transform import RowTransform
 
 # An infinite range has no scale: a distance d gives the signal d / (d + 1 m).
 _HALF_DISTANCE = 1.0
@@ -39,6 +39,7 @@ class _Reading(RowTransform):
             key each.
     """
 
+    _NUM_IN = _NUM_OUT = (1, 1)
     _range: Tensor
 
     def __init__(
@@ -47,9 +48,7 @@ class _Reading(RowTransform):
         in_keys: Sequence[NestedKey],
         out_keys: Sequence[NestedKey],
     ) -> None:
-        super().__init__(
-            key_list("in_keys", in_keys, 1, 1), key_list("out_keys", out_keys, 1, 1)
-        )
+        super().__init__(in_keys, out_keys)
         if isinstance(max_range, ProximitySensor):
             max_range = max_range.ranges.tolist()
         try:
@@ -231,14 +230,14 @@ class BeamMinimum(RowTransform):
         ValueError: If there is not one key each.
     """
 
+    _NUM_IN = _NUM_OUT = (1, 1)
+
     def __init__(
         self,
         in_keys: Sequence[NestedKey] = ("distance",),
         out_keys: Sequence[NestedKey] = ("sensor_distance",),
     ) -> None:
-        super().__init__(
-            key_list("in_keys", in_keys, 1, 1), key_list("out_keys", out_keys, 1, 1)
-        )
+        super().__init__(in_keys, out_keys)
 
     def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Return the minima, ``[B, S]``."""
@@ -264,6 +263,8 @@ class Localization(RowTransform):
         ValueError: If the number of keys is wrong.
     """
 
+    _NUM_IN, _NUM_OUT = (4, None), (1, 1)
+
     def __init__(
         self,
         in_keys: Sequence[NestedKey] = (
@@ -272,9 +273,7 @@ class Localization(RowTransform):
         ),
         out_keys: Sequence[NestedKey] = ("signal",),
     ) -> None:
-        super().__init__(
-            key_list("in_keys", in_keys, 4), key_list("out_keys", out_keys, 1, 1)
-        )
+        super().__init__(in_keys, out_keys)
 
     def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Return the signal, ``[B, 3]``."""

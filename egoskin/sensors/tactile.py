@@ -69,6 +69,8 @@ class Tactile(RowTransform):
         ValueError: If the threshold is negative or NaN.
     """
 
+    _NUM_IN = _NUM_OUT = (1, 1)
+
     def __init__(
         self,
         threshold: float,
@@ -208,6 +210,7 @@ class ContactFree(StatefulTransform):
         ValueError: If a pattern matches no link.
     """
 
+    _NUM_IN = _NUM_OUT = (1, 1)
     _counted: Tensor
 
     def __init__(
