@@ -482,4 +482,4 @@ class Corruption(StatefulTransform):
     def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
         """Return the specs of the reading, the clock and the models' states."""
         # On the CPU: the number of finite readings is unknown on "meta".
-        return super().out_specs(spec.cpu())
+        return super().out_specs(spec.to("cpu"))
