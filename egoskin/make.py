@@ -10,7 +10,7 @@ from functools import partial
 from typing import Annotated, Literal
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import (
     Compose,
@@ -154,12 +154,12 @@ def make_worker_env(
         )
     if sparse and mask and not masks_all(mask):
         raise ValueError("sparse sources cannot mask only some links: turn sparse off")
-    sensors, robot = config.pipeline(skin), config.robot_config
+    sensors = config.pipeline(skin)
     sensors.check_mask(mask)
     # On "meta" there are specs, but no data.
     place = torch.device("meta") if str(device) == "meta" else device_of(str(device))
     env = DodgeballEnv(
-        robot,
+        config.robot_config,
         config.task,
         num_envs=num_envs,
         seed=seed,
@@ -173,35 +173,10 @@ def make_worker_env(
     )
     transforms: list[Transform] = []
     if not bare:
-        throws = config.task.throws
-        # With a history, the current values have other names.
-        suffix = "" if config.history == 1 else "_now"
-        default = torch.from_numpy(robot.default_joint_pos)
-        observed = [*Proprioception.STATE_KEYS]
-        if config.previous_action:
-            observed.append("previous_action")
-        transforms += [
-            Proprioception(default, observed, out_keys=[f"observation{suffix}"]),
-            Privileged(config.privileged, throws.gravity),
-        ]
-        if masks_all(mask):
-            transforms.append(HideObjects())
-        if not sparse:
-            transforms += sensors.transforms(
-                throws.balls,
-                dt=1 / config.task.physics.control_hz,
-                seed=seed,
-                row_offset=row_offset,
-                out_key=f"signal{suffix}",
-            )
-            sensors.mask(transforms, sensors.masked(mask))
-        if config.sensor.coverage == "oracle":
-            transforms.append(Oracle(out_keys=[f"signal{suffix}"]))
-        if suffix:
-            new = [f"{key}{suffix}" for key in config.actor_keys]
-            transforms.append(History(config.history, new, config.actor_keys))
+        transforms += _observations(config, sensors, seed, row_offset, sparse, mask)
     if not keep_raw:
-        kept = {*_NETWORK_KEYS, *(k for t in transforms for k in _state_keys(t))}
+        stateful = [t for t in transforms if isinstance(t, StatefulTransform)]
+        kept = {*_NETWORK_KEYS, *(key for t in stateful for key in t.state_keys)}
         written = dict.fromkeys(key for t in transforms for key in t.out_keys)
         raw = [key.name for key in env.state_rows if key.stays_in_worker]
         between = [key for key in written if key not in {*kept, *raw}]
@@ -210,10 +185,46 @@ def make_worker_env(
     return TransformedEnv(env, Compose(transforms).to(env.device))
 
 
-def _state_keys(transform: Transform) -> list[NestedKey]:
-    """Return the keys that a transform reads back at the next step."""
-    stateful = isinstance(transform, StatefulTransform)
-    return transform.state_keys if stateful else []
+def _observations(
+    config: EnvConfig,
+    sensors: SensorPipeline,
+    seed: int,
+    row_offset: int,
+    sparse: bool,
+    mask: Sequence[str],
+) -> list[Transform]:
+    """Return the transforms from the state to what the networks read.
+
+    The arguments are those of `make_worker_env`, and its sensors.
+    """
+    throws = config.task.throws
+    # With a history, the current values have other names.
+    suffix = "" if config.history == 1 else "_now"
+    default = torch.from_numpy(sensors.robot.default_joint_pos)
+    observed = [*Proprioception.STATE_KEYS]
+    if config.previous_action:
+        observed.append("previous_action")
+    transforms: list[Transform] = [
+        Proprioception(default, observed, out_keys=[f"observation{suffix}"]),
+        Privileged(config.privileged, throws.gravity),
+    ]
+    if masks_all(mask):
+        transforms.append(HideObjects())
+    if not sparse:
+        transforms += sensors.transforms(
+            throws.balls,
+            dt=1 / config.task.physics.control_hz,
+            seed=seed,
+            row_offset=row_offset,
+            out_key=f"signal{suffix}",
+        )
+        sensors.mask(transforms, sensors.masked(mask))
+    if config.sensor.coverage == "oracle":
+        transforms.append(Oracle(out_keys=[f"signal{suffix}"]))
+    if suffix:
+        new = [f"{key}{suffix}" for key in config.actor_keys]
+        transforms.append(History(config.history, new, config.actor_keys))
+    return transforms
 
 
 def make_env(

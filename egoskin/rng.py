@@ -87,6 +87,8 @@ def philox(counter: Tensor, key: tuple[int, int]) -> Tensor:
 
 def check_seed(seed: int, name: str = "seed") -> None:
     """Raise ValueError for a seed that is not a 32-bit unsigned integer."""
+    if not isinstance(seed, Integral):
+        raise ValueError(f"{name} must be an integer, got {seed!r}")
     if not 0 <= seed <= _MASK:
         raise ValueError(f"{name} must be in [0, 2**32), got {seed}")
 
@@ -124,12 +126,9 @@ def stream_key(seed: int, stream: Stream) -> tuple[int, int]:
     Raises:
         ValueError: If the seed is neither of them.
     """
-    if not isinstance(seed, Integral):
-        raise ValueError(f"the seed must be an integer, got {seed!r}")
-    own = seed & ~_HELD_OUT
-    if not 0 <= own <= _MASK:
+    if not isinstance(seed, Integral) or not 0 <= seed & ~_HELD_OUT <= _MASK:
         check_seed(seed)
-    return own, int(stream) | (_HELD_OUT_KEY if seed & _HELD_OUT else 0)
+    return seed & ~_HELD_OUT, int(stream) | (_HELD_OUT_KEY if seed & _HELD_OUT else 0)
 
 
 def random_words(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -38,6 +39,30 @@ def exact_sqrt(x: Tensor) -> Tensor:
     if torch.compiler.is_compiling() or x.dtype != torch.float32:
         return x.sqrt()
     return x.double().sqrt_().float()
+
+
+def matvec(rows: Sequence | Tensor, vector: Sequence | Tensor) -> list[Tensor]:
+    """Return the product of matrices with vectors, three coordinates ``[*B]``.
+
+    Written out: a library's product may round differently for another batch.
+
+    Args:
+        rows: Matrices, ``[3, 3, *B]``.
+        vector: Vectors, ``[3, *B]``, broadcastable.
+    """
+    x, y, z = vector
+    return [row[0] * x + row[1] * y + row[2] * z for row in rows]
+
+
+def matmul(a: Tensor, b: Tensor) -> Tensor:
+    """Return the product of matrices, ``[3, 3, *B]``; see `matvec`.
+
+    Args:
+        a: ``[3, 3, *B]``.
+        b: ``[3, 3, *B]``, broadcastable.
+    """
+    columns = b.transpose(0, 1)
+    return torch.stack([torch.stack(matvec(columns, row)) for row in a])
 
 
 # pi/2 = HIGH + MIDDLE + LOW. The first two have only a few bits each (Cephes), so that

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.data import Composite, TensorSpec
+from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
 from egoskin.rounding import pad_rows
@@ -43,20 +43,27 @@ def key_list(
         raise ValueError(f"{name} must be a list of keys, got {keys!r}")
     keys = list(keys)
     if len(keys) < least or (most is not None and len(keys) > most):
-        number = f"{least}" if most == least else f"at least {least}"
+        number = {least: f"{least}", None: f"at least {least}"}.get(most)
+        number = number or f"{least} to {most}"
         raise ValueError(f"{name} must be a list of {number}, got {keys}")
     return keys
 
 
 class _KeyedTransform(Transform):
-    """A transform that reads some keys and adds others to the observation."""
+    """A transform that reads some keys and adds others to the observation.
+
+    A subclass states how many keys it needs and how many it allows (None: any).
+    """
+
+    _NUM_IN: tuple[int, int | None] = (0, None)
+    _NUM_OUT: tuple[int, int | None] = (0, None)
 
     def __init__(
         self, in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey]
     ) -> None:
         super().__init__(
-            in_keys=key_list("in_keys", in_keys),
-            out_keys=key_list("out_keys", out_keys),
+            in_keys=key_list("in_keys", in_keys, *self._NUM_IN),
+            out_keys=key_list("out_keys", out_keys, *self._NUM_OUT),
         )
 
     def clone(self) -> Self:
@@ -67,9 +74,32 @@ class _KeyedTransform(Transform):
             setattr(new, name, buffer.clone())
         return new
 
-    @abstractmethod
     def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
-        """Return the spec of each out key, ``[*B, ...]``, given the input spec."""
+        """Return the spec of each out key, ``[*B, ...]``, given the input spec.
+
+        By default unbounded, with the shapes and types computed from a row of zeros.
+        """
+        batch = spec.shape
+        zeros = [
+            torch.zeros(
+                (1, *spec[key].shape[len(batch) :]),
+                dtype=spec[key].dtype,
+                device=spec.device,
+            )
+            for key in self.in_keys
+        ]
+        with torch.no_grad():
+            values = self._first(zeros)
+        return [
+            (Binary if value.dtype == torch.bool else Unbounded)(
+                shape=torch.Size((*batch, *value.shape[1:])), dtype=value.dtype
+            )
+            for value in values
+        ]
+
+    @abstractmethod
+    def _first(self, inputs: Sequence[Tensor]) -> Sequence[Tensor]:
+        """Return the first values of an episode of one row, ``[1, ...]`` each."""
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Return the spec with the out keys added."""
@@ -166,7 +196,8 @@ class RowTransform(_KeyedTransform):
     It works inside a worker, around a ParallelEnv, and when called on a TensorDict with
     any leading dimensions (for example, a stored batch with time). Keys may be nested,
     but the batch is that of the whole TensorDict: further batch dimensions of a nested
-    one (several agents, say) are not supported.
+    one (several agents, say) are not supported. The specs of the out keys are computed
+    from a row of zeros; override ``out_specs`` for others, such as bounded ones.
 
     Args:
         in_keys: Keys read; written only if they are also out keys.
@@ -191,6 +222,9 @@ class RowTransform(_KeyedTransform):
         inputs = self._read(next_tensordict, self.in_keys)
         self._write(next_tensordict, self._computed(inputs))
         return next_tensordict
+
+    def _first(self, inputs: Sequence[Tensor]) -> Sequence[Tensor]:
+        return self._computed(inputs)
 
     def _computed(self, inputs: Sequence[Tensor]) -> tuple[Tensor, ...]:
         values = self.compute(*inputs)
@@ -291,6 +325,10 @@ class StatefulTransform(_KeyedTransform):
         Returns:
             Tensors ``[B, ...]``.
         """
+
+    def _first(self, inputs: Sequence[Tensor]) -> Sequence[Tensor]:
+        row = torch.zeros(1, dtype=torch.int64, device=inputs[0].device)
+        return self.start(row, inputs, None)
 
     def transform_state_spec(self, state_spec: TensorSpec) -> TensorSpec:
         """Return the spec with the state keys added."""

@@ -20,7 +20,6 @@ if __name__ == "__main__":
 
 # isort: split
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import gymnasium
@@ -30,7 +29,6 @@ import torch
 import tyro
 from gymnasium.vector import AutoresetMode
 from torch import Tensor
-from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 from torchrl.envs import Compose, GymWrapper, StepCounter, TransformedEnv
 
 from egoskin.commands.errors import clear_errors
@@ -102,15 +100,6 @@ class HumanoidState(RowTransform):
             torch.cat((ball, upright), -1)[:, None],
             torch.ones_like(steps, dtype=torch.bool),
         )
-
-    def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
-        """Return the specs of the four outputs."""
-        batch, dtype = spec.shape, spec["observation"].dtype
-        state = [
-            Unbounded(shape=torch.Size((*batch, *shape)), dtype=dtype)
-            for shape in ((7,), (17,), (1, 7))
-        ]
-        return (*state, Binary(shape=torch.Size((*batch, 1)), dtype=torch.bool))
 
 
 def make_env(skin: Skin, num_envs: int) -> TransformedEnv:

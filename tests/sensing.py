@@ -12,7 +12,7 @@ import torch
 from hypothesis import strategies as st
 
 from egoskin.robots.builtin import H1_2
-from egoskin.sensors import Field, Ray, RaySensor, Skin
+from egoskin.sensors import Field, FieldSensor, Ray, RaySensor, Skin
 from egoskin.sensors.kernels.binding import Kernels
 from egoskin.shapes import Box, Capsule, Ellipsoid, Sphere
 
@@ -106,6 +106,34 @@ def draw_balls(random_state, rng):
             flat = state[key].view(rows, -1)
             flat[rng.integers(rows), rng.integers(flat.shape[1])] = math.nan
     return BALLS[:count], state
+
+
+def check_fields(pair, skin, random_state, seed, per_object):
+    """Assert that a pair of field sensors has the same bits; return it, and a state."""
+    rng = np.random.default_rng(seed)
+    coverages = draw_fields(rng)
+    balls, state = draw_balls(random_state, rng)
+    some = draw_coverages(skin, coverages, rng)
+    plain, fast = pair(FieldSensor, some, H1_2.chain, balls, 1.0, per_object=per_object)
+    assert_same_bits(measure(fast, state), measure(plain, state))
+    return plain, fast, state
+
+
+def check_rays(pair, skin, random_state, seed, reduce, per_object) -> None:
+    """Assert that a pair of ray sensors has the same bits."""
+    rng = np.random.default_rng(seed)
+    coverages = draw_rays(rng)
+    balls, state = draw_balls(random_state, rng)
+    plain, fast = pair(
+        RaySensor,
+        *(draw_coverages(skin, coverages, rng), H1_2.chain, balls, 1.0),
+        reduce=reduce,
+        per_object=per_object,
+    )
+    assert_same_bits(measure(fast, state), measure(plain, state))
+    if reduce == "none" and not per_object:
+        inputs = [state[key] for key in KEYS]
+        assert_same_bits(fast.hits(*inputs), plain.hits(*inputs))
 
 
 def sliced_inputs(random_state) -> list[torch.Tensor]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from importlib.util import find_spec
 
 import pytest
@@ -170,6 +171,13 @@ def test_seed_outside_32_bits_is_refused(seed):
 def test_a_user_may_not_choose_a_held_out_seed(seed):
     for check in (check_seed, held_out):
         with pytest.raises(ValueError, match=r"seed must be in \[0, 2\*\*32\), got"):
+            check(seed)
+
+
+@pytest.mark.parametrize("seed", [0.5, "0", None])
+def test_a_seed_that_is_no_integer_is_refused(seed):
+    for check in (check_seed, held_out, partial(stream_key, stream=Stream.START)):
+        with pytest.raises(ValueError, match=f"seed must be an integer, got {seed!r}"):
             check(seed)
 
 

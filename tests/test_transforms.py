@@ -13,6 +13,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from tensordict import TensorDict
+from torchrl.data import Binary as BinarySpec
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import Compose, ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
@@ -34,6 +35,7 @@ from egoskin.sensors import (
     Localization,
     Proximity,
     RaySensor,
+    Tactile,
     place_sensors,
 )
 from egoskin.sensors.config import SensorConfig
@@ -154,6 +156,20 @@ def test_a_missing_key_is_named(build, full_state):
         transform(state)
 
 
+def test_specs_are_by_default_those_of_the_results():
+    class Split(RowTransform):
+        def __init__(self) -> None:
+            super().__init__(in_keys=["x"], out_keys=["y", "flag"])
+
+        def compute(self, *inputs) -> Any:
+            return inputs[0][:, :2].double(), inputs[0][:, 0] > 0
+
+    spec = Composite(x=Unbounded((2, 4, 3)), shape=[2, 4])
+    specs = Split().transform_observation_spec(spec)
+    assert specs["y"] == Unbounded((2, 4, 2), dtype=torch.float64)
+    assert specs["flag"] == BinarySpec(shape=torch.Size((2, 4)), dtype=torch.bool)
+
+
 @pytest.mark.parametrize("given", ["bare", "two"])
 @pytest.mark.parametrize("method", ["compute", "out_specs"])
 def test_results_that_are_not_one_for_each_key_are_refused(method, given):
@@ -222,6 +238,8 @@ def test_results_that_are_not_one_for_each_key_are_refused(method, given):
             r"in_keys must be a list of at least 4, got \['a",
         ),
         (lambda: KeepLast(["signal"]), "in_keys must be a list of at least 2, got"),
+        (lambda: Oracle(["base_pose"]), "in_keys must be a list of 5, got"),
+        (lambda: Tactile(1.0, ["a", "b"]), "in_keys must be a list of 1, got"),
     ],
 )
 def test_keys_of_a_wrong_kind_or_number_are_refused(build, message):

@@ -8,7 +8,6 @@ from typing import Literal
 import torch
 from tensordict import NestedKey
 from torch import Tensor
-from torchrl.data import Composite, TensorSpec, Unbounded
 
 from egoskin.robots.kinematics import axis_vectors, rotate_inverse
 from egoskin.transform import RowTransform
@@ -32,6 +31,7 @@ class Proprioception(RowTransform):
         out_keys: Key of the observation.
     """
 
+    _NUM_IN, _NUM_OUT = (4, 5), (1, 1)
     _default: Tensor
     STATE_KEYS = ("base_pose", "base_ang_vel_b", "joint_pos", "joint_vel")
     """The required inputs."""
@@ -53,12 +53,6 @@ class Proprioception(RowTransform):
         deviation = joint_pos - self._default.to(joint_pos.dtype)
         parts = (base_ang_vel_b, deviation, joint_vel, gravity_b, *action)
         return (torch.cat(parts, -1),)
-
-    def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
-        """Return the spec of the observation."""
-        size = 6 + (len(self.in_keys) - 2) * len(self._default)
-        dtype = spec[self.in_keys[2]].dtype
-        return (Unbounded(shape=torch.Size((*spec.shape, size)), dtype=dtype),)
 
 
 def object_states_b(
@@ -143,10 +137,6 @@ class HideObjects(RowTransform):
         """Return the flags, ``[B, O]``."""
         return (torch.zeros_like(inputs[0]),)
 
-    def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
-        """Return the spec of the flags."""
-        return (spec[self.in_keys[0]].clone(),)
-
 
 class Oracle(RowTransform):
     """The true state of every ball: a diagnostic that no sensor can provide.
@@ -158,6 +148,8 @@ class Oracle(RowTransform):
         in_keys: Keys of the inputs, in the order above.
         out_keys: Key of the signal.
     """
+
+    _NUM_IN, _NUM_OUT = (5, 5), (1, 1)
 
     def __init__(
         self,
@@ -175,12 +167,6 @@ class Oracle(RowTransform):
     def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Return the signal, ``[B, 7 O]``."""
         return (object_states_b(*inputs),)
-
-    def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
-        """Return the spec of the signal."""
-        objects = spec[self.in_keys[4]].shape[-1]
-        shape = torch.Size((*spec.shape, 7 * objects))
-        return (Unbounded(shape=shape, dtype=spec[self.in_keys[0]].dtype),)
 
 
 class Privileged(RowTransform):
@@ -242,13 +228,3 @@ class Privileged(RowTransform):
             parts += [rotate_inverse(quat, planar), previous_action, states]
             parts += [approaches, base_pose[:, 2:3]]
         return (torch.cat(parts, -1),)
-
-    def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
-        """Return the spec of the observation."""
-        base_pose, _, *rest = (spec[key] for key in self.in_keys)
-        size = 3
-        if rest:
-            _, previous_action, *_, active = rest
-            size += 3 + previous_action.shape[-1] + 11 * active.shape[-1] + 1
-        shape = torch.Size((*spec.shape, size))
-        return (Unbounded(shape=shape, dtype=base_pose.dtype),)

@@ -116,11 +116,6 @@ def kept_robot(name: str) -> str | RobotConfig:
     return name if name in ROBOTS else portable(raw_robot(name))
 
 
-def _name(robot: str | RobotConfig) -> str:
-    """Return the name of a robot as stored in configurations."""
-    return robot if isinstance(robot, str) else robot.name
-
-
 Robot = Annotated[
     str | RobotConfig,
     PrimitiveConstructorSpec(
@@ -128,7 +123,9 @@ Robot = Annotated[
         metavar="NAME|PATH",
         instance_from_str=lambda texts: kept_robot(texts[0]),
         is_instance=lambda value: isinstance(value, (str, RobotConfig)),
-        str_from_instance=lambda value: [_name(value)],
+        str_from_instance=lambda value: [
+            value if isinstance(value, str) else value.name
+        ],
     ),
 ]
 """A built-in robot by name, or another one as data; a command-line option accepts the
@@ -242,18 +239,8 @@ def read_folder(folder: Path) -> RobotConfig:
             "skin_links, gains)"
         )
     toml = _Toml(path)
+    _check_keys(toml)
     content = toml.content
-    for key in content:
-        if key not in _KEYS:
-            raise toml.error(f"there is {_no_match(key, _KEYS, 'key')}", key)
-    for key in _NEEDED:
-        if key not in content:
-            raise toml.error(f"{key} is missing")
-    for key, value in content.items():
-        kind = list if key in _LISTS else dict if key in _TABLES else str
-        if not isinstance(value, kind):
-            names = {list: "a list of links", dict: "a table", str: "a string"}
-            raise toml.error(f"{key} must be {names[kind]}, got {value!r}", key)
     model = folder / content["model"]
     if not model.is_file():
         raise toml.error(f"there is no file {model}", "model")
@@ -275,6 +262,28 @@ def read_folder(folder: Path) -> RobotConfig:
     except ValueError as error:
         raise toml.error(str(error), "base") from None
     lists = {key: _links(toml, key, links) for key in _LISTS}
+    _check_joints(toml, robot)
+    return replace(robot, **lists)
+
+
+def _check_keys(toml: _Toml) -> None:
+    """Raise ValueError for keys that are unknown, missing or of a wrong type."""
+    content = toml.content
+    for key in content:
+        if key not in _KEYS:
+            raise toml.error(f"there is {_no_match(key, _KEYS, 'key')}", key)
+    for key in _NEEDED:
+        if key not in content:
+            raise toml.error(f"{key} is missing")
+    for key, value in content.items():
+        kind = list if key in _LISTS else dict if key in _TABLES else str
+        if not isinstance(value, kind):
+            names = {list: "a list of links", dict: "a table", str: "a string"}
+            raise toml.error(f"{key} must be {names[kind]}, got {value!r}", key)
+
+
+def _check_joints(toml: _Toml, robot: RobotConfig) -> None:
+    """Raise ValueError for patterns of joints that match none, or too many."""
     tables = [(("default_pose",), robot.default_pose)]
     tables += [(("gains", name), table) for name, table in robot.gains.items()]
     for keys, table in tables:
@@ -296,7 +305,6 @@ def read_folder(folder: Path) -> RobotConfig:
         _ = robot.default_joint_pos
     except ValueError as error:
         raise toml.error(str(error), "default_pose") from None
-    return replace(robot, **lists)
 
 
 def _pose(toml: _Toml) -> dict[str, float]:
@@ -322,19 +330,15 @@ def _gains(toml: _Toml) -> dict[str, dict[str, Gain]]:
         if not isinstance(table, dict):
             raise toml.error(f"gains.{name} must be a table of joints", "gains", name)
         for joint, gain in table.items():
-            if (
-                not isinstance(gain, dict)
-                or gain.keys() != {"kp", "kd"}
-                or not all(map(is_number, gain.values()))
-                or gain["kp"] <= 0
-                or gain["kd"] < 0
-            ):
+            try:
+                given = Gain(**gain)
+            except (TypeError, ValueError):
                 raise toml.error(
                     f"the gains of {joint!r} must be {{ kp = N m/rad > 0, kd = "
                     f"N m s/rad >= 0 }}, got {gain!r}",
                     *("gains", name, joint),
-                )
-            sets[name][joint] = Gain(kp=float(gain["kp"]), kd=float(gain["kd"]))
+                ) from None
+            sets[name][joint] = Gain(kp=float(given.kp), kd=float(given.kd))
     return sets
 
 

@@ -84,24 +84,13 @@ def make_portable(robot: RobotConfig) -> Portable:
     if robot.model_xml is not None:
         return Portable(robot=robot, fits=[], lost=[])
     spec, model = robot.spec(), robot.model
-    keep = set(robot.links)
-    _check_outermost(robot, model)
-    acting = [np.any(getattr(model, f"tendon_{name}")) for name in _TENDON_FORCES]
-    for kind, found in {
-        "tendons with limit, stiffness, damping, friction or armature": any(acting),
-        "equality constraints (in a URDF: mimic)": bool(spec.equalities),
-    }.items():
-        if found:
-            raise ValueError(
-                f"{robot.name}: {kind} are not supported: remove them, or fix the "
-                "joints that they move"
-            )
+    _check_supported(robot, spec, model)
     _fix_inertia(spec, model)
     _limit_torques(spec, model)
     in_pairs = {pair.geomname1 for pair in spec.pairs}
     in_pairs |= {pair.geomname2 for pair in spec.pairs}
     for body in list(spec.worldbody.bodies):
-        if body.name not in keep:
+        if body.name not in robot.links:
             spec.delete(body)
     # They may refer to what has been deleted.
     _delete(
@@ -114,31 +103,7 @@ def make_portable(robot: RobotConfig) -> Portable:
     else:
         fits, lost = fit_meshes(spec, in_pairs), []
     _round_off(spec)
-    for geom in list(spec.geoms):
-        touches = geom.contype or geom.conaffinity or geom.name in in_pairs
-        if touches and geom.group > _LAST_SHOWN:
-            # What was shown in its place is left out.
-            geom.group = 0
-        if geom.parent.name == "world" or (
-            not touches and geom.type not in _PRIMITIVES
-        ):
-            spec.delete(geom)
-        elif geom.type not in _PRIMITIVES:
-            raise ValueError(
-                f"{robot.name}: link {geom.parent.name!r} has a collision shape, "
-                f"{geom.name or 'unnamed'}, of kind "
-                f"{geom.type.name.removeprefix('mjGEOM_').lower()}; a robot stored as "
-                "data may have spheres, capsules, boxes, cylinders, ellipsoids and "
-                "meshes: replace it, or make it visual only "
-                '(contype="0" conaffinity="0")'
-            )
-    for each in (*spec.geoms, *spec.pairs):
-        # A ball within the margin would count as a touch.
-        each.margin = each.gap = 0.0
-    geoms = {geom.name for geom in spec.geoms}
-    for pair in list(spec.pairs):
-        if not {pair.geomname1, pair.geomname2} <= geoms:
-            spec.delete(pair)
+    _keep_primitives(spec, robot.name, in_pairs)
     _set_bits(spec, in_pairs)
     _exclude_overlaps(spec, robot, {fit.link for fit in fits})
     _delete(spec, spec.meshes, spec.textures, spec.hfields)
@@ -185,8 +150,43 @@ def _robot_only(text: str) -> str:
     return ElementTree.tostring(root, encoding="unicode") if surplus else text
 
 
-def _check_outermost(robot: RobotConfig, model: mujoco.MjModel) -> None:
-    """Raise ValueError if the base is fixed to another body."""
+def _keep_primitives(spec: mujoco.MjSpec, name: str, in_pairs: Collection[str]) -> None:
+    """Delete visual meshes and the shapes of the world; reset margins of contacts.
+
+    Raises:
+        ValueError: If a collision shape is no primitive.
+    """
+    for geom in list(spec.geoms):
+        touches = geom.contype or geom.conaffinity or geom.name in in_pairs
+        if touches and geom.group > _LAST_SHOWN:
+            # What was shown in its place is left out.
+            geom.group = 0
+        if geom.parent.name == "world" or (
+            not touches and geom.type not in _PRIMITIVES
+        ):
+            spec.delete(geom)
+        elif geom.type not in _PRIMITIVES:
+            raise ValueError(
+                f"{name}: link {geom.parent.name!r} has a collision shape, "
+                f"{geom.name or 'unnamed'}, of kind "
+                f"{geom.type.name.removeprefix('mjGEOM_').lower()}; a robot stored as "
+                "data may have spheres, capsules, boxes, cylinders, ellipsoids and "
+                "meshes: replace it, or make it visual only "
+                '(contype="0" conaffinity="0")'
+            )
+    for each in (*spec.geoms, *spec.pairs):
+        # A ball within the margin would count as a touch.
+        each.margin = each.gap = 0.0
+    geoms = {geom.name for geom in spec.geoms}
+    for pair in list(spec.pairs):
+        if not {pair.geomname1, pair.geomname2} <= geoms:
+            spec.delete(pair)
+
+
+def _check_supported(
+    robot: RobotConfig, spec: mujoco.MjSpec, model: mujoco.MjModel
+) -> None:
+    """Raise ValueError if the base is fixed to a body, or for tendons or equalities."""
     parent = model.body_parentid[body_id(model, robot.base)]
     if parent:
         raise ValueError(
@@ -194,6 +194,16 @@ def _check_outermost(robot: RobotConfig, model: mujoco.MjModel) -> None:
             f"{body_name(model, parent)!r}, but must be attached to the world itself: "
             "take the outermost body as base, or remove what is above it"
         )
+    acting = [np.any(getattr(model, f"tendon_{name}")) for name in _TENDON_FORCES]
+    for kind, found in {
+        "tendons with limit, stiffness, damping, friction or armature": any(acting),
+        "equality constraints (in a URDF: mimic)": bool(spec.equalities),
+    }.items():
+        if found:
+            raise ValueError(
+                f"{robot.name}: {kind} are not supported: remove them, or fix the "
+                "joints that they move"
+            )
 
 
 def _fix_inertia(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:

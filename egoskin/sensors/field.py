@@ -12,7 +12,7 @@ from tensordict import NestedKey
 from torch import Tensor
 
 from egoskin.robots.config import Primitive
-from egoskin.rounding import exact_sqrt
+from egoskin.rounding import exact_sqrt, matvec
 from egoskin.sensors.geometry import (
     STATE_KEYS,
     ProximitySensor,
@@ -143,10 +143,8 @@ class FieldSensor(ProximitySensor):
 
     def _in_object(self, view: View, centre: Tensor) -> list[Tensor]:
         """Sensor positions in the object's frame [m], three of ``[S, B]``."""
-        x, y, z = centre
         assert view.turn is not None
-        turn = view.turn[:, :, self._link]
-        return [-(row[0] * x + row[1] * y + row[2] * z) for row in turn]
+        return [-p for p in matvec(view.turn[:, :, self._link], centre)]
 
     def _to_closest(self, view: View, shape: Solid, centre: Tensor) -> Sequence[Tensor]:
         """Vector from each sensor to the object's closest point, in its link [m].
@@ -156,10 +154,9 @@ class FieldSensor(ProximitySensor):
         if isinstance(shape, Sphere):
             return list(centre)
         p = self._in_object(view, centre)
-        x, y, z = (a - b for a, b in zip(shape.closest_point(*p), p, strict=True))
+        way = [a - b for a, b in zip(shape.closest_point(*p), p, strict=True)]
         assert view.turn is not None
-        columns = view.turn[:, :, self._link].transpose(0, 1)
-        return [c[0] * x + c[1] * y + c[2] * z for c in columns]
+        return matvec(view.turn[:, :, self._link].transpose(0, 1), way)
 
     def measure(self, scene: Scene, rows: Tensor, out: Tensor) -> Tensor:
         """Write the readings of some rows; return the minimum of each object."""

@@ -28,6 +28,7 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 
 from egoskin.robots.config import Primitive
 from egoskin.robots.kinematics import LinkKinematics, quat_to_entries
+from egoskin.rounding import matmul, matvec
 from egoskin.sensors.kernels.binding import Kernels
 from egoskin.sensors.occlusion import Occluder
 from egoskin.sensors.skin.coverage import Coverage
@@ -69,26 +70,6 @@ class View(NamedTuple):
     turn: Tensor | None
     """Rotation from the link frames into the object's, ``[3, 3, L, B]``; None for a
     sphere, which has no orientation."""
-
-
-def product(a: Tensor, b: Tensor) -> Tensor:
-    """Return the matrix product over the first two dimensions, ``[3, 3, *B]``.
-
-    Written out because a library's product may round differently for another batch.
-
-    Args:
-        a: ``[3, 3, *B]``.
-        b: ``[3, 3, *B]``, broadcastable.
-    """
-    return torch.stack(
-        [
-            torch.stack(
-                [a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
-                 for j in range(3)]
-            )
-            for i in range(3)
-        ]
-    )  # fmt: skip
 
 
 def _turned_back(rotation: Tensor, vector: Tensor) -> Tensor:
@@ -138,6 +119,7 @@ class ProximitySensor(RowTransform):
             not a shape, or another argument is of a wrong kind or number.
     """
 
+    _NUM_IN, _NUM_OUT = (4, 4), (2, 2)
     _link: Tensor
     _offset: Tensor
     _axes: Tensor
@@ -156,11 +138,6 @@ class ProximitySensor(RowTransform):
         out_keys: Sequence[NestedKey],
     ) -> None:
         super().__init__(in_keys, out_keys)
-        if len(in_keys) != 4 or len(out_keys) != 2:
-            raise ValueError(
-                "a proximity sensor has four in_keys and two out_keys, got "
-                f"{list(in_keys)} and {list(out_keys)}"
-            )
         if not isinstance(chain, pk.Chain):
             raise ValueError(
                 "chain must be a pytorch_kinematics.Chain (RobotConfig.chain), got "
@@ -314,8 +291,8 @@ class ProximitySensor(RowTransform):
             turn = None
             if not isinstance(shape, Sphere):
                 # Link to base to object: (R_base^T R_object)^T R_link.
-                to_object = product(_matrix(pose[3:]).transpose(0, 1), base)
-                turn = product(to_object[:, :, None], rotation)
+                to_object = matmul(_matrix(pose[3:]).transpose(0, 1), base)
+                turn = matmul(to_object[:, :, None], rotation)
             views.append(View(seen, turn))
         return views
 
@@ -386,10 +363,6 @@ class ProximitySensor(RowTransform):
         assert self._occluder is not None
         link = self._link[sensor]
         turn, position = (x[..., link, row] for x in scene.links)
-
-        def to_base(v: Tensor, of: Tensor | slice = slice(None)) -> list[Tensor]:
-            return [r[0, of] * v[0] + r[1, of] * v[1] + r[2, of] * v[2] for r in turn]
-
         # p + R o
         x, y, z = scene.skin["start"][:, sensor, 0]
         origin = position + turn[:, 0] * x + turn[:, 1] * y + turn[:, 2] * z
@@ -399,10 +372,10 @@ class ProximitySensor(RowTransform):
             scene.links,
             row,
             origin,
-            torch.stack(to_base(target)),
+            torch.stack(matvec(turn, target)),
             radius,
             pair,
-            to_base(direction[:, pair, path], pair),
+            matvec(turn[..., pair], direction[:, pair, path]),
             length[pair, path],
         )
         return torch.where(hidden, torch.inf, reading)

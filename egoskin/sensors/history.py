@@ -10,7 +10,7 @@ from tensordict import NestedKey
 from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 
-from egoskin.transform import StatefulTransform, key_list
+from egoskin.transform import StatefulTransform
 
 
 class History(StatefulTransform):
@@ -38,13 +38,11 @@ class History(StatefulTransform):
     ) -> None:
         if not isinstance(length, Integral) or length < 1:
             raise ValueError(f"length must be an integer, at least 1, got {length}")
-        in_keys = key_list("in_keys", in_keys)
-        out_keys = key_list("out_keys", out_keys)
-        if len(in_keys) != len(out_keys):
-            raise ValueError(
-                f"need one out key per in key, got {in_keys} and {out_keys}"
-            )
         super().__init__(in_keys, out_keys, state_keys=out_keys)
+        if len(self.in_keys) != len(self.out_keys):
+            raise ValueError(
+                f"need one out key per in key, got {self.in_keys} and {self.out_keys}"
+            )
         self.length = length
 
     def start(
@@ -101,13 +99,13 @@ class KeepLast(StatefulTransform):
         ValueError: If the number of keys is wrong.
     """
 
+    _NUM_IN, _NUM_OUT = (2, None), (1, 1)
+
     def __init__(
         self,
         in_keys: Sequence[NestedKey] = ("signal", "object_detected"),
         out_keys: Sequence[NestedKey] = ("last_signal",),
     ) -> None:
-        in_keys = key_list("in_keys", in_keys, 2)
-        out_keys = key_list("out_keys", out_keys, 1, 1)
         super().__init__(in_keys, out_keys, state_keys=out_keys)
 
     def start(
@@ -126,8 +124,3 @@ class KeepLast(StatefulTransform):
         signal, *detections = inputs
         detected = torch.stack([d.any(-1, keepdim=True) for d in detections]).any(0)
         return [torch.where(detected, signal, state[0])]
-
-    def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
-        """Return the spec of the last signal."""
-        one = spec[self.in_keys[0]]
-        return [Unbounded(shape=one.shape, dtype=one.dtype)]

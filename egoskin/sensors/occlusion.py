@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from egoskin.robots.config import Primitive
+from egoskin.rounding import matvec
 from egoskin.shapes import shape_of
 
 # A path is blocked if a longer part of it than this lies inside one primitive [m]. The
@@ -58,7 +59,7 @@ class Occluder:
             before = point
             for i, shape in enumerate(self._shapes):
                 start = [p - c for p, c in zip(point, self._centres[i], strict=True)]
-                start, way = (_turned(self._turns[i], v) for v in (start, normal))
+                start, way = (matvec(self._turns[i], v) for v in (start, normal))
                 inside = shape.signed_distance(*start) < -_ROUNDING
                 inside &= link == self._link[i]
                 _, leave = shape.ray_interval(*start, *way)
@@ -110,10 +111,10 @@ class Occluder:
             link, at = self._link[i], row[some]
             # Into the link's frame, then the primitive's: R^T (p - o).
             columns = rotation[:, :, link, at].transpose(0, 1)
-            start = _turned(columns, origin[:, some] - position[:, link, at])
+            start = matvec(columns, origin[:, some] - position[:, link, at])
             start = [p - c for p, c in zip(start, self._centres[i], strict=True)]
-            way = _turned(columns, [d[some] for d in direction])
-            start, way = (_turned(self._turns[i], v) for v in (start, way))
+            way = matvec(columns, [d[some] for d in direction])
+            start, way = (matvec(self._turns[i], v) for v in (start, way))
             enter, leave = shape.ray_interval(*start, *way)
             inside = torch.minimum(leave, length[some]) - enter.clamp(min=0.0)
             hidden[some] = inside > _DEPTH
@@ -145,9 +146,3 @@ class Occluder:
         gap = torch.maximum(gap, along - (reach + radius))
         bounds = centre.new_tensor([s.bounding_radius for s in self._shapes])
         return ~(gap > bounds[:, None] + _SLACK)
-
-
-def _turned(rows: Sequence | Tensor, vector: Sequence | Tensor) -> list[Tensor]:
-    """The product of a matrix, given by its rows, with a vector."""
-    x, y, z = vector
-    return [a * x + b * y + c * z for a, b, c in rows]

@@ -12,13 +12,13 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from egoskin.robots.config import Primitive
+from egoskin.rounding import matmul, matvec
 from egoskin.sensors.geometry import (
     STATE_KEYS,
     ProximitySensor,
     Scene,
     View,
     checked,
-    product,
 )
 from egoskin.sensors.kernels.binding import VECTOR
 from egoskin.sensors.signals import Binary, Proximity
@@ -164,7 +164,7 @@ class RaySensor(ProximitySensor):
     def _margin(self, view: View, shape: Solid, skin: dict[str, Tensor]) -> Tensor:
         """Margins of one object [m], ``[S, B]``."""
         away = view.centre[:, self._link] - skin["offset"]
-        x, y, z = self._in_sensor(away, skin["axes"])
+        x, y, z = matvec(skin["axes"], away)
         # Outside the range, behind the sensor, or beyond a side of the pyramid:
         # R + r - |c|, r + z, r - (|x| cos h - z sin h).
         cos, sin = skin["pyramid"]
@@ -174,11 +174,6 @@ class RaySensor(ProximitySensor):
         )
         gap = torch.maximum(torch.maximum(far, beside), -z)
         return (shape.bounding_radius + _SLACK - gap).clamp(min=0.0)
-
-    @staticmethod
-    def _in_sensor(v: Tensor, axes: Tensor) -> list[Tensor]:
-        """Coordinates of a vector in the sensor frames."""
-        return [a[0] * v[0] + a[1] * v[1] + a[2] * v[2] for a in axes]
 
     def read(
         self,
@@ -204,17 +199,15 @@ class RaySensor(ProximitySensor):
         skin, link = scene.skin, self._link[sensor]
         axes, offset = skin["axes"][:, :, sensor, 0], skin["offset"][:, sensor, 0]
         away = view.centre[:, link, row] - offset
-        centre = self._in_sensor(away, axes)
         beams = skin["beams"]
         if beams.shape[1] > 1:
             beams = beams[:, self._beam_of[sensor]]
-        origin, way = [-c[:, None] for c in centre], list(beams)
+        origin = [-c[:, None] for c in matvec(axes, away)]
+        way = list(beams)
         if view.turn is not None:
             # Sensor to object: M R; the columns of R are the sensor's axes.
-            turn = product(view.turn[:, :, link, row], axes.transpose(0, 1))[..., None]
-            x, y, z = origin
-            origin = [r[0] * x + r[1] * y + r[2] * z for r in turn]
-            way = [r[0] * beams[0] + r[1] * beams[1] + r[2] * beams[2] for r in turn]
+            turn = matmul(view.turn[:, :, link, row], axes.transpose(0, 1))[..., None]
+            origin, way = matvec(turn, origin), matvec(turn, beams)
         distance = first_hit(*shape.ray_interval(*origin, *way))
         if self._occluder is not None:
             x, y, z = axes[..., None]

@@ -14,11 +14,11 @@ from collections.abc import Sequence
 import torch
 from tensordict import NestedKey
 from torch import Tensor
-from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
+from torchrl.data import Bounded, Composite, TensorSpec
 
 from egoskin.robots.kinematics import rotate_inverse
 from egoskin.sensors.geometry import ProximitySensor
-from egoskin.transform import RowTransform, key_list
+from egoskin.transform import RowTransform
 
 # An infinite range has no scale: a distance d gives the signal d / (d + 1 m).
 _HALF_DISTANCE = 1.0
@@ -39,6 +39,7 @@ class _Reading(RowTransform):
             key each.
     """
 
+    _NUM_IN = _NUM_OUT = (1, 1)
     _range: Tensor
 
     def __init__(
@@ -47,9 +48,7 @@ class _Reading(RowTransform):
         in_keys: Sequence[NestedKey],
         out_keys: Sequence[NestedKey],
     ) -> None:
-        super().__init__(
-            key_list("in_keys", in_keys, 1, 1), key_list("out_keys", out_keys, 1, 1)
-        )
+        super().__init__(in_keys, out_keys)
         if isinstance(max_range, ProximitySensor):
             max_range = max_range.ranges.tolist()
         try:
@@ -231,23 +230,18 @@ class BeamMinimum(RowTransform):
         ValueError: If there is not one key each.
     """
 
+    _NUM_IN = _NUM_OUT = (1, 1)
+
     def __init__(
         self,
         in_keys: Sequence[NestedKey] = ("distance",),
         out_keys: Sequence[NestedKey] = ("sensor_distance",),
     ) -> None:
-        super().__init__(
-            key_list("in_keys", in_keys, 1, 1), key_list("out_keys", out_keys, 1, 1)
-        )
+        super().__init__(in_keys, out_keys)
 
     def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Return the minima, ``[B, S]``."""
         return (inputs[0].amin(-1),)
-
-    def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
-        """Return the spec of the minima."""
-        measured = spec[self.in_keys[0]]
-        return (Unbounded(shape=measured.shape[:-1], dtype=measured.dtype),)
 
 
 class Localization(RowTransform):
@@ -269,6 +263,8 @@ class Localization(RowTransform):
         ValueError: If the number of keys is wrong.
     """
 
+    _NUM_IN, _NUM_OUT = (4, None), (1, 1)
+
     def __init__(
         self,
         in_keys: Sequence[NestedKey] = (
@@ -277,9 +273,7 @@ class Localization(RowTransform):
         ),
         out_keys: Sequence[NestedKey] = ("signal",),
     ) -> None:
-        super().__init__(
-            key_list("in_keys", in_keys, 4), key_list("out_keys", out_keys, 1, 1)
-        )
+        super().__init__(in_keys, out_keys)
 
     def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Return the signal, ``[B, 3]``."""
@@ -298,8 +292,3 @@ class Localization(RowTransform):
         position = position.gather(1, nearest[..., None].expand(-1, -1, 3))[:, 0]
         # NaN remains if an object is detected; poses of inactive objects do not matter.
         return (position.masked_fill(~detected.any(-1, keepdim=True), 0.0),)
-
-    def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
-        """Return the spec of the signal."""
-        dtype = spec[self.in_keys[0]].dtype
-        return (Unbounded(shape=torch.Size((*spec.shape, 3)), dtype=dtype),)

@@ -19,7 +19,6 @@ from collections.abc import Mapping, Sequence
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary as BinarySpec
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
@@ -70,6 +69,8 @@ class Tactile(RowTransform):
         ValueError: If the threshold is negative or NaN.
     """
 
+    _NUM_IN = _NUM_OUT = (1, 1)
+
     def __init__(
         self,
         threshold: float,
@@ -95,11 +96,6 @@ class Tactile(RowTransform):
             )
         # Not `>`, which is false for NaN: a diverged simulation must count as contact.
         return (~(force[..., -3:].norm(dim=-1) <= self.threshold),)
-
-    def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
-        """Return the spec of the contacts."""
-        shape = spec[self.in_keys[0]].shape[:-1]
-        return (BinarySpec(shape=shape, dtype=torch.bool),)
 
 
 class ContactPenalty(Transform):
@@ -214,6 +210,7 @@ class ContactFree(StatefulTransform):
         ValueError: If a pattern matches no link.
     """
 
+    _NUM_IN = _NUM_OUT = (1, 1)
     _counted: Tensor
 
     def __init__(
@@ -243,10 +240,6 @@ class ContactFree(StatefulTransform):
         """Return whether the trajectory is still free of contact, ``[B, 1]``."""
         (now,) = self.start(rows, inputs, None)
         return (state[0] & now,)
-
-    def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
-        """Return the spec of the label."""
-        return (BinarySpec(shape=torch.Size((*spec.shape, 1)), dtype=torch.bool),)
 
 
 def _trajectory(done: Tensor) -> Tensor:

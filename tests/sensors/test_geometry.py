@@ -191,8 +191,8 @@ def test_inputs_of_a_wrong_form_are_refused(
         ({"max_range": [1.0] * 64}, "one number, got .* belongs in Skin.range"),
         ({"max_range": "2"}, "max_range must be one number, got '2'"),
         ({"body": H1_2}, r"body must hold primitives \(RobotConfig.prim.*got RobotCon"),
-        ({"in_keys": KEYS[:3]}, "four in_keys and two out_keys, got"),
-        ({"out_keys": ["distance"]}, "four in_keys and two out_keys, got"),
+        ({"in_keys": KEYS[:3]}, "in_keys must be a list of 4, got"),
+        ({"out_keys": ["distance"]}, "out_keys must be a list of 2, got"),
         ({"out_keys": "ab"}, "out_keys must be a list of keys, got 'ab'"),
     ],
 )

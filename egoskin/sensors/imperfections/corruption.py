@@ -19,7 +19,7 @@ from functools import cached_property
 import torch
 from tensordict import NestedKey
 from torch import Tensor
-from torchrl.data import Composite, TensorSpec, Unbounded
+from torchrl.data import Composite, TensorSpec
 
 from egoskin.bounds import BoundsError, check_bounds
 from egoskin.rng import Stream, halfwords, random_words, stream_key
@@ -481,14 +481,5 @@ class Corruption(StatefulTransform):
 
     def out_specs(self, spec: Composite) -> Sequence[TensorSpec]:
         """Return the specs of the reading, the clock and the models' states."""
-        batch = spec.shape
-        # Take the shapes from a dummy reading.
-        inputs = [
-            torch.zeros(1, *spec[k].shape[len(batch) :], dtype=spec[k].dtype)
-            for k in self.in_keys
-        ]
-        values = self.start(torch.zeros(1, dtype=torch.int64), inputs, None)
-        return [
-            Unbounded(shape=torch.Size((*batch, *value.shape[1:])), dtype=value.dtype)
-            for value in values
-        ]
+        # On the CPU: the number of finite readings is unknown on "meta".
+        return super().out_specs(spec.to("cpu"))

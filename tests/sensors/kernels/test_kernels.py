@@ -39,10 +39,8 @@ from sensing import (
     KEYS,
     SEED,
     assert_same_bits,
-    draw_balls,
-    draw_coverages,
-    draw_fields,
-    draw_rays,
+    check_fields,
+    check_rays,
     measure,
     sliced_inputs,
 )
@@ -69,12 +67,7 @@ def pair(kind, *args, **options):
 @needs_compiler
 @given(SEED, st.booleans())
 def test_fields_have_the_same_bits(skin, random_state, seed, per_object):
-    rng = np.random.default_rng(seed)
-    coverages = draw_fields(rng)
-    balls, state = draw_balls(random_state, rng)
-    some = draw_coverages(skin, coverages, rng)
-    plain, fast = pair(FieldSensor, some, H1_2.chain, balls, 1.0, per_object=per_object)
-    assert_same_bits(measure(fast, state), measure(plain, state))
+    plain, fast, state = check_fields(pair, skin, random_state, seed, per_object)
     joints = state["joint_pos"]
     assert_same_bits(fast.poses_b(joints), plain.poses_b(joints))
 
@@ -132,19 +125,7 @@ def test_hits_of_wrong_inputs_are_refused(skin, random_state):
 @needs_compiler
 @given(SEED, st.sampled_from(["none", "min"]), st.booleans())
 def test_rays_have_the_same_bits(skin, random_state, seed, reduce, per_object):
-    rng = np.random.default_rng(seed)
-    coverages = draw_rays(rng)
-    balls, state = draw_balls(random_state, rng)
-    plain, fast = pair(
-        RaySensor,
-        *(draw_coverages(skin, coverages, rng), H1_2.chain, balls, 1.0),
-        reduce=reduce,
-        per_object=per_object,
-    )
-    assert_same_bits(measure(fast, state), measure(plain, state))
-    if reduce == "none" and not per_object:
-        inputs = [state[key] for key in KEYS]
-        assert_same_bits(fast.hits(*inputs), plain.hits(*inputs))
+    check_rays(pair, skin, random_state, seed, reduce, per_object)
 
 
 @needs_compiler

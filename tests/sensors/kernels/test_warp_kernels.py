@@ -12,7 +12,6 @@ import re
 from importlib.util import find_spec
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from hypothesis import given
@@ -25,10 +24,8 @@ from sensing import (
     KEYS,
     SEED,
     assert_same_bits,
-    draw_balls,
-    draw_coverages,
-    draw_fields,
-    draw_rays,
+    check_fields,
+    check_rays,
     measure,
     sliced_inputs,
     use_warp_kernels,
@@ -59,29 +56,12 @@ def pair(kind, *args, **options):
 
 @given(SEED, st.booleans())
 def test_fields_have_the_same_bits(skin, random_state, seed, per_object):
-    rng = np.random.default_rng(seed)
-    coverages = draw_fields(rng)
-    balls, state = draw_balls(random_state, rng)
-    some = draw_coverages(skin, coverages, rng)
-    plain, fast = pair(FieldSensor, some, H1_2.chain, balls, 1.0, per_object=per_object)
-    assert_same_bits(measure(fast, state), measure(plain, state))
+    check_fields(pair, skin, random_state, seed, per_object)
 
 
 @given(SEED, st.sampled_from(["none", "min"]), st.booleans())
 def test_rays_have_the_same_bits(skin, random_state, seed, reduce, per_object):
-    rng = np.random.default_rng(seed)
-    coverages = draw_rays(rng)
-    balls, state = draw_balls(random_state, rng)
-    plain, fast = pair(
-        RaySensor,
-        *(draw_coverages(skin, coverages, rng), H1_2.chain, balls, 1.0),
-        reduce=reduce,
-        per_object=per_object,
-    )
-    assert_same_bits(measure(fast, state), measure(plain, state))
-    if reduce == "none" and not per_object:
-        inputs = [state[key] for key in KEYS]
-        assert_same_bits(fast.hits(*inputs), plain.hits(*inputs))
+    check_rays(pair, skin, random_state, seed, reduce, per_object)
 
 
 @pytest.mark.parametrize("kind", [FieldSensor, RaySensor])
