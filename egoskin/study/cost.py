@@ -13,12 +13,12 @@ from multiprocessing import active_children, get_context
 from pathlib import Path
 
 from egoskin.agents.ppo import NonFiniteError
+from egoskin.interrupts import end_with_parent, sheltered
 from egoskin.parallel import WorkerError
 from egoskin.progress import counted
 from egoskin.runs.config import TrainConfig
 from egoskin.runs.run import Run
 from egoskin.runs.trainer import open_trainer
-from egoskin.study.children import end_with_parent, sheltered
 from egoskin.study.manifest import Manifest, PlannedRun
 
 WORTH_MEASURING = 50_000_000
