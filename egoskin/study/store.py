@@ -17,7 +17,6 @@ from __future__ import annotations
 import csv
 import dataclasses
 import io
-import json
 import os
 import shutil
 import time
@@ -31,7 +30,7 @@ from egoskin.runs.config import INIT_HASH, read_config
 from egoskin.runs.run import Run
 from egoskin.storage.files import write_file
 from egoskin.storage.formats import content_hash, read_sealed, sealed_json
-from egoskin.storage.serialization import read_json
+from egoskin.storage.serialization import read_json, write_json
 from egoskin.storage.tensor_file import load_tensors
 from egoskin.study.claims import is_claimed, is_locked
 from egoskin.study.manifest import EvaluationPlan, Manifest, PlannedRun
@@ -353,7 +352,7 @@ class StudyFolder:
         failure = Failure(tries=(before.tries if before else 0) + 1, error=error)
         path = self._failure_path(name)
         path.parent.mkdir(exist_ok=True)
-        write_file(path, (json.dumps(dataclasses.asdict(failure)) + "\n").encode())
+        write_json(path, dataclasses.asdict(failure))
         return failure
 
     def forget_failures(self, runs: Iterable[PlannedRun]) -> None:
