@@ -52,7 +52,7 @@ def end_next_time() -> None:
 
 
 @contextmanager
-def sheltered() -> Iterator[None]:
+def block_terminal_signals() -> Iterator[None]:
     """Keep a terminal's signals from the processes that are started in this context.
 
     Ctrl-C and a closed terminal reach the whole process group, but the parent decides

@@ -13,7 +13,7 @@ from multiprocessing import active_children, get_context
 from pathlib import Path
 
 from egoskin.agents.ppo import NonFiniteError
-from egoskin.interrupts import end_with_parent, sheltered
+from egoskin.interrupts import block_terminal_signals, end_with_parent
 from egoskin.parallel import WorkerError
 from egoskin.progress import counted
 from egoskin.runs.config import TrainConfig
@@ -148,7 +148,7 @@ def measure(run: PlannedRun, cores_per_run: int = 1, parallel: int = 1) -> Speed
         ) as processes,
     ):
         try:
-            with sheltered():
+            with block_terminal_signals():
                 jobs = [
                     processes.submit(_train, config, Path(folder) / str(i))
                     for i in range(parallel)

@@ -360,7 +360,7 @@ class StudyFolder:
         for run in runs:
             self._failure_path(run.name).unlink(missing_ok=True)
 
-    def last_words(self, name: str) -> str:
+    def last_error(self, name: str) -> str:
         """Return the last error of a run's latest process, or else its last line.
 
         Of an error of several lines, as with a worker's traceback, the first and last.
@@ -368,12 +368,12 @@ class StudyFolder:
         with suppress(FileNotFoundError), open(self.log_path(name), "rb") as file:
             file.seek(max(0, file.seek(0, os.SEEK_END) - _TAIL))
             text = file.read().decode(errors="replace").rpartition(START)[2]
-            said = [line.strip() for line in text.split("\n")[1:] if line.strip()]
-            starts = [i for i, line in enumerate(said) if line.startswith("error: ")]
+            lines = [line.strip() for line in text.split("\n")[1:] if line.strip()]
+            starts = [i for i, line in enumerate(lines) if line.startswith("error: ")]
             if starts:
-                first, *rest = said[starts[-1] :]
+                first, *rest = lines[starts[-1] :]
                 return ": ".join([first.removeprefix("error: "), *rest[-1:]])
-            return said[-1] if said else ""
+            return lines[-1] if lines else ""
         return ""
 
     # --- progress -------------------------------------------------------------
