@@ -1,4 +1,4 @@
-"""Signals that end a script: Ctrl-C, a batch system, a closed terminal.
+"""What ends a process: signals (Ctrl-C, batch systems, closed terminals), its parent.
 
 A script calls `end_quietly` before its other imports, which take seconds: without it,
 Ctrl-C during an import prints a traceback from within another package.
@@ -8,9 +8,13 @@ from __future__ import annotations
 
 import functools
 import os
+import shutil
 import signal
 import sys
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from multiprocessing import parent_process
+from threading import Thread
 from types import FrameType
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -45,6 +49,38 @@ def end_next_time() -> None:
     """
     take(end_now, signal.SIGINT, signal.SIGTERM)
     take(signal.SIG_IGN, signal.SIGHUP)
+
+
+@contextmanager
+def block_terminal_signals() -> Iterator[None]:
+    """Keep a terminal's signals from the processes that are started in this context.
+
+    Ctrl-C and a closed terminal reach the whole process group, but the parent decides
+    when to end. A new process inherits the signal mask.
+    """
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+
+
+def end_with_parent(folder: str | None = None) -> None:
+    """Let this child process end as soon as its parent ends, even by SIGKILL.
+
+    Args:
+        folder: Temporary folder of the parent, to be removed then.
+    """
+    Thread(target=_await_parent, args=(folder,), daemon=True).start()
+
+
+def _await_parent(folder: str | None) -> None:
+    parent = parent_process()
+    assert parent is not None
+    parent.join()
+    if folder is not None:
+        shutil.rmtree(folder, ignore_errors=True)
+    os._exit(1)
 
 
 def unread_output() -> SystemExit:

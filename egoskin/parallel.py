@@ -26,7 +26,6 @@ from multiprocessing import (
     active_children,
     current_process,
     forkserver,
-    parent_process,
     resource_tracker,
     set_forkserver_preload,
     util,
@@ -43,7 +42,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase, ParallelEnv, Transform, TransformedEnv
 
-from egoskin.interrupts import ENDING
+from egoskin.interrupts import ENDING, end_with_parent
 from egoskin.memory import is_out_of_memory
 
 _CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")
@@ -216,7 +215,7 @@ class _Build:
             for name in own_settings():
                 del os.environ[name]
             os.environ.update(self._settings)
-            Thread(target=_end_with_parent, daemon=True).start()
+            end_with_parent()
             # A worker ends with its parent, not after 10,000 s without a command.
             torchrl._utils.BATCHED_PIPE_TIMEOUT = None
         with _reported(self._report):
@@ -233,14 +232,6 @@ class _Build:
 def own_settings() -> dict[str, str]:
     """Return the package's own environment variables."""
     return {k: v for k, v in os.environ.items() if k.startswith("EGOSKIN_")}
-
-
-def _end_with_parent() -> None:
-    """End this process as soon as the parent ends, even by SIGKILL."""
-    parent = parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
 
 
 def start_server() -> None:

@@ -34,7 +34,7 @@ from egoskin.evaluation.throw_set import (
 )
 from egoskin.make import EnvConfig, check_num_workers, device_of
 from egoskin.parallel import default_num_workers
-from egoskin.policies.policy import load_policy
+from egoskin.policies.policy import PolicySpec, load_policy
 from egoskin.progress import StatusLine, counted
 from egoskin.rng import check_seed
 from egoskin.sensors import MASK_ALL
@@ -238,6 +238,24 @@ def physics_rate(config: EnvConfig) -> str:
     return f"{1 / config.task.physics.timestep:g} Hz"
 
 
+def title_of(config: EvaluateConfig, spec: PolicySpec, episodes: int) -> str:
+    """Return which policy is evaluated on which throws, as text."""
+    of_training = config.standard == "run"
+    throws = (
+        "the throws of its training" if of_training else f"standard {config.standard}"
+    )
+    text = (
+        f"{config.policy}: trained for {spec.frames:,} frames "
+        f"on standard {spec.env.standard}; evaluated on {throws}, "
+        f"throw set {config.throw_set} of {counted(episodes, 'episode')}"
+    )
+    if config.masked:
+        text += f", sensors masked: {', '.join(config.masked)}"
+    if config.engine != "mujoco":
+        text += f", engine {config.engine}"
+    return text
+
+
 def main(args: list[str]) -> None:
     """Run the command."""
     config = tyro.cli(EvaluateConfig, args=args)
@@ -278,37 +296,21 @@ def main(args: list[str]) -> None:
     if config.check_substeps is not None:
         checked = evaluate(policy, finer, policy.skin, **whole, **engine)
     line.finish()
-    trained = policy.env_config.standard
-    of_training = config.standard == "run"
-    played = trained if of_training else config.standard
-    throws = "the throws of its training" if of_training else f"standard {played}"
-
-    def title_of(number: int) -> str:
-        title = (
-            f"{config.policy}: trained for {policy.policy_spec.frames:,} frames "
-            f"on standard {trained}; evaluated on {throws}, "
-            f"throw set {config.throw_set} of {counted(number, 'episode')}"
-        )
-        if config.masked:
-            title += f", sensors masked: {', '.join(config.masked)}"
-        if config.engine != "mujoco":
-            title += f", engine {config.engine}"
-        return title
-
-    title = title_of(config.episodes) + ", physics at "
+    spec, of_training = policy.policy_spec, config.standard == "run"
+    title = title_of(config, spec, config.episodes) + ", physics at "
     task = env_config.task
     print(table(result, title + physics_rate(env_config), task))
     content = {
         **dataclasses.asdict(result),
         "policy": str(config.policy),
-        "standard": played,
+        "standard": spec.env.standard if of_training else config.standard,
         "throws_of_training": of_training,
-        "trained_on": trained,
+        "trained_on": spec.env.standard,
         "throw_set": config.throw_set,
-        "frames": policy.policy_spec.frames,
+        "frames": spec.frames,
         "mask": config.masked,
         "engine": config.engine,
-        "trained_by_engine": policy.policy_spec.engine,
+        "trained_by_engine": spec.engine,
     }
     if behaviour is not None:
         print(behaviour_table(behaviour))
@@ -329,11 +331,11 @@ def main(args: list[str]) -> None:
         lines = operating_map(
             *subject,
             **quarter,
-            trained=policy.env_config.task.throws,
+            trained=spec.env.task.throws,
             on_point=counting("map"),
         )
         line.finish()
-        figure = draw_map(lines, title_of(episodes), task.success_age_s)
+        figure = draw_map(lines, title_of(config, spec, episodes), task.success_age_s)
         write_figure(config.map, figure, dpi=110)
         content["map_episodes"] = episodes
         content["map"] = [dataclasses.asdict(line) for line in lines]

@@ -27,7 +27,7 @@ from egoskin.viewer.film import (
     save_picture,
 )
 from egoskin.viewer.offscreen import CameraConfig, painter_of
-from egoskin.viewer.recording import check_film, record_episodes, render_recording
+from egoskin.viewer.recording import check_film, record_longest, render_recording
 
 # Browsers show a picture of a GIF for 100 ms if its delay, whole centiseconds, is
 # below 20 ms.
@@ -120,7 +120,7 @@ def main(args: list[str]) -> None:
     painter = painter_of(env_config, skin, size=config.size, camera=config.camera)
     line = StatusLine(f"playing {counted(config.longest_of, 'episode')}")
     with painter:
-        (recording,) = record_episodes(
+        recording = record_longest(
             env_config,
             skin,
             policy,
@@ -128,7 +128,6 @@ def main(args: list[str]) -> None:
             first=config.episode,
             episodes=config.longest_of,
             hold=config.hold,
-            longest=True,
             on_step=lambda step, running: line.show(
                 f"{step / hz:.2f} s played, {running} still running"
             ),

@@ -13,7 +13,6 @@ egoskin.study.manifest.Study.
 
 from __future__ import annotations
 
-import json
 import math
 import sys
 from collections.abc import Sequence
@@ -28,8 +27,7 @@ from egoskin.commands.errors import check_packages, parse_subcommand
 from egoskin.evaluation.visibility import alike, analyse, warning_texts
 from egoskin.parallel import WorkerError, available_cores
 from egoskin.progress import counted, duration
-from egoskin.storage.files import write_file
-from egoskin.storage.serialization import to_plain
+from egoskin.storage.serialization import to_plain, write_json
 from egoskin.study.claims import is_claimed, owner
 from egoskin.study.cost import WORTH_MEASURING, Speed, cost, measure_all
 from egoskin.study.fields import settings
@@ -185,8 +183,7 @@ class Plan:
         if self.visibility:
             seen = what_is_seen(manifest)
             if seen and self.dir is not None:
-                text = json.dumps(seen, indent=2, allow_nan=False) + "\n"
-                write_file(self.dir / "visibility.json", text.encode())
+                write_json(self.dir / "visibility.json", seen, allow_nan=False)
         if self.dir is not None:
             print(f"manifest {StudyFolder(self.dir).manifest_path}")
 

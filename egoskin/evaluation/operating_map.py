@@ -7,6 +7,7 @@ varied together. Everything else is as in the task.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -25,13 +26,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Speed [m/s], time between throws [s], height aimed at [m] and direction [deg].
-_SPEEDS = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 10.0, 12.0)
-_INTERVALS = (0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 3.0)
-_HEIGHTS = (0.3, 0.5, 0.7, 0.9, 1.1, 1.3, 1.5)
-_DIRECTIONS = (-180.0, -135.0, -90.0, -45.0, 0.0, 45.0, 90.0, 135.0)
-_GRID_SPEEDS = (3.0, 4.0, 6.0, 8.0, 10.0)
-_GRID_INTERVALS = (0.5, 1.0, 1.5, 2.0, 3.0)
 # Half width of the box aimed at when the height is fixed [m].
 _HALF_WIDTH = 0.15
 # Half width of the sector around each direction [deg].
@@ -62,62 +56,37 @@ class Line:
     """Points; the second property varies fastest."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class _Property:
     """A property of the throws."""
 
     name: str
-    values: Sequence[float]
-    vary: Callable[[ThrowConfig, float], ThrowConfig]
-    trained: Callable[[ThrowConfig], tuple[float, float] | None]
+    """Its name, with unit."""
+    fields: Callable[[float], dict[str, Any]]
+    """Function that returns the fields of `ThrowConfig` for a value."""
+    trained: str | None = None
+    """Field that holds the training range; None if there is none to show."""
 
 
-def _speed(values: Sequence[float]) -> _Property:
-    return _Property(
-        name="speed of the ball [m/s]",
-        values=values,
-        vary=lambda throws, x: dataclasses.replace(throws, speed=(x, x)),
-        trained=lambda throws: throws.speed,
-    )
-
-
-def _interval(values: Sequence[float]) -> _Property:
-    return _Property(
-        name="time between throws [s]",
-        values=values,
-        vary=lambda throws, x: dataclasses.replace(throws, interval=(x, x)),
-        trained=lambda throws: throws.interval,
-    )
-
-
-def _at_height(throws: ThrowConfig, height: float) -> ThrowConfig:
-    box = {"box_half_width": _HALF_WIDTH, "box_height": (height, height)}
-    return dataclasses.replace(throws, aim="box", **box)
-
-
-def _from_direction(throws: ThrowConfig, azimuth: float) -> ThrowConfig:
-    sector = (azimuth - _SECTOR, azimuth + _SECTOR)
-    return dataclasses.replace(throws, azimuth_deg=sector)
-
-
+_SPEED = _Property("speed of the ball [m/s]", lambda x: {"speed": (x, x)}, "speed")
+_INTERVAL = _Property(
+    "time between throws [s]", lambda x: {"interval": (x, x)}, "interval"
+)
 _HEIGHT = _Property(
-    name="height aimed at [m]",
-    values=_HEIGHTS,
-    vary=_at_height,
-    trained=lambda throws: None,
+    "height aimed at [m]",
+    lambda x: {"aim": "box", "box_half_width": _HALF_WIDTH, "box_height": (x, x)},
 )
 _DIRECTION = _Property(
-    name="direction it comes from, left positive [deg]",
-    values=_DIRECTIONS,
-    vary=_from_direction,
-    trained=lambda throws: None,
+    "direction it comes from, left positive [deg]",
+    lambda x: {"azimuth_deg": (x - _SECTOR, x + _SECTOR)},
 )
-_MAPS = (
-    (_speed(_SPEEDS),),
-    (_interval(_INTERVALS),),
-    (_HEIGHT,),
-    (_DIRECTION,),
-    (_speed(_GRID_SPEEDS), _interval(_GRID_INTERVALS)),
+# Values of the properties that are varied, alone or together.
+_MAPS: tuple[dict[_Property, tuple[float, ...]], ...] = (
+    {_SPEED: (2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 10.0, 12.0)},
+    {_INTERVAL: (0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 3.0)},
+    {_HEIGHT: (0.3, 0.5, 0.7, 0.9, 1.1, 1.3, 1.5)},
+    {_DIRECTION: (-180.0, -135.0, -90.0, -45.0, 0.0, 45.0, 90.0, 135.0)},
+    {_SPEED: (3.0, 4.0, 6.0, 8.0, 10.0), _INTERVAL: (0.5, 1.0, 1.5, 2.0, 3.0)},
 )
 
 
@@ -172,15 +141,17 @@ def operating_map(
     """
     check_map(config)
     trained = trained or config.task.throws
-    grids = [_grid(properties) for properties in _MAPS]
+    # The last property varies fastest.
+    grids = [list(itertools.product(*varied.values())) for varied in _MAPS]
     total, done = sum(map(len, grids)), 0
     lines = []
-    for properties, grid in zip(_MAPS, grids, strict=True):
+    for varied, grid in zip(_MAPS, grids, strict=True):
         points = []
         for values in grid:
-            throws = config.task.throws
-            for what, value in zip(properties, values, strict=True):
-                throws = what.vary(throws, value)
+            fields: dict[str, Any] = {}
+            for what, value in zip(varied, values, strict=True):
+                fields |= what.fields(value)
+            throws = dataclasses.replace(config.task.throws, **fields)
             throws = _with_enough_balls(throws)
             task = dataclasses.replace(config.task, throws=throws)
             played = play_throws(
@@ -205,20 +176,15 @@ def operating_map(
                 on_point(done, total)
         lines.append(
             Line(
-                names=tuple(what.name for what in properties),
-                trained=tuple(what.trained(trained) for what in properties),
+                names=tuple(what.name for what in varied),
+                trained=tuple(
+                    None if what.trained is None else getattr(trained, what.trained)
+                    for what in varied
+                ),
                 points=points,
             )
         )
     return lines
-
-
-def _grid(properties: Sequence[_Property]) -> list[tuple[float, ...]]:
-    """Return all combinations of the values; the last property varies fastest."""
-    grid: list[tuple[float, ...]] = [()]
-    for what in properties:
-        grid = [(*values, value) for values in grid for value in what.values]
-    return grid
 
 
 def draw_map(lines: Sequence[Line], title: str, success_age_s: float) -> Figure:

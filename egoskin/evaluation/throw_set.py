@@ -14,6 +14,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -356,21 +357,15 @@ def evaluate(
         engine: Physics engine.
         device: Device of engine warp.
     """
-
-    def play(who: Any, hold: bool) -> Episodes:
-        return play_throws(
-            who,
-            config,
-            skin,
-            throw_set=throw_set,
-            episodes=episodes,
-            num_workers=num_workers,
-            hold=hold,
-            mask=() if hold else mask,
-            on_step=None if hold else on_step,
-            watch=None if hold else watch,
-            engine=engine,
-            device=device,
-        )
-
-    return summarize(play(policy, False), play(None, True), config.task)
+    play = partial(
+        play_throws,
+        config=config,
+        skin=skin,
+        throw_set=throw_set,
+        episodes=episodes,
+        num_workers=num_workers,
+        engine=engine,
+        device=device,
+    )
+    played = play(policy, mask=mask, on_step=on_step, watch=watch)
+    return summarize(played, play(None, hold=True), config.task)

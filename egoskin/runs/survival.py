@@ -9,6 +9,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+# Factor on past counts at each rollout: ten rollouts are remembered.
+_MEMORY = 0.9
+
 
 class SurvivalCurve:
     """Running Kaplan-Meier estimate over the latest rollouts.
@@ -18,18 +21,16 @@ class SurvivalCurve:
 
     Args:
         max_steps: Age at which episodes are truncated [control steps].
-        memory: Factor on past counts at each `decay`; 0.9 remembers ten rollouts.
     """
 
-    def __init__(self, max_steps: int, memory: float = 0.9) -> None:
-        self._memory = memory
+    def __init__(self, max_steps: int) -> None:
         self.at_risk = torch.zeros(max_steps + 1, dtype=torch.float64)
         self.ended = torch.zeros(max_steps + 1, dtype=torch.float64)
 
     def decay(self) -> None:
         """Discount past counts; called once per rollout."""
-        self.at_risk *= self._memory
-        self.ended *= self._memory
+        self.at_risk *= _MEMORY
+        self.ended *= _MEMORY
 
     def update(self, age: Tensor, terminated: Tensor) -> None:
         """Count one step of some agents.

@@ -13,12 +13,12 @@ from multiprocessing import active_children, get_context
 from pathlib import Path
 
 from egoskin.agents.ppo import NonFiniteError
+from egoskin.interrupts import block_terminal_signals, end_with_parent
 from egoskin.parallel import WorkerError
 from egoskin.progress import counted
 from egoskin.runs.config import TrainConfig
 from egoskin.runs.run import Run
 from egoskin.runs.trainer import open_trainer
-from egoskin.study.children import end_with_parent, sheltered
 from egoskin.study.manifest import Manifest, PlannedRun
 
 WORTH_MEASURING = 50_000_000
@@ -148,7 +148,7 @@ def measure(run: PlannedRun, cores_per_run: int = 1, parallel: int = 1) -> Speed
         ) as processes,
     ):
         try:
-            with sheltered():
+            with block_terminal_signals():
                 jobs = [
                     processes.submit(_train, config, Path(folder) / str(i))
                     for i in range(parallel)

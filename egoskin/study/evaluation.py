@@ -9,11 +9,9 @@ from typing import Any
 
 from egoskin.evaluation.throw_set import play_throws, standard_task, summarize
 from egoskin.parallel import default_num_workers
-from egoskin.policies.policy import Policy, load_policy
-from egoskin.runs.run import Run
+from egoskin.policies.policy import Policy
 from egoskin.sensors import MASK_ALL
-from egoskin.study.manifest import EvaluationPlan, PlannedRun
-from egoskin.study.store import StudyFolder
+from egoskin.study.manifest import EvaluationPlan
 
 
 def evaluate_policy(
@@ -53,16 +51,3 @@ def evaluate_policy(
         "throw_set": plan.throw_set,
         "frames": policy.policy_spec.frames,
     }
-
-
-def evaluate_run(
-    folder: StudyFolder,
-    planned: PlannedRun,
-    plan: EvaluationPlan,
-    on_step: Callable[[int, int], None] | None = None,
-    cores: int = 1,
-) -> None:
-    """Evaluate the policy of a trained run, and mark the run as finished."""
-    run = Run(folder.run_path(planned.name), planned.config)
-    policy = load_policy(run.policy_path(planned.end))
-    folder.finish(planned, evaluate_policy(policy, plan, on_step, cores))

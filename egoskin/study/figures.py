@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from egoskin.storage.files import write_figure
 from egoskin.study.findings import MARGIN, SAME, Judged
-from egoskin.study.manifest import Cell, Manifest
+from egoskin.study.manifest import Manifest
 from egoskin.study.metrics import frames_to, has_learnt
 from egoskin.study.statistics import Effect, Table, contrast, spread
 from egoskin.study.store import Result
@@ -28,7 +28,9 @@ _STYLES = {
     "closeness": ("#CC79A7", "D"),
 }
 _OTHERS = ("#E69F00", "#56B4E9", "#CC79A7", "#0072B2", "#D55E00", "#009E73")
-_BLIND, _ORACLE = "#555555", "#000000"
+_BLIND = "#555555"
+# Label and colour of robots without a skin, by coverage.
+_UNSKINNED = {"none": ("blind", _BLIND), "oracle": ("oracle", "#000000")}
 # Largest change of a line by leaving out points [pixels].
 _SIMPLIFY = 0.3
 # Factor between the ranges at which two signals of the same range are drawn.
@@ -83,13 +85,18 @@ def _geometry(name: str, grid: Mapping[str, Place]) -> dict[tuple[str, float], s
     }
 
 
-def _unskinned(manifest: Manifest, coverage: str) -> Cell | None:
-    """Return the blind or oracle cell that differs only in the paper's fields."""
-    for cell in manifest.cells:
-        own = cell.config.env.sensor.coverage
-        if own == coverage and set(manifest.overrides(cell)) <= _GRID:
-            return cell
-    return None
+def _unskinned(manifest: Manifest) -> dict[str, tuple[str, str]]:
+    """Return label and colour of the cells without a skin, by name.
+
+    Only of those that differ only in the paper's fields.
+    """
+    return {
+        cell.name: style
+        for coverage, style in _UNSKINNED.items()
+        for cell in manifest.cells
+        if cell.config.env.sensor.coverage == coverage
+        and set(manifest.overrides(cell)) <= _GRID
+    }
 
 
 def save(figure: Figure, folder: Path, name: str) -> None:
@@ -152,11 +159,9 @@ def success_by_range(
             }
             if by_range:
                 _draw_signal(axes, by_range, style, _SHIFT ** (number - 1), signal)
-        for coverage, colour in (("none", _BLIND), ("oracle", _ORACLE)):
-            cell = _unskinned(manifest, coverage)
-            if cell is not None and table.get(cell.name):
-                own = spread(list(table[cell.name].values()))
-                label = "blind" if coverage == "none" else coverage
+        for cell, (label, colour) in _unskinned(manifest).items():
+            if table.get(cell):
+                own = spread(list(table[cell].values()))
                 axes.axhline(own.iqm, color=colour, linestyle="--", label=label)
                 axes.axhspan(own.low, own.high, color=colour, alpha=0.15, linewidth=0)
         ticks = sorted({p.range for p in grid.values()}.union(*below))
@@ -257,8 +262,7 @@ def learning_curves(manifest: Manifest, results: Sequence[Result]) -> Figure | N
     if not by_cell:
         return None
     grid = {k: v for k, v in places(manifest).items() if k in by_cell}
-    blind, oracle = (_unskinned(manifest, c) for c in ("none", "oracle"))
-    bare = {c.name for c in (blind, oracle) if c is not None}
+    bare = {cell: colour for cell, (_, colour) in _unskinned(manifest).items()}
     others = [name for name in by_cell if name not in grid and name not in bare]
     rows = [n for n in _GEOMETRIES.values() if n in {p.geometry for p in grid.values()}]
     ranges = sorted({p.range for p in grid.values()})
@@ -296,11 +300,7 @@ def learning_curves(manifest: Manifest, results: Sequence[Result]) -> Figure | N
             axes.set_visible(False)
             continue
         title, cells = panel
-        shown = {**cells}
-        for cell, colour in ((blind, _BLIND), (oracle, _ORACLE)):
-            if cell is not None:
-                shown[cell.name] = colour
-        for name, colour in shown.items():
+        for name, colour in {**cells, **bare}.items():
             if name in by_cell:
                 label = grid[name].signal if name in grid else name
                 _draw_curves(axes, by_cell[name], colour, label)

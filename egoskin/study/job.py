@@ -20,11 +20,12 @@ from types import FrameType
 from egoskin.agents.ppo import NonFiniteError
 from egoskin.interrupts import ENDING, take
 from egoskin.parallel import WorkerError
+from egoskin.policies.policy import load_policy
 from egoskin.progress import ProgressLine
 from egoskin.runs.run import RunLockedError
 from egoskin.runs.trainer import open_trainer, train
 from egoskin.study.claims import claimed
-from egoskin.study.evaluation import evaluate_run
+from egoskin.study.evaluation import evaluate_policy
 from egoskin.study.store import StudyFolder, now
 
 FAILED = 1
@@ -109,9 +110,11 @@ def work(folder: StudyFolder, name: str, stop: Stop, cores: int = 1) -> int:
                 return STOPPED
         print(f"{now()} evaluate on {manifest.evaluation.episodes} throws", flush=True)
         try:
-            evaluate_run(folder, planned, manifest.evaluation, stop.check, cores)
+            policy = load_policy(run.policy_path(planned.end))
+            result = evaluate_policy(policy, manifest.evaluation, stop.check, cores)
         except _StoppedError:
             return STOPPED
+        folder.finish(planned, result)
         print(f"{now()} finished", flush=True)
         return 0
 

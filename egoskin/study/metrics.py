@@ -20,7 +20,7 @@ from egoskin.study.store import Result
 _END_SHARE, _LEAST_END = 0.05, 0.05
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Metric:
     """A metric of a run."""
 
@@ -77,62 +77,44 @@ def _percent(*path: str) -> Callable[[Result], float | None]:
 
 
 METRICS = (
+    Metric("success_3s", "success at 3 s", "%", _percent("success", "mean")),
+    Metric("success_5s", "success at 5 s", "%", _percent("success_5s", "mean")),
     Metric(
-        name="success_3s",
-        label="success at 3 s",
-        unit="%",
-        of=_percent("success", "mean"),
+        "survival_s",
+        "mean survival, restricted to 10 s",
+        "s",
+        lambda result: result.stored.evaluation["survival_time"]["mean"],
     ),
     Metric(
-        name="success_5s",
-        label="success at 5 s",
-        unit="%",
-        of=_percent("success_5s", "mean"),
+        "first_avoided", "first balls avoided", "%", _percent("avoided", "first_ball")
     ),
     Metric(
-        name="survival_s",
-        label="mean survival, restricted to 10 s",
-        unit="s",
-        of=lambda result: result.stored.evaluation["survival_time"]["mean"],
+        "later_avoided", "later balls avoided", "%", _percent("avoided", "later_balls")
+    ),
+    Metric("falls", "falls within 3 s", "%", _percent("ended_by_fall")),
+    Metric(
+        "masked_success_3s",
+        "success at 3 s, sensors masked",
+        "%",
+        _percent("masked", "success", "mean"),
     ),
     Metric(
-        name="first_avoided",
-        label="first balls avoided",
-        unit="%",
-        of=_percent("avoided", "first_ball"),
+        "m_frames_to_50",
+        "frames to 50 % of its final success",
+        "M frames",
+        lambda result: frames_to(result, 0.5) / 1e6,
     ),
     Metric(
-        name="later_avoided",
-        label="later balls avoided",
-        unit="%",
-        of=_percent("avoided", "later_balls"),
+        "m_frames_to_90",
+        "frames to 90 % of its final success",
+        "M frames",
+        lambda result: frames_to(result, 0.9) / 1e6,
     ),
     Metric(
-        name="falls", label="falls within 3 s", unit="%", of=_percent("ended_by_fall")
-    ),
-    Metric(
-        name="masked_success_3s",
-        label="success at 3 s, sensors masked",
-        unit="%",
-        of=_percent("masked", "success", "mean"),
-    ),
-    Metric(
-        name="m_frames_to_50",
-        label="frames to 50 % of its final success",
-        unit="M frames",
-        of=lambda result: frames_to(result, 0.5) / 1e6,
-    ),
-    Metric(
-        name="m_frames_to_90",
-        label="frames to 90 % of its final success",
-        unit="M frames",
-        of=lambda result: frames_to(result, 0.9) / 1e6,
-    ),
-    Metric(
-        name="share_to_90",
-        label="share of the budget to 90 % of its final success",
-        unit="%",
-        of=lambda result: 100 * frames_to(result, 0.9) / result.run.end,
+        "share_to_90",
+        "share of the budget to 90 % of its final success",
+        "%",
+        lambda result: 100 * frames_to(result, 0.9) / result.run.end,
     ),
 )
 """Metrics of a run. Success, survival, balls and falls are from the throw set; frames

@@ -23,7 +23,7 @@ from egoskin.parallel import own_settings
 from egoskin.study.job import FAILED
 from egoskin.study.manifest import PlannedRun
 from egoskin.study.runner import (
-    PATIENCE_S,
+    STOP_TIMEOUT_S,
     Runner,
     end_job,
     how_it_ended,
@@ -124,7 +124,7 @@ class RayRunner(Runner):
     def _stop(self) -> None:
         left = list(self._tasks.values())
         self._tasks.clear()
-        deadline = time.monotonic() + PATIENCE_S + _ANSWER_S
+        deadline = time.monotonic() + STOP_TIMEOUT_S + _ANSWER_S
         while left and time.monotonic() < deadline:
             for task in left:
                 # A task that waits for cores never starts. A worker that is still
@@ -170,7 +170,7 @@ def _work(path: str, name: str, nice: int, cores: int) -> tuple[int, str]:
             # The runner stops, or this worker has received SIGTERM.
             if job.poll() is None:
                 job.terminate()
-                end_job(job, PATIENCE_S)
+                end_job(job, STOP_TIMEOUT_S)
         return job.returncode, how_it_ended(folder, name, job.returncode)
 
 

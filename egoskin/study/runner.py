@@ -31,7 +31,7 @@ from egoskin.study.store import START, RunStatus, StudyFolder, now
 _POLL, _LOOK = 0.2, 5.0
 # Intervals between progress lines: on a terminal, in a file [s].
 _SHOW_LIVE, _SHOW_FILE = 2.0, 60.0
-PATIENCE_S = 120.0
+STOP_TIMEOUT_S = 120.0
 """How long a run may take to stop with a checkpoint [s]."""
 
 
@@ -234,7 +234,7 @@ class LocalRunner(Runner):
     def _stop(self) -> None:
         for job in self._jobs.values():
             job.terminate()
-        deadline = time.monotonic() + PATIENCE_S
+        deadline = time.monotonic() + STOP_TIMEOUT_S
         for job in self._jobs.values():
             end_job(job, deadline - time.monotonic())
         self._jobs.clear()
@@ -258,10 +258,10 @@ def start_job(
         )
 
 
-def end_job(job: subprocess.Popen[bytes], patience: float) -> None:
-    """Wait until a stopping job has ended; kill it after ``patience`` [s]."""
+def end_job(job: subprocess.Popen[bytes], timeout: float) -> None:
+    """Wait until a stopping job has ended; kill it after ``timeout`` [s]."""
     try:
-        job.wait(max(0.0, patience))
+        job.wait(max(0.0, timeout))
     except subprocess.TimeoutExpired:
         os.killpg(job.pid, signal.SIGKILL)
         job.wait()
@@ -271,7 +271,7 @@ def how_it_ended(folder: StudyFolder, name: str, status: int) -> str:
     """Return the last error of a run whose job ended with an exit status."""
     if status < 0:
         return f"killed by {signal.Signals(-status).name}"
-    return folder.last_words(name)
+    return folder.last_error(name)
 
 
 def slurm_script(

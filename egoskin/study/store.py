@@ -17,7 +17,6 @@ from __future__ import annotations
 import csv
 import dataclasses
 import io
-import json
 import os
 import shutil
 import time
@@ -31,7 +30,7 @@ from egoskin.runs.config import INIT_HASH, read_config
 from egoskin.runs.run import Run
 from egoskin.storage.files import write_file
 from egoskin.storage.formats import content_hash, read_sealed, sealed_json
-from egoskin.storage.serialization import read_json
+from egoskin.storage.serialization import read_json, write_json
 from egoskin.storage.tensor_file import load_tensors
 from egoskin.study.claims import is_claimed, is_locked
 from egoskin.study.manifest import EvaluationPlan, Manifest, PlannedRun
@@ -353,7 +352,7 @@ class StudyFolder:
         failure = Failure(tries=(before.tries if before else 0) + 1, error=error)
         path = self._failure_path(name)
         path.parent.mkdir(exist_ok=True)
-        write_file(path, (json.dumps(dataclasses.asdict(failure)) + "\n").encode())
+        write_json(path, dataclasses.asdict(failure))
         return failure
 
     def forget_failures(self, runs: Iterable[PlannedRun]) -> None:
@@ -361,7 +360,7 @@ class StudyFolder:
         for run in runs:
             self._failure_path(run.name).unlink(missing_ok=True)
 
-    def last_words(self, name: str) -> str:
+    def last_error(self, name: str) -> str:
         """Return the last error of a run's latest process, or else its last line.
 
         Of an error of several lines, as with a worker's traceback, the first and last.
@@ -369,12 +368,12 @@ class StudyFolder:
         with suppress(FileNotFoundError), open(self.log_path(name), "rb") as file:
             file.seek(max(0, file.seek(0, os.SEEK_END) - _TAIL))
             text = file.read().decode(errors="replace").rpartition(START)[2]
-            said = [line.strip() for line in text.split("\n")[1:] if line.strip()]
-            starts = [i for i, line in enumerate(said) if line.startswith("error: ")]
+            lines = [line.strip() for line in text.split("\n")[1:] if line.strip()]
+            starts = [i for i, line in enumerate(lines) if line.startswith("error: ")]
             if starts:
-                first, *rest = said[starts[-1] :]
+                first, *rest = lines[starts[-1] :]
                 return ": ".join([first.removeprefix("error: "), *rest[-1:]])
-            return said[-1] if said else ""
+            return lines[-1] if lines else ""
         return ""
 
     # --- progress -------------------------------------------------------------

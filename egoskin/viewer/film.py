@@ -19,6 +19,8 @@ from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from egoskin.storage.files import check_output, write_file
 
+# Pictures of a contact sheet, and of them in a line; width and height of each [px].
+_SHEET, _SHEET_CELL = (12, 4), (560, 420)
 # Time for which the last picture is held [s].
 _LAST_PICTURE = 1.0
 # One palette of 256 colours for the whole film: without it a GIF flickers.
@@ -125,26 +127,18 @@ def pick_moments(frames: Sequence[Frame], count: int) -> list[int]:
     return sorted(picked)
 
 
-def contact_sheet(
-    frames: Sequence[Frame],
-    *,
-    count: int = 12,
-    columns: int = 4,
-    size: tuple[int, int] = (560, 420),
-) -> np.ndarray:
-    """Return a grid of the most informative frames of an episode.
+def contact_sheet(frames: Sequence[Frame]) -> np.ndarray:
+    """Return a grid of the 12 most informative frames of an episode, in lines of 4.
 
     Args:
         frames: Frames in order of time.
-        count: Number of pictures.
-        columns: Pictures per line.
-        size: Width and height of each picture [px].
 
     Returns:
         Picture, ``[rows * height, columns * width, 3]`` uint8; empty cells are
         white.
     """
-    cells = [annotate(frames[i], size) for i in pick_moments(frames, count)]
+    count, columns = _SHEET
+    cells = [annotate(frames[i], _SHEET_CELL) for i in pick_moments(frames, count)]
     while len(cells) % columns:
         cells.append(np.full_like(cells[0], 255))
     lines = [cells[i : i + columns] for i in range(0, len(cells), columns)]

@@ -1,4 +1,4 @@
-"""Recordings of episodes of a throw set, and the pictures of a film of one."""
+"""Recording of an episode of a throw set, and the pictures of a film of it."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Recording:
     """Why the episode ended ("hit", "fall", "time limit", ...)."""
 
 
-def record_episodes(
+def record_longest(
     config: EnvConfig,
     skin: Skin,
     policy: nn.Module | TensorDictModuleBase | None,
@@ -44,10 +44,9 @@ def record_episodes(
     first: int = 0,
     episodes: int = 1,
     hold: bool = False,
-    longest: bool = False,
     on_step: Callable[[int, int], None] | None = None,
-) -> list[Recording]:
-    """Return recordings of some episodes of a throw set.
+) -> Recording:
+    """Return a recording of the longest of some episodes of a throw set.
 
     Starts and throws are those of the throw set's rows. The motion is the same up to
     rounding: the last bits of a network's output depend on the batch size.
@@ -59,39 +58,32 @@ def record_episodes(
             the default pose.
         throw_set: Seed of the throw set.
         first: Row of the first episode.
-        episodes: Number of episodes.
+        episodes: Number of episodes; of several longest ones the first is recorded.
         hold: Whether the robot is held rigid in its default pose.
-        longest: Whether to return only the longest episode (the first of several), with
-            only the keys that `render_recording` reads; this needs far less memory.
         on_step: Called with (steps done, episodes still running).
     """
-    keys: list[str] | None = None
-    if longest:
-        distances = (f"distance{g.suffix}" for g in config.pipeline(skin).groups)
-        keys = [*_READ, *distances]
-    # Episodes that are recorded, and their states after each step: in one tensordict,
-    # as those of single states need more memory than their content.
+    distances = (f"distance{g.suffix}" for g in config.pipeline(skin).groups)
+    keys = [*_READ, *distances]
+    # Episodes that may be the longest, and their states after each step: in one
+    # tensordict, as those of single states need more memory than their content.
     kept, history = torch.arange(episodes), list[TensorDictBase]()
     last_step = torch.zeros(episodes, dtype=torch.int64)
-
-    def add(state: TensorDictBase) -> None:
-        history.append((state if keys is None else state.select(*keys))[kept])
 
     def watch(
         before: TensorDictBase, after: TensorDictBase, running: torch.Tensor
     ) -> None:
         nonlocal kept
         if not history:
-            add(before)
+            history.append(before.select(*keys)[kept])
         last_step[running] += 1
         left = running[kept]
         # Episodes that still run are longer than those that have ended. Not dropped one
         # by one, which would copy all states each time.
-        if longest and 2 * int(left.sum()) <= len(kept):
+        if 2 * int(left.sum()) <= len(kept):
             kept = kept[left]
             for step, states in enumerate(history):
                 history[step] = states[left]
-        add(after)
+        history.append(after.select(*keys)[kept])
 
     play_throws(
         policy,
@@ -104,16 +96,10 @@ def record_episodes(
         on_step=on_step,
         watch=watch,
     )
-    wanted = range(episodes)
-    if longest:
-        wanted = [int(last_step.argmax())]
-    recordings = []
-    for i in wanted:
-        (place,) = (kept == i).nonzero()[:, 0].tolist()
-        states = [state[place] for state in history[: int(last_step[i]) + 1]]
-        ending = ending_of(states[-1])
-        recordings.append(Recording(row=first + i, states=states, ending=ending))
-    return recordings
+    longest = int(last_step.argmax())
+    (place,) = (kept == longest).nonzero()[:, 0].tolist()
+    states = [state[place] for state in history[: int(last_step[longest]) + 1]]
+    return Recording(row=first + longest, states=states, ending=ending_of(states[-1]))
 
 
 def render_recording(

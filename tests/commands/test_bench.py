@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
 
 from calling import succeed
+from egoskin.commands.bench.gradients import GradientBench, gradient_rows
 from egoskin.commands.bench.loop import LoopConfig
 from egoskin.make import EnvConfig
+from egoskin.runs.config import TrainConfig
+from egoskin.runs.run import Run
 from egoskin.sensors.config import SensorConfig
 
 
@@ -73,6 +77,13 @@ def test_bench_gradients_compares_rollouts_and_leaves_the_run_alone(
     assert rows[0]["ratio"] == 1.0
     assert all(-1 < row["value"] < 1 for row in rows)
     assert {p: p.read_bytes() for p in trained.rglob("*") if p.is_file()} == before
+
+
+def test_bench_gradients_names_the_damaged_checkpoint_not_its_copy(tmp_path: Path):
+    run = Run.create(TrainConfig(num_envs=2, run_dir=tmp_path / "run"))
+    run.checkpoint_path.write_bytes(b"damaged")
+    with pytest.raises(ValueError, match=re.escape(f"{run.checkpoint_path} is trunc")):
+        gradient_rows(GradientBench(run=run.path))
 
 
 def test_bench_accuracy_compares_two_rates(tmp_path: Path):

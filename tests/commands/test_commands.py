@@ -264,8 +264,8 @@ def test_an_evaluation_draws_an_operating_map(
 ):
     pytest.importorskip("matplotlib")
     # Two lines: one of two points and one of a single point.
-    fast, tempo = operating_map._speed((4.0, 8.0)), operating_map._interval((1.0,))
-    monkeypatch.setattr(operating_map, "_MAPS", ((fast,), (tempo,), (fast, tempo)))
+    fast, tempo = {operating_map._SPEED: (4.0, 8.0)}, {operating_map._INTERVAL: (1.0,)}
+    monkeypatch.setattr(operating_map, "_MAPS", (fast, tempo, fast | tempo))
     picture = tmp_path / "map.png"
     result, text = figures_of(tmp_path, trained, "--map", picture, "--mask")
     assert f"{picture}: success against speed" in text

@@ -36,24 +36,25 @@ def test_the_map_varies_what_it_says_alone_and_two_together():
     assert names[-1] == (speed, tempo)
     assert [len(n) for n in names] == [1, 1, 1, 1, 2]
     # Within the training range and beyond it, on both sides.
-    for (what,) in maps._MAPS[:2]:
-        low, high = what.trained(TASK.throws) or (0, 0)
-        inside = [v for v in what.values if low <= v <= high]
+    for varied in maps._MAPS[:2]:
+        ((what, values),) = varied.items()
+        low, high = getattr(TASK.throws, what.trained)
+        inside = [v for v in values if low <= v <= high]
         assert len(inside) >= 3
-        assert min(what.values) < low
-        assert max(what.values) > high
+        assert min(values) < low
+        assert max(values) > high
 
 
 @pytest.mark.parametrize("value", [0.3, 1.5])
 def test_a_ball_is_aimed_at_the_height_of_its_place(value):
-    thrower, drawn = draws(maps._HEIGHT.vary(CONFIG.task.throws, value))
+    thrower, drawn = draws(replace(CONFIG.task.throws, **maps._HEIGHT.fields(value)))
     height, _ = thrower.at_standing_robot(drawn)
     torch.testing.assert_close(height, torch.full_like(height, value))
 
 
-@pytest.mark.parametrize("value", maps._DIRECTIONS)
+@pytest.mark.parametrize("value", maps._MAPS[3][maps._DIRECTION])
 def test_a_ball_comes_from_the_sector_of_its_place(value):
-    _, drawn = draws(maps._DIRECTION.vary(CONFIG.task.throws, value))
+    _, drawn = draws(replace(CONFIG.task.throws, **maps._DIRECTION.fields(value)))
     off = drawn.azimuth - math.radians(value)
     off = torch.rad2deg(torch.atan2(off.sin(), off.cos()))
     assert -22.501 < off.min() < -21
@@ -109,8 +110,8 @@ def test_slow_balls_in_a_fast_sequence_all_arrive():
 
 
 def test_an_operating_map_is_the_success_on_each_throw(monkeypatch):
-    speed, tempo = maps._speed((4.0, 9.0)), maps._interval((1.0, 2.5))
-    monkeypatch.setattr(maps, "_MAPS", ((speed,), (speed, tempo)))
+    speed, tempo = {maps._SPEED: (4.0, 9.0)}, {maps._INTERVAL: (1.0, 2.5)}
+    monkeypatch.setattr(maps, "_MAPS", (speed, speed | tempo))
     config = replace(CONFIG, task=replace(CONFIG.task, success_s=1.0))
     # What is played may be another task than that of the training.
     trained = replace(config.task.throws, speed=(2.0, 12.0))
@@ -163,7 +164,7 @@ def test_the_mask_reaches_what_is_played(monkeypatch):
         return play_throws(*args, mask=mask, **kwargs)
 
     monkeypatch.setattr(maps, "play_throws", play)
-    monkeypatch.setattr(maps, "_MAPS", ((maps._speed((4.0, 9.0)),),))
+    monkeypatch.setattr(maps, "_MAPS", ({maps._SPEED: (4.0, 9.0)},))
     options = {"throw_set": 5, "episodes": 4}
     operating_map(None, CONFIG, SKIN, **options, mask=("torso_link",))
     operating_map(None, CONFIG, SKIN, **options)

@@ -41,13 +41,13 @@ def test_agents_still_alive_are_not_left_out():
 
 
 def test_the_past_fades():
-    curve = SurvivalCurve(max_steps=1, memory=0.5)
+    curve = SurvivalCurve(max_steps=1)
     ages = torch.ones(4, dtype=torch.int64)
     curve.update(ages, torch.ones(4, dtype=torch.bool))
     curve.decay()
     curve.update(ages, torch.zeros(4, dtype=torch.bool))
-    # 2 of weight ended, of 2 + 4 at risk.
-    assert curve.probability(1) == pytest.approx(1 - 2 / 6)
+    # 3.6 = 0.9 x 4 of weight ended, of 3.6 + 4 at risk.
+    assert curve.probability(1) == pytest.approx(1 - 3.6 / 7.6)
 
 
 def test_what_ends_before_age_zero_makes_it_less_than_certain_by_hand():

@@ -24,7 +24,7 @@ from calling import wait_for
 from egoskin.runs.run import Run
 from egoskin.study.claims import is_locked
 from egoskin.study.manifest import Manifest, resolve
-from egoskin.study.runner import PATIENCE_S
+from egoskin.study.runner import STOP_TIMEOUT_S
 from egoskin.study.store import StudyFolder
 
 ray = pytest.importorskip("ray", reason="extra ray")
@@ -123,7 +123,7 @@ def test_ctrl_c_ends_all_tasks_with_checkpoints(cluster, study, start, undisturb
     runner.process.send_signal(signal.SIGINT)
     begin = time.monotonic()
     assert runner.end() == 130
-    assert time.monotonic() - begin < PATIENCE_S
+    assert time.monotonic() - begin < STOP_TIMEOUT_S
     assert "Traceback" not in runner.text()
     before = kept(study)
     assert before

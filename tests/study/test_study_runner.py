@@ -421,9 +421,9 @@ def test_status_tells_failures_and_what_is_left(folder: StudyFolder):
     log = folder.log_path("blind-seed1")
     log.parent.mkdir()
     log.write_text("--- started\nerror: old\n--- started\nTraceback\nKeyError: 'x'\n")
-    assert folder.last_words("blind-seed1") == "KeyError: 'x'"
+    assert folder.last_error("blind-seed1") == "KeyError: 'x'"
     for tries in (1, 2):
-        failure = folder.note_failure("blind-seed1", folder.last_words("blind-seed1"))
+        failure = folder.note_failure("blind-seed1", folder.last_error("blind-seed1"))
         assert failure == Failure(tries=tries, error="KeyError: 'x'")
     status = folder.status(manifest.runs)
     assert [s.state for s in status] == ["done", "failed", "missing"]
@@ -442,15 +442,15 @@ def test_status_tells_failures_and_what_is_left(folder: StudyFolder):
     assert folder.status(manifest.runs)[1].state == "missing"
 
 
-def test_the_last_words_of_a_worker_have_its_reason(folder: StudyFolder):
+def test_the_last_error_of_a_worker_has_its_reason(folder: StudyFolder):
     path = folder.log_path(NAME)
     path.parent.mkdir(exist_ok=True)
     path.write_text(
         "--- started\nerror: worker 0 of 1 raised\nTraceback\n  line 1\nValueError: x\n"
     )
-    assert folder.last_words(NAME) == "worker 0 of 1 raised: ValueError: x"
+    assert folder.last_error(NAME) == "worker 0 of 1 raised: ValueError: x"
     path.write_text("--- started\nnote\nerror: the disk is full\n")
-    assert folder.last_words(NAME) == "the disk is full"
+    assert folder.last_error(NAME) == "the disk is full"
     assert how_it_ended(folder, NAME, 1) == "the disk is full"
     assert how_it_ended(folder, NAME, -signal.SIGKILL) == "killed by SIGKILL"
 

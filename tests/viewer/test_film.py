@@ -97,12 +97,11 @@ def test_an_end_by_a_hit_is_written_in_red():
 
 
 def test_a_sheet_is_a_grid_filled_up_with_white():
-    sheet = contact_sheet(approach(5, closest=2), count=5, columns=3, size=(80, 60))
-    assert sheet.shape == (120, 240, 3)
-    assert (sheet[60:, 160:] == 255).all()
+    sheet = contact_sheet(approach(5, closest=2))
+    assert sheet.shape == (840, 2240, 3)
+    assert (sheet[420:, 560:] == 255).all()
     # The frames are in order: each is brighter than the previous one.
-    cells = [sheet[50, 40 + 80 * i, 0] for i in range(3)]
-    cells += [sheet[110, 40 + 80 * i, 0] for i in range(2)]
+    cells = [sheet[350, 280 + 560 * i, 0] for i in range(4)] + [sheet[770, 280, 0]]
     assert cells == sorted(set(cells))
 
 

@@ -29,7 +29,7 @@ from egoskin.viewer.offscreen import (
 from egoskin.viewer.recording import (
     Recording,
     ending_of,
-    record_episodes,
+    record_longest,
     render_recording,
 )
 from throwing import TASK
@@ -174,7 +174,7 @@ def test_the_closest_point_lies_on_the_surface():
 def render(
     config: EnvConfig, skin: Skin, *, hold: bool = False, **options: object
 ) -> list[Frame]:
-    (recording,) = record_episodes(config, skin, None, hold=hold)
+    recording = record_longest(config, skin, None, hold=hold)
     with painter_of(config, skin, size=SIZE) as painter:
         return render_recording(painter, config, skin, recording, **options)
 
@@ -240,9 +240,10 @@ def test_without_a_skin_there_are_no_sensors_to_draw(coverage, skin: Skin):
 
 def test_recordings_are_of_the_rows_of_the_throw_set(skin: Skin):
     config = EnvConfig(task=TASK)
-    recordings = record_episodes(
-        config, skin, None, throw_set=3, first=5, episodes=2, hold=True
-    )
+    recordings = [
+        record_longest(config, skin, None, throw_set=3, first=row, hold=True)
+        for row in (5, 6)
+    ]
     assert [r.row for r in recordings] == [5, 6]
     which = {"throw_set": 3, "episodes": 8, "hold": True}
     steps = play_throws(None, config, skin, **which).steps
@@ -260,7 +261,7 @@ def test_recordings_are_of_the_rows_of_the_throw_set(skin: Skin):
     for step in range(30):
         for recording in recordings:
             state = recording.states[step]
-            for key in ("object_pose", "base_pose", "joint_pos", "signal"):
+            for key in ("object_pose", "base_pose", "joint_pos", "distance"):
                 assert torch.equal(state[key], td[key][recording.row]), key
         td["action"] = torch.zeros(8, 21)
         td = env.step(td)["next"]
@@ -269,10 +270,12 @@ def test_recordings_are_of_the_rows_of_the_throw_set(skin: Skin):
 @pytest.mark.parametrize("coverage", ["field", "none"])
 def test_the_longest_episode_is_recorded_in_little_memory(coverage, skin: Skin):
     config = EnvConfig(task=TASK, sensor=SensorConfig(coverage=coverage))
-    which = {"throw_set": 3, "first": 2, "episodes": 8, "hold": True}
-    every = record_episodes(config, skin, None, **which)
+    which = {"throw_set": 3, "hold": True}
+    every = [
+        record_longest(config, skin, None, **which, first=row) for row in range(2, 10)
+    ]
     longest = max(every, key=lambda recording: len(recording.states))
-    (alone,) = record_episodes(config, skin, None, **which, longest=True)
+    alone = record_longest(config, skin, None, **which, first=2, episodes=8)
     assert (alone.row, alone.ending) == (longest.row, longest.ending)
     for state, expected in zip(alone.states, longest.states, strict=True):
         assert all(torch.equal(state[key], expected[key]) for key in state.keys())
@@ -296,7 +299,7 @@ def test_of_equally_long_episodes_the_first_is_recorded(skin: Skin, monkeypatch)
             watch(state, state, torch.tensor(running, dtype=torch.bool))
 
     monkeypatch.setattr("egoskin.viewer.recording.play_throws", play)
-    (alone,) = record_episodes(EnvConfig(), skin, None, episodes=6, longest=True)
+    alone = record_longest(EnvConfig(), skin, None, episodes=6)
     assert alone.row == 2
     assert [int(state["base_pose"]) for state in alone.states] == [2] * 4
 

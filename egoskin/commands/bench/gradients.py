@@ -47,6 +47,9 @@ def gradient_rows(config: GradientBench) -> list[Row]:
     which has the least bias.
     """
     run = Run.open(config.run)
+    if not run.is_new():
+        # The error of a damaged checkpoint names this one, not its copy.
+        run.load_checkpoint()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "run"
         shutil.copytree(config.run, path)

@@ -18,7 +18,7 @@ import numpy as np
 import viser
 
 from egoskin.policies.policy import CHECKPOINT_NAME, policy_file, shipped_policies
-from egoskin.viewer.web.panel import EPISODES, MEMORY, Panel, Wishes
+from egoskin.viewer.web.panel import EPISODES, MEMORY, Callbacks, Panel
 from egoskin.viewer.web.scene import RobotScene, set_stage
 from egoskin.viewer.web.server import ServedPage, slider_value
 from egoskin.viewer.web.session import Frame, Session, Throw
@@ -48,21 +48,20 @@ class Page(ServedPage):
     Args:
         sources: Policy of each robot: name, file, checkpoint or run folder.
         port: Port of 127.0.0.1; 0 for any free one.
-        seed: Random seed of the episodes and throws.
 
     Raises:
         ValueError: If a policy does not exist, or two have different control rates.
         OSError: If the port cannot be used.
     """
 
-    def __init__(self, sources: Sequence[str], port: int = 0, seed: int = 0) -> None:
+    def __init__(self, sources: Sequence[str], port: int = 0) -> None:
         # Before loading: a checkpoint that is written meanwhile is newer.
         self._versions = [_version(source) for source in sources]
         self._notes = [""] * len(sources)
         self.sessions: list[Session] = []
         for source in sources:
             rate = self.hz if self.sessions else None
-            self.sessions.append(Session(source, seed, rate))
+            self.sessions.append(Session(source, rate))
         super().__init__(port)
         set_stage(self.server)
         self._scenes = [self._scene_of(i) for i in range(len(sources))]
@@ -70,7 +69,7 @@ class Page(ServedPage):
             self.server,
             self.sessions,
             offered_policies(sources),
-            Wishes(
+            Callbacks(
                 throw=lambda bearing: self._ask(self.throw_from, bearing),
                 pause=lambda: self._ask(self.pause),
                 step=lambda: self._ask(self.step_once),
@@ -94,7 +93,7 @@ class Page(ServedPage):
         self.is_paused = False
         self.steps = 0
         """Control steps computed so far."""
-        self._random = np.random.default_rng(seed)
+        self._random = np.random.default_rng(0)
         self._looked = self._panel_shown = self._pictured = 0.0
         self._steps_shown, self._speed = 0, ""
         self._forget()
@@ -149,10 +148,10 @@ class Page(ServedPage):
             # Handle requests until the next step is due, at least all queued so far.
             while True:
                 try:
-                    wish = self._commands.get(timeout=max(due - time.monotonic(), 0))
+                    request = self._commands.get(timeout=max(due - time.monotonic(), 0))
                 except queue.Empty:
                     break
-                self._do(wish)
+                self._do(request)
 
     def advance(self, is_late: bool = False) -> None:
         """Advance one control step unless paused, and draw if a picture is due.

@@ -47,7 +47,7 @@ _HELP = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Wishes:
+class Callbacks:
     """Functions of the page that the panel calls."""
 
     throw: Callable[[float | None], None]
@@ -77,7 +77,7 @@ class Panel:
         server: The page.
         sessions: The robots.
         policies: Policies that can be selected.
-        wishes: Functions to call for each request.
+        callbacks: Functions to call for each request.
     """
 
     def __init__(
@@ -85,9 +85,9 @@ class Panel:
         server: viser.ViserServer,
         sessions: Sequence[Session],
         policies: Sequence[str],
-        wishes: Wishes,
+        callbacks: Callbacks,
     ) -> None:
-        self._gui, self._wishes = server.gui, wishes
+        self._gui, self._callbacks = server.gui, callbacks
         self._status = server.gui.add_markdown("")
         tabs = server.gui.add_tab_group()
         with tabs.add_tab("Play"):
@@ -103,11 +103,11 @@ class Panel:
     # --- controls -------------------------------------------------------------
 
     def _add_play(self) -> None:
-        gui, wishes = self._gui, self._wishes
+        gui, callbacks = self._gui, self._callbacks
         throw = gui.add_button("Throw a ball", icon=viser.Icon.BALL_BASEBALL)
-        throw.on_click(lambda _: wishes.throw(None))
+        throw.on_click(lambda _: callbacks.throw(None))
         sides = gui.add_button_group("From", list(SIDES))
-        sides.on_click(lambda event: wishes.throw(SIDES[event.target.value]))
+        sides.on_click(lambda event: callbacks.throw(SIDES[event.target.value]))
         self.speed = gui.add_slider("Speed [m/s]", *SPEEDS, 0.5, 6.0)
         self.height = gui.add_slider("Height [m]", *HEIGHTS, 0.1, 2.5)
         self.tempo = gui.add_slider(
@@ -116,9 +116,9 @@ class Panel:
         gui.add_divider()
         self.slowdown = gui.add_slider("Slowdown", 1, 20, 1, 1)
         actions = {
-            "Pause": wishes.pause,
-            "Step": wishes.step,
-            "Reset": wishes.reset,
+            "Pause": callbacks.pause,
+            "Step": callbacks.step,
+            "Reset": callbacks.reset,
         }
         times = gui.add_button_group("Time", list(actions))
         times.on_click(lambda event: actions[event.target.value]())
@@ -130,19 +130,19 @@ class Panel:
 
         def again(event: viser.GuiEvent) -> None:
             if event.target.value == "Save":
-                wishes.save(event.client)
+                callbacks.save(event.client)
             else:
-                wishes.replay()
+                callbacks.replay()
 
         last.on_click(again)
         self._map = gui.add_image(_EMPTY, label="Readings, last five seconds")
         gui.add_markdown(_HELP)
 
     def _add_sensors(self) -> None:
-        gui, wishes = self._gui, self._wishes
+        gui, callbacks = self._gui, self._callbacks
         self._masked = gui.add_markdown("")
         masks = gui.add_button_group("Mask", ["All", "None"])
-        masks.on_click(lambda event: wishes.mask(event.target.value == "All"))
+        masks.on_click(lambda event: callbacks.mask(event.target.value == "All"))
         gui.add_divider()
         self._kind = gui.add_dropdown("Kind", list(_KINDS))
         self._signal = gui.add_dropdown("Signal", _SIGNALS)
@@ -156,7 +156,7 @@ class Panel:
         }
         for name, handle in self._settings.items():
             # A change made by the page itself has no client.
-            handle.on_update(lambda event, n=name: event.client and wishes.sense(n))
+            handle.on_update(lambda event, n=name: event.client and callbacks.sense(n))
         self._readable = gui.add_markdown("")
 
     def _add_plots(self, sessions: Sequence[Session]) -> None:
@@ -193,14 +193,16 @@ class Panel:
         self._survival = plot("episode", episodes, upward, whole)
 
     def _add_policies(self, sessions: Sequence[Session], names: Sequence[str]) -> None:
-        gui, wishes = self._gui, self._wishes
+        gui, callbacks = self._gui, self._callbacks
         self._policies = []
         for i, session in enumerate(sessions):
             label = ("Left", "Right")[i] if len(sessions) > 1 else "Policy"
             given = [session.source, *(n for n in names if n != session.source)]
             handle = gui.add_dropdown(label, given, initial_value=session.source)
             handle.on_update(
-                lambda event, i=i: event.client and wishes.load(i, event.target.value)
+                lambda event, i=i: (
+                    event.client and callbacks.load(i, event.target.value)
+                )
             )
             self._policies.append(handle)
         self._about = gui.add_markdown("")

@@ -110,7 +110,7 @@ class RobotScene:
                 f"{name}/link_{part.body}/part_{i}",
                 part.vertices,
                 part.faces,
-                color=_lit(rgb),
+                color=_rgb_255(rgb),
                 opacity=None if opacity == 1 else opacity,
             )
         meshes = map(mesh_of, balls)
@@ -228,7 +228,8 @@ class RobotScene:
         self._root.remove()
 
 
-def _lit(rgb: Sequence[float]) -> tuple[int, int, int]:
+def _rgb_255(rgb: Sequence[float]) -> tuple[int, int, int]:
+    """Return a colour in integers, as viser takes it."""
     red, green, blue = (round(255 * c) for c in rgb)
     return red, green, blue
 

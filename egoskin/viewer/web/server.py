@@ -83,14 +83,14 @@ class ServedPage:
         if text:
             self._error_text.content = f"**Error.** {html.escape(text)}"
 
-    def _ask(self, wish: Callable[..., object], *args: Any) -> None:
+    def _ask(self, request: Callable[..., object], *args: Any) -> None:
         """Queue a function; any thread may call this."""
-        self._commands.put(lambda: wish(*args))
+        self._commands.put(lambda: request(*args))
 
-    def _do(self, wish: Callable[[], object]) -> None:
+    def _do(self, request: Callable[[], object]) -> None:
         """Call a function; an exception is shown on the page and does not end it."""
         try:
-            wish()
+            request()
         # A policy, a file or a robot that does not fit may raise anything.
         except Exception as error:
             self.show_error(f"{type(error).__name__}: {error}")

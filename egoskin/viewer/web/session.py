@@ -22,13 +22,15 @@ from egoskin.envs.dodgeball import DodgeballEnv
 from egoskin.envs.throws import NUM_AIM_POINTS, Draw, Thrower
 from egoskin.make import EnvConfig, make_worker_env
 from egoskin.policies.policy import Policy, load_with_critic
-from egoskin.sensors import Corruption, Skin
+from egoskin.sensors import Binary, Corruption, Proximity, Skin
 from egoskin.sensors.config import SensorConfig
 from egoskin.sensors.pipeline import SensorGroup
 from egoskin.viewer.offscreen import closest_point
 from egoskin.viewer.recording import ending_of
 from egoskin.viewer.web.body import Body
 
+# The same for all robots: they start alike and receive the same throws.
+_SEED = 0
 # Time until the next throw [s]: never, as balls are only thrown on demand.
 _NEVER = 1e6
 _MIN_DISTANCE, _MAX_DISTANCE = 1.5, 8.0
@@ -98,9 +100,9 @@ class ThrownOnDemand(Thrower):
             if value is not None:
                 given[name] = torch.full(row.shape, float(value))
         if self.wanted.target is not None:
-            # The second number, for the height in a box, is from digits that do not
-            # matter to the first: two equal numbers are on the diagonal of the box, and
-            # one drawn here differs between robots that receive the same throw.
+            # The second number sets the height in a box. It is made from the further
+            # digits of the first: equal numbers would aim along the box's diagonal, and
+            # a random number would differ between robots that receive the same throw.
             pair = self.wanted.target, self.wanted.target * NUM_AIM_POINTS % 1
             given["target"] = torch.tensor(pair).float().expand(len(row), 2)
         return dataclasses.replace(draw, **given)
@@ -111,16 +113,13 @@ class Session:
 
     Args:
         policy: Name, file, checkpoint or run folder of its policy.
-        seed: Random seed; robots with the same seed start alike and receive the same
-            throws.
         hz: Control rate that the policy must have [Hz]; None: any.
 
     Raises:
         ValueError: If there is no such policy, or it has another control rate.
     """
 
-    def __init__(self, policy: str, seed: int = 0, hz: float | None = None) -> None:
-        self.seed = seed
+    def __init__(self, policy: str, hz: float | None = None) -> None:
         self.load(policy, hz)
 
     # --- policy and sensors -----------------------------------------------------
@@ -179,7 +178,7 @@ class Session:
         """Take a policy and its environment; if this fails, nothing is changed."""
         pipeline, task = config.pipeline(policy.skin), config.task
         env = make_worker_env(
-            config, policy.skin, num_envs=1, seed=self.seed, keep_raw=True
+            config, policy.skin, num_envs=1, seed=_SEED, keep_raw=True
         )
         base = env.base_env
         assert isinstance(base, DodgeballEnv)
@@ -237,7 +236,7 @@ class Session:
 
     def reset(self) -> Frame:
         """Start an episode, always from the same state and without a ball in flight."""
-        self.env.set_seed(self.seed, static_seed=True)
+        self.env.set_seed(_SEED, static_seed=True)
         assert isinstance(self.env.transform, Compose)
         for transform in self.env.transform:
             if isinstance(transform, Corruption):
@@ -391,14 +390,8 @@ class Session:
         """Return the readings of a group of sensors, as in `Frame.reading`."""
         corrupted = f"reading{group.suffix}"
         key = corrupted if corrupted in row.keys() else f"distance{group.suffix}"
-        distance = np.asarray(row[key], float).reshape(len(group.index), -1).min(-1)
-        ranges = group.skin.range
+        nearest = row[key].reshape(1, len(group.index), -1).amin(-1)
+        ranges = group.skin.range.tolist()
         if self.config.sensor.signal == "binary":
-            # As in the binary signal, an infinite range detects nothing at infinity.
-            return (np.isfinite(distance) & (distance <= ranges)).astype(float)
-        # As in the proximity signal, with a scale of 1 m for infinite range.
-        with np.errstate(invalid="ignore"):
-            share = np.where(
-                np.isinf(ranges), 1 - 1 / (1 + distance), distance / ranges
-            )
-        return 1 - np.clip(share, 0, 1)
+            return Binary(ranges).signal(nearest)[0].numpy()
+        return Proximity(ranges, closeness=True).signal(nearest)[0].numpy()
