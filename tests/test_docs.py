@@ -10,6 +10,7 @@ import re
 import shlex
 import subprocess
 import sys
+from collections.abc import Iterator
 from contextlib import redirect_stdout
 from dataclasses import asdict
 from pathlib import Path
@@ -30,6 +31,19 @@ from egoskin.policies.export import export_onnx, observation_parts
 from egoskin.robots.builtin import H1_2
 from egoskin.runs.config import TrainConfig, parse_config
 from egoskin.sensors.config import SensorConfig
+from egoskin.sensors.imperfections.models import (
+    Bias,
+    DeadSensors,
+    Drift,
+    Dropout,
+    FalsePositives,
+    Latency,
+    Noise,
+    Quantisation,
+    RangeLimits,
+    SampleAndHold,
+)
+from egoskin.sensors.imperfections.presets import PRESETS
 from egoskin.storage.serialization import to_plain
 from egoskin.study.findings import FINDINGS
 from egoskin.study.manifest import resolve
@@ -322,6 +336,87 @@ def test_learning_has_the_numbers_they_say():
         [ppo.noise_correlation, ppo.noise_correlation_start],
     ]
     assert net.hidden == (32, 32)
+
+
+def test_the_presets_of_real_sensors_are_made_of_the_numbers_they_say():
+    rows = table("sensor-models.md", "Presets")
+    # Without the numbers of sources and zones.
+    plain = re.compile(r"\[\d\]|8 x 8 zones")
+    said = {name: [numbers(plain.sub("", cell)) for cell in row] for name, *row in rows}
+
+    def mm(x: float) -> float:
+        return x / 1000
+
+    def percent(x: float) -> float:
+        return x / 100
+
+    def row(name: str) -> Iterator[list[float]]:
+        return iter(said.pop(name))
+
+    (far,), (far_cm,), none = row("maximum range")
+    (near_cm,), *others = row("minimum range")
+    assert [none, *others] == [[], [], []]
+    (step,), *others = row("resolution")
+    assert others == [[], []]
+    (light,), (charge,), (sound,) = row("rate")
+    (light_late,), (charge_late,), (sound_late,) = row("latency")
+    (least, share), (square,), (least_cm, sound_share, motion) = row("noise, std")
+    nothing, (common,), others = row("common noise, std")
+    assert nothing == others == []
+    (offset, gain), (charge_gain,), (offset_cm, sound_gain) = row("bias, std")
+    nothing, (drift,), others = row("drift, std after 1 s")
+    assert nothing == others == []
+    (lost,), nothing, (at_rest, moving, speed) = row("drop-out")
+    assert (nothing, at_rest) == ([], 0)
+    (false, up_to), nothing, (sound_false, sound_up_to) = row("false positives")
+    assert nothing == []
+    (dead,), (charge_dead,), (sound_dead,) = row("dead sensors")
+    assert not said
+    expected = {
+        "time_of_flight": (
+            Bias(offset_std=mm(offset), gain_std=percent(gain)),
+            Noise(constant=mm(least), linear=percent(share)),
+            Dropout(per_metre=percent(lost)),
+            FalsePositives(probability=false, max_range=up_to),
+            DeadSensors(probability=percent(dead)),
+            RangeLimits(minimum=near_cm / 100, maximum=far),
+            Quantisation(step=mm(step)),
+            SampleAndHold(rate_hz=light),
+            Latency(seconds=mm(light_late)),
+        ),
+        "capacitive": (
+            Bias(gain_std=percent(charge_gain)),
+            Noise(quadratic=square),
+            Noise(quadratic=common, common=True),
+            Drift(quadratic=drift),
+            DeadSensors(probability=percent(charge_dead)),
+            RangeLimits(maximum=far_cm / 100),
+            SampleAndHold(rate_hz=charge),
+            Latency(seconds=mm(charge_late)),
+        ),
+        "acoustic": (
+            Bias(offset_std=offset_cm / 100, gain_std=percent(sound_gain)),
+            Noise(
+                constant=least_cm / 100,
+                linear=percent(sound_share),
+                per_speed=percent(motion),
+            ),
+            Dropout(per_speed=percent(moving) / speed),
+            FalsePositives(probability=sound_false, max_range=sound_up_to),
+            DeadSensors(probability=percent(sound_dead)),
+            SampleAndHold(rate_hz=sound),
+            Latency(seconds=mm(sound_late)),
+        ),
+    }
+    assert PRESETS.keys() == expected.keys()
+    for name, models in expected.items():
+        for one, other in zip(PRESETS[name](), models, strict=True):
+            assert type(one) is type(other)
+            if isinstance(one, Latency):
+                # It is told in whole milliseconds.
+                assert one.seconds == pytest.approx(other.seconds, abs=0.0005)
+            else:
+                assert one == other
 
 
 def test_every_column_of_the_metrics_is_explained(trained):

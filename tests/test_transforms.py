@@ -420,6 +420,20 @@ def test_an_approach_is_where_the_ball_will_be(gravity):
     torch.testing.assert_close(approach(-velocity), expected)
 
 
+def test_an_approach_is_told_for_two_seconds_ahead_and_three_metres_around():
+    # Balls at 1 m/s: one comes from 2.5 m ahead, one flies past at 5 m to the left.
+    pose = torch.tensor([[[2.5, 0, 0.5, 1, 0, 0, 0], [1.0, 5, 0.5, 1, 0, 0, 0]]])
+    velocity = torch.tensor([[[-1.0, 0, 0], [-1.0, 0, 0]]])
+    base_pose = torch.tensor([[0.0, 0, 0, 1, 0, 0, 0]])
+    active = torch.ones(1, 2, dtype=torch.bool)
+    told = approaches_b(
+        base_pose, torch.zeros(1, 3), pose, velocity, active, gravity=0.0
+    )
+    # After 2 s the first is 0.5 m away; the second is nearest after 1 s.
+    expected = torch.tensor([[0.3 / 2.3, 0.5, 0, 0.5, 0.3 / 1.3, 0, 3, 0.5]])
+    torch.testing.assert_close(told, expected)
+
+
 def test_an_oracle_is_told_of_every_ball_by_hand():
     state = privileged_state()
     state["object_active"][:] = True

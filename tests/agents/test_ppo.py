@@ -387,6 +387,17 @@ def test_the_learning_rate_follows_the_divergence_from_update_to_update():
     assert 0.0005 < sum(divergences[10:]) / 10 < 0.002
 
 
+@pytest.mark.parametrize(
+    ("desired", "rate", "bound"), [(1e6, 9e-3, 1e-2), (1e-15, 1.2e-5, 1e-5)]
+)
+def test_an_adapted_learning_rate_stays_within_its_bounds(desired, rate, bound):
+    agent = bandit_agent()
+    config = PPOConfig(
+        desired_kl=desired, learning_rate=rate, ppo_epochs=1, num_mini_batches=1
+    )
+    assert PPO(agent, config).update(bandit_rollout(agent))["learning_rate"] == bound
+
+
 def test_the_divergence_of_an_update_is_that_of_the_policy_it_leaves():
     agent = bandit_agent()
     ppo = PPO(agent, PPOConfig())

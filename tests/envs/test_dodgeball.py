@@ -563,6 +563,8 @@ def test_each_ball_is_told_apart_until_it_is_thrown_again(chest):
     step, _ = advance(env, root)
     assert step["object_hit"].tolist() == [[True, False]]
     assert step["object_arrived"].tolist() == [[True, False]]
+    # Thrown again, the first ball is a later one.
+    assert counts(step) == [[1, 1], [1, 0]]
 
 
 def test_first_and_later_balls_are_counted_once_as_arrived_and_avoided(chest):

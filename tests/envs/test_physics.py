@@ -301,6 +301,18 @@ def test_torque_of_a_step_includes_the_velocity_target(target_velocity):
         last = target
 
 
+def test_stiff_joints_swing_out_at_the_default_rate():
+    # The damping of these gains is too strong for a step that is explicit in it.
+    physics = make(1, PhysicsConfig(gains="real"))
+    put(physics, height=3.0)
+    swing = np.random.default_rng(0).normal(size=len(DEFAULT))
+    physics._qvel[0, 6 : 6 + len(DEFAULT)] = swing
+    for _ in range(30):
+        step(physics)
+    assert np.abs(swing).max() > 1
+    assert physics.read().joint_vel.abs().max() < 0.5
+
+
 def test_a_held_robot_stays_where_it_is_put(crown):
     physics = make(2, hold=True)
     before = physics.read()

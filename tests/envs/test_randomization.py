@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+from unittest.mock import Mock
 
 import mujoco
+import numpy as np
 import pytest
 import torch
 
 from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
 from egoskin.envs.physics.mujoco import MujocoPhysics
-from egoskin.envs.randomization import RandomizationConfig
+from egoskin.envs.randomization import Randomization, RandomizationConfig
+from egoskin.envs.rewards import TERMS
 from egoskin.envs.standards import evaluation_task, standard_of
 from egoskin.envs.throws import ThrowConfig
 from egoskin.robots.builtin import H1_2
@@ -96,6 +100,40 @@ def test_a_row_has_the_robot_that_its_variation_says():
     assert 0.5 <= own.link_mass.min() < own.link_mass.max() <= 2.0
 
 
+def assert_uniform_and_independent(shares: torch.Tensor) -> None:
+    """Assert that columns ``[n, k]`` are uniform in [0, 1], each on its own."""
+    n = len(shares)
+    assert (shares.amin(0) >= -1e-5).all()
+    assert (shares.amin(0) < 0.01).all()
+    assert (shares.amax(0) <= 1 + 1e-5).all()
+    assert (shares.amax(0) > 0.99).all()
+    # The correlation of n independent pairs has standard deviation 1/sqrt(n).
+    correlation = np.corrcoef(shares.T.double().numpy())
+    assert np.abs(correlation - np.eye(shares.shape[1])).max() < 5 / math.sqrt(n)
+
+
+def test_every_factor_has_a_draw_of_its_own_in_each_episode():
+    ranges = {
+        "link_mass": (0.5, 2.0),
+        "friction": (0.1, 1.0),
+        "gains": (0.8, 1.3),
+        "torque_limit": (0.2, 0.9),
+    }
+    config = RandomizationConfig(**ranges, delay_steps=(0, 100))
+    drawn = Randomization(config, 4096, 3, 2, 60.0, torch.device("cpu"))
+    row, physics, shares = torch.arange(4096), Mock(), []
+    for episode in (0, 1):
+        drawn.start(physics, row, 5, row, 0 * row + episode)
+        _, robot = physics.vary.call_args.args
+        for name, (low, high) in ranges.items():
+            factor = getattr(robot, name).reshape(4096, -1)
+            shares.append((factor - low) / (high - low))
+        shares.append(drawn.state["delay"][:, None] / 100)
+    # 3 links, friction, gains and limits of 2 joints, and the delay; two episodes.
+    assert sum(x.shape[1] for x in shares) == 2 * (3 + 1 + 2 + 2 + 1)
+    assert_uniform_and_independent(torch.cat(shares, 1))
+
+
 def test_gains_scale_stiffness_and_damping_alike():
     env = make(gains=(1.5, 1.5))
     env.reset()
@@ -112,7 +150,6 @@ def test_actions_come_late_by_whole_steps():
     for delay in (1, 2):
         late, _ = play(make(delay_steps=(delay, delay)), 12)
         # No action takes effect before the delay; then the first one does.
-        root = make().reset()
         env = make()
         root = env.reset()
         for step in range(12):
@@ -122,6 +159,19 @@ def test_actions_come_late_by_whole_steps():
             one, root = env.step_and_maybe_reset(root)
             assert torch.equal(one["next", "joint_pos"], late[step]["joint_pos"])
         assert not torch.equal(late["joint_pos"], plain["joint_pos"])
+
+
+def test_what_is_observed_and_paid_for_is_the_action_chosen_however_late_it_acts():
+    env = make(delay_steps=(2, 2))
+    root, before = env.reset(), torch.zeros(4, JOINTS)
+    weight = env.config.reward.action_rate
+    for action in torch.randn(4, 4, JOINTS, generator=torch.Generator().manual_seed(0)):
+        step, root = env.step_and_maybe_reset(root.set("action", action))
+        assert torch.equal(root["previous_action"], action)
+        paid = step["next", "reward_terms"][:, TERMS.index("action_rate")]
+        change = (action - before).square().mean(-1)
+        torch.testing.assert_close(paid, weight * change)
+        before = action
 
 
 def test_delays_of_a_range_all_occur_and_last_an_episode():
@@ -170,6 +220,23 @@ def test_pushes_come_at_their_step_and_from_everywhere():
     # The mean of 256 directions has a standard deviation of 0.044 in x and y.
     assert (way.mean(0).abs() < 0.2).all()
     assert (way.square().mean(0) - 0.5).abs().max() < 0.15
+
+
+def test_every_push_has_a_direction_a_speed_and_a_wait_of_its_own():
+    config = RandomizationConfig(push_speed=(0.5, 1.5), push_interval=(1.0, 3.0))
+    pushed = Randomization(config, 4096, 3, 2, 1000.0, torch.device("cpu"))
+    row, physics, shares = torch.arange(4096), Mock(), []
+    draws = (5, row, 0 * row)
+    pushed.start(physics, row, *draws)
+    before = 0 * row
+    for _ in range(3):
+        at = pushed.state["next_push_step"].clone()
+        pushed.push(physics, row, *draws)
+        x, y, _ = physics.push.call_args.args[1].unbind(-1)
+        turn = torch.atan2(y, x) / (2 * math.pi) % 1
+        shares += [((at - before) / 1000 - 1) / 2, turn, torch.hypot(x, y) - 0.5]
+        before = at
+    assert_uniform_and_independent(torch.stack(shares, 1))
 
 
 def test_a_robot_that_is_held_is_not_pushed():

@@ -266,6 +266,23 @@ def test_success_is_counted_from_the_first_throw():
     assert watcher._failed.tolist() == [True, False, False]
 
 
+def test_a_ball_after_a_long_delay_is_the_first():
+    # Without the delay it would be the third, fourth or fifth of its episode.
+    watcher = Watcher(make(throws=replace(AT_ONCE, first_delay=(5.0, 5.0))), 0, 8)
+    seen = torch.tensor([[True, False]]).expand(8, 2)
+    after = state(
+        8,
+        object_arrived=seen,
+        object_hit=seen,
+        first_throw_step=torch.full((8, 1), 300),
+    )
+    watcher._step = 300
+    watcher(state(8), after, torch.ones(8, dtype=torch.bool))
+    first, *later = watcher.groups()["number of the ball"]
+    assert (first.episodes, first.first_hits) == (8, 1.0)
+    assert [group.later_balls for group in later] == [0, 0, 0]
+
+
 @pytest.mark.slow
 def test_balls_after_a_delay_are_those_that_the_environment_counts():
     config = make(throws=replace(BESIDE, first_delay=(0.3, 1.1)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import asdict, replace
 
 from egoskin.envs.randomization import RandomizationConfig
@@ -19,6 +20,18 @@ def test_the_last_perturbation_is_of_all_others_together():
         for name in (name for name in ranges if ranges[name] != none[name]):
             (low, high), (least, most) = ranges[name], together[name]
             assert least <= low <= high <= most
+
+
+def test_a_perturbation_is_as_large_as_its_name_says():
+    none = asdict(RandomizationConfig())
+    steps = {"actions a step late": (1, 1), "actions two steps late": (2, 2)}
+    for name, perturbed in list(PERTURBATIONS.items())[1:]:
+        said = tuple(map(float, re.findall(r"[\d.]+", name)))
+        ranges = asdict(perturbed)
+        changed = [ranges[key] for key in ranges if ranges[key] != none[key]]
+        assert steps.get(name, said) in changed, name
+        # Pushes have a time, the default; the last one is all of them.
+        assert len(changed) == 1 or name.startswith("all")
 
 
 def test_each_perturbation_is_played_and_so_is_the_mask(monkeypatch):

@@ -8,7 +8,7 @@ import math
 import pytest
 import torch
 
-from egoskin.envs.dodgeball import DodgeballConfig
+from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
 from egoskin.envs.randomization import RandomizationConfig
 from egoskin.envs.standards import training_task
 from egoskin.envs.throws import ThrowConfig, Thrower
@@ -299,6 +299,26 @@ def test_ends_by_self_contact_are_told_apart():
     # Every episode has exactly one cause of its end.
     causes = (played.hit, played.fallen, played.diverged, played.self_contact)
     assert (torch.stack(causes).sum(0) == 1).all()
+
+
+def test_an_end_by_two_causes_counts_once_and_a_ball_before_a_fall(monkeypatch):
+    step = DodgeballEnv._step
+
+    def twice(env, tensordict):
+        # Whom a ball touches falls as well; of every other one the ball is forgotten,
+        # and its simulation fails.
+        out = step(env, tensordict)
+        odd = torch.arange(len(out))[:, None] % 2 > 0
+        out["fallen"], out["diverged"] = out["hit"].clone(), out["hit"] & odd
+        out["hit"] &= ~odd
+        return out
+
+    monkeypatch.setattr(DodgeballEnv, "_step", twice)
+    played = play_throws(None, **make_case(), throw_set=3, hold=True)
+    odd = torch.arange(32) % 2 > 0
+    assert torch.equal(played.hit, ~odd)
+    assert torch.equal(played.fallen, odd)
+    assert not (played.diverged | played.self_contact).any()
 
 
 def test_another_seed_is_another_throw_set():

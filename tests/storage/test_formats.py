@@ -16,6 +16,7 @@ from safetensors.torch import save
 
 import egoskin
 from egoskin.commands.verify import run_hash
+from egoskin.envs.randomization import RandomizationConfig
 from egoskin.envs.throws import ThrowConfig
 from egoskin.make import EnvConfig
 from egoskin.runs.config import TrainConfig, parse_config
@@ -355,6 +356,51 @@ def test_in_a_run_of_format_6_spheres_were_thrown(run: Path, monkeypatch):
     resume(run)
     policy = egoskin.load_policy(run)
     assert policy.env_config.task.throws.shape == "sphere"
+
+
+@pytest.mark.parametrize(
+    ("number", "name", "gone", "effect"),
+    [
+        (1, "core_frames", [0, 0], [0, 7]),
+        (1, "drift_frames", [0, 0], [10, 20]),
+        (1, "slow_start_frames", 0, 7),
+        (1, "told_next_first", False, True),
+        (1, "env.sensor.numb", False, True),
+        (2, "env.sensor.field.measure", "surface", "centre"),
+        (2, "env.sensor.ray.fov", "diagonal", "axes"),
+        (2, "env.sensor.ray.beams", "centres", "edges"),
+        (2, "env.sensor.ray.sub_beams", 1, 4),
+        (2, "env.sensor.per_object", False, True),
+        (2, "env.sensor.validity", False, True),
+        (2, "env.sensor.localization.over_range", False, True),
+        (2, "env.sensor.localization.frame", "base", "world"),
+    ],
+)
+def test_an_older_file_that_measured_or_learnt_otherwise_is_not_read_as_one_of_today(
+    number, name, gone, effect
+):
+    *path, key = name.split(".")
+    for value, retired in ((gone, {}), (effect, {name: effect})):
+        config = inner = {"env": {"sensor": {"range": 1.0}}}
+        for part in path:
+            inner = inner.setdefault(part, {})
+        inner[key] = value
+        present, found = migrate(config, number)
+        assert found == retired
+        assert present["env"]["sensor"]["range"] == 1.0
+        inner = present
+        for part in path:
+            inner = inner.get(part, {})
+        assert key not in inner
+
+
+def test_before_there_was_randomisation_there_was_none():
+    old, _ = migrate({"env": {}}, 3)
+    ranges = old["env"]["task"]["randomization"].items()
+    config = RandomizationConfig(**{name: tuple(value) for name, value in ranges})
+    assert not config.varies_robot
+    assert not config.pushes
+    assert config.delay_steps == (0, 0)
 
 
 @pytest.mark.parametrize(

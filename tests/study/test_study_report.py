@@ -243,7 +243,7 @@ def test_cells_of_other_kinds_are_reported_too(tmp_path: Path):
 def test_the_cost_of_a_decision_is_in_core_hours(
     manifest: Manifest, tmp_path: Path, without_pictures
 ):
-    hours = []
+    hours, needed = [], None
     for cores in (1, 4):
         folder = StudyFolder(tmp_path / str(cores))
         folder.plan(manifest)
@@ -257,8 +257,11 @@ def test_the_cost_of_a_decision_is_in_core_hours(
         text = (folder.path / "report" / "report.md").read_text()
         (row,) = (line for line in text.splitlines() if line.startswith("| 6a |"))
         hours.append(float(row.split("|")[-2]))
-    # Each run took an hour of wall time.
-    assert hours[1] == 4 * hours[0] > 0
+        judged = judge_findings(tables(folder.results(manifest)))
+        (needed,) = (j.seeds_needed for j in judged if j.finding.label == "6a")
+    # Each run took an hour of wall time; two cells have two seeds each.
+    assert needed is not None
+    assert hours == [2 * (needed - 2), 4 * 2 * (needed - 2)]
 
 
 def test_the_claim_of_a_row_is_the_one_that_needs_its_seeds(
@@ -351,6 +354,45 @@ def test_signals_whose_seeds_have_no_spread_are_neither_equal_nor_different(
     (axes,) = figure.axes
     points = [x for x in axes.lines if x.get_marker() == "o" and len(x.get_xdata())]
     assert [point.get_color() for point in points] == ["#888888"]
+
+
+def test_signals_are_equivalent_by_their_90_and_different_by_their_95_percent_interval(
+    manifest: Manifest,
+):
+    localization = np.array([50.0, 60.0, 55.0])
+    values = {
+        "localization": localization,
+        # Of three pairs with a standard deviation of 2.5 the 90 % interval is +- 4.2,
+        # the 95 % interval +- 6.2.
+        "proximity": localization + np.array([-2.5, 0.0, 2.5]),
+        "binary": localization + np.array([-21.0, -20.0, -19.0]),
+    }
+    table = {f"field-{k}-1m": dict(enumerate(x)) for k, x in values.items()}
+    # With rays binary is better.
+    table["ray-localization-1m"] = dict(enumerate(values["binary"]))
+    table["ray-binary-1m"] = dict(enumerate(localization))
+    figure = equivalence(manifest, table)
+    assert figure is not None
+    (axes,) = figure.axes
+    names = [tick.get_text().split(" m: ")[1] for tick in axes.get_yticklabels()]
+    assert names == [
+        "proximity - localization",
+        "binary - localization",
+        "binary - proximity",
+        "binary - localization",
+    ]
+    points = [x for x in axes.lines if x.get_marker() == "o" and len(x.get_xdata())]
+    same, different = "#0072B2", "#D55E00"
+    found = [point.get_color() for point in points]
+    assert found == [same, different, different, different]
+    # Thin 95 % and thick 90 % intervals.
+    ends = {
+        line.get_linewidth(): np.asarray(line.get_xdata()).tolist()
+        for line in axes.lines
+        if len(line.get_xdata()) == 2 and list(line.get_ydata()) == [0, 0]
+    }
+    assert ends[3.0] == pytest.approx([-4.215, 4.215], abs=1e-3)
+    assert ends[1.0] == pytest.approx([-6.210, 6.210], abs=1e-3)
 
 
 def test_the_lowest_panel_of_each_column_has_numbers_on_its_axis(tmp_path: Path):

@@ -96,6 +96,11 @@ def test_cells_that_share_no_seeds_are_compared_by_welch():
     own = stats.ttest_ind(A, B, equal_var=False, alternative="greater")
     assert effect.df == pytest.approx(own.df)
     assert effect.p_above(0) == pytest.approx(own.pvalue)
+    # Half of a cell is compared as values half as large.
+    half = contrast({"a": 0.5, "b": -1.0}, apart)
+    assert half is not None
+    own = stats.ttest_ind(np.divide(A, 2), B, equal_var=False, alternative="less")
+    assert (half.df, half.p_below(0)) == pytest.approx((own.df, own.pvalue))
     # Its spread is that of one seed of each cell, whatever their numbers of seeds.
     few = {"a": TABLE["a"], "b": {10: 55.0, 11: 63.0}}
     effect = contrast(DIFFERENCE, few)
@@ -144,9 +149,14 @@ def test_equivalence_is_two_one_sided_tests():
     assert SAME.p_inside(effect) == pytest.approx(max(one, other))
     assert SAME.p_outside(effect) == pytest.approx(min(1, 2 * min(1 - one, 1 - other)))
     # The test is whether the 90 % interval lies within the margin.
-    low, high = mean_effect([0.5, -1, 1, -0.5, 0.2]).interval(0.9)
-    assert low > -5
-    assert high < 5
+    found = set()
+    for values in np.random.default_rng(0).normal(1.0, 3.0, (50, 4)):
+        effect = mean_effect(values)
+        low, high = effect.interval(0.9)
+        inside = low > -5 and high < 5
+        assert (SAME.p_inside(effect) <= 0.05) == inside
+        found.add(inside)
+    assert found == {False, True}
 
 
 def test_holm_is_that_of_his_paper():
