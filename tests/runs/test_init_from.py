@@ -90,6 +90,21 @@ def test_an_initial_deviation_is_not_that_of_networks_to_start_from(
     assert torch.equal(start["agent/head.log_std"], before["agent/head.log_std"])
 
 
+def test_the_deviation_of_networks_to_start_from_is_within_the_bounds_of_the_run(
+    finished: Trainer, tmp_path: Path
+):
+    before = networks_of(finished.run.policy_path(64))["agent/head.log_std"]
+    assert (before.exp() > 0.6).any()
+    config = blind_run(tmp_path / "run", 64)
+    network = NetworkConfig(init_std=0.3, std_bounds=(0.1, 0.6))
+    ppo = replace(config.ppo, network=network)
+    run = Run.create(replace(config, ppo=ppo, init_from=finished.run.path))
+    with open_trainer(run):
+        pass
+    start = networks_of(run.checkpoint_path)["agent/head.log_std"]
+    torch.testing.assert_close(start.exp(), before.exp().clamp(max=0.6))
+
+
 def test_a_resumed_run_needs_no_longer_what_it_started_from(
     finished: Trainer, tmp_path: Path
 ):

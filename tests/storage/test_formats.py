@@ -381,7 +381,8 @@ def test_an_older_file_that_measured_or_learnt_otherwise_is_not_read_as_one_of_t
 ):
     *path, key = name.split(".")
     for value, retired in ((gone, {}), (effect, {name: effect})):
-        config = inner = {"env": {"sensor": {"range": 1.0}}}
+        config: dict[str, Any] = {"env": {"sensor": {"range": 1.0}}}
+        inner: Any = config
         for part in path:
             inner = inner.setdefault(part, {})
         inner[key] = value
