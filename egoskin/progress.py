@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import errno
+import os
 import sys
 import time
 from collections.abc import Mapping
+from typing import TextIO
 
 # Interval between lines in a file [s]; a terminal shows every rollout.
 _FILE_INTERVAL = 10.0
@@ -16,9 +18,15 @@ def counted(number: int, noun: str) -> str:
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
+def can_overwrite(stream: TextIO) -> bool:
+    """Return whether a stream is a terminal whose current line can be overwritten."""
+    # Terminals inside editors have no control sequences.
+    return stream.isatty() and os.environ.get("TERM") != "dumb"
+
+
 def note(text: str) -> None:
     """Print a line to stderr; on a terminal in place of an unfinished progress line."""
-    clear = "\r\x1b[K" if sys.stderr.isatty() else ""
+    clear = "\r\x1b[K" if can_overwrite(sys.stderr) else ""
     print(f"{clear}{text}", file=sys.stderr, flush=True)
 
 
@@ -39,14 +47,14 @@ def duration(seconds: float | None) -> str:
 class StatusLine:
     """One line on stderr with the progress of the work.
 
-    On a terminal the line is overwritten; in a file a line is added every 10 s.
+    On a terminal the line is overwritten; elsewhere a line is added every 10 s.
 
     Args:
         text: Description of the work, shown at once.
     """
 
     def __init__(self, text: str) -> None:
-        self._live = sys.stderr.isatty()
+        self._live = can_overwrite(sys.stderr)
         self._shown = float("-inf")
         self.show(text)
 
@@ -81,7 +89,7 @@ class ProgressLine:
         self._first, self._total = frames, total
         self._start = time.monotonic()
         self._shown = float("-inf")
-        self._live = sys.stdout.isatty()
+        self._live = can_overwrite(sys.stdout)
         self.is_unread = False
         self.metrics: Mapping[str, float] = {}
 

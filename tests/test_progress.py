@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from egoskin.progress import ProgressLine, duration
+from egoskin.progress import ProgressLine, StatusLine, duration, note
 
 METRICS = {
     "episode/success": float("nan"),
@@ -28,6 +28,24 @@ def test_durations_are_readable():
 def test_few_frames_of_many_are_not_none(capsys):
     ProgressLine(0, 65_536_000).update({**METRICS, "frames": 512})
     assert capsys.readouterr().out.startswith("       512 / 65,536,000 frames    0.0%")
+
+
+@pytest.mark.parametrize(
+    ("term", "expected"),
+    [
+        ("xterm", "\rplaying\x1b[K\r\x1b[Kdone\n"),
+        # In an editor; TERM says that it knows no control sequences.
+        ("dumb", "playing\ndone\n"),
+    ],
+)
+def test_a_terminal_without_control_sequences_gets_plain_lines(
+    term, expected, monkeypatch, capsys
+):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    monkeypatch.setenv("TERM", term)
+    StatusLine("playing")
+    note("done")
+    assert capsys.readouterr().err == expected
 
 
 def test_a_closed_pipe_is_noted(monkeypatch):

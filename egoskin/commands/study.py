@@ -26,7 +26,7 @@ from egoskin.bounds import COUNT, POSITIVE, check_bounds
 from egoskin.commands.errors import check_packages, parse_subcommand
 from egoskin.evaluation.visibility import alike, analyse, warning_texts
 from egoskin.parallel import WorkerError, available_cores
-from egoskin.progress import counted, duration
+from egoskin.progress import can_overwrite, counted, duration
 from egoskin.storage.serialization import to_plain, write_json
 from egoskin.study.claims import is_claimed, owner
 from egoskin.study.cost import WORTH_MEASURING, Speed, cost, measure_all
@@ -113,7 +113,7 @@ def fastest(manifest: Manifest, runs: Sequence[PlannedRun]) -> tuple[Speed, str]
 
 def show(text: str, stays: bool) -> None:
     """Print a line; on a terminal the next one replaces it, unless it stays."""
-    live = sys.stdout.isatty()
+    live = can_overwrite(sys.stdout)
     start, end = ("\r", "\x1b[K" + "\n" * stays) if live else ("", "\n")
     print(f"{start}{text}", end=end, flush=True)
 
@@ -299,7 +299,7 @@ class Run:
             nice=self.nice,
             show=show,
         ).run()
-        print("\r\x1b[K" * sys.stdout.isatty(), end="")
+        print("\r\x1b[K" * can_overwrite(sys.stdout), end="")
         print_status(folder, manifest, folder.status(manifest.runs))
         if any(each.state == "failed" for each in status):
             again = f"egoskin study run --dir {self.dir} --again"

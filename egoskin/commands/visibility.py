@@ -37,7 +37,7 @@ except ImportError:
 from egoskin.envs.physics import PhysicsConfig
 from egoskin.envs.throws import ThrowConfig
 from egoskin.evaluation.visibility import Analysis, alike, analyse, warning_texts
-from egoskin.progress import counted, note
+from egoskin.progress import can_overwrite, counted, note
 from egoskin.robots.own import find_robot
 from egoskin.sensors import Field, Ray, Skin
 from egoskin.sensors.config import SensorConfig, SkinConfig
@@ -104,7 +104,7 @@ def notes(skin: Skin) -> Iterator[str]:
 
 def show_progress(what: str, share: float) -> None:
     """Show the progress of the current stage, on a terminal."""
-    if sys.stdout.isatty():
+    if can_overwrite(sys.stdout):
         # The line is cleared at the end.
         text = f"{what} {share:.0%}" if share < 1 else ""
         print(f"\r{text}\x1b[K", end="", flush=True)

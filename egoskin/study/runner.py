@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from egoskin.parallel import available_cores
-from egoskin.progress import duration
+from egoskin.progress import can_overwrite, duration
 from egoskin.study.job import CLAIMED, STOPPED, command
 from egoskin.study.manifest import Manifest, PlannedRun
 from egoskin.study.store import START, RunStatus, StudyFolder, now
@@ -144,7 +144,7 @@ class Runner(ABC):
         """
         for name in ("runs", "results", "claims", "logs", "failed"):
             (self._folder.path / name).mkdir(exist_ok=True)
-        interval = _SHOW_LIVE if sys.stdout.isatty() else _SHOW_FILE
+        interval = _SHOW_LIVE if can_overwrite(sys.stdout) else _SHOW_FILE
         looked = shown = float("-inf")
         try:
             while True:

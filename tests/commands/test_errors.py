@@ -178,6 +178,7 @@ def test_on_a_terminal_an_error_takes_the_place_of_the_progress(error, monkeypat
         def isatty(self) -> bool:
             return True
 
+    monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setattr(sys, "stderr", Terminal())
     StatusLine("playing 1 episode")
     with pytest.raises(SystemExit), clear_errors():

@@ -456,6 +456,7 @@ def test_the_last_error_of_a_worker_has_its_reason(folder: StudyFolder):
 
 
 def test_a_failure_stays_on_a_terminal(monkeypatch: pytest.MonkeyPatch, capsys):
+    monkeypatch.setenv("TERM", "xterm")
     for live, text in (
         (True, "\rprogress\x1b[K\rfailed\x1b[K\n"),
         (False, "progress\nfailed\n"),

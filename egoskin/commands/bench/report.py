@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from egoskin.progress import can_overwrite
 from egoskin.storage.serialization import write_json
 
 
@@ -35,7 +36,7 @@ def median_row(
 
 def show(text: str) -> None:
     """Replace the progress line of a terminal."""
-    if sys.stderr.isatty():
+    if can_overwrite(sys.stderr):
         print(f"\r{text}\x1b[K", end="", file=sys.stderr, flush=True)
 
 
