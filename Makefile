@@ -3,6 +3,9 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 ARGS ?=
+# An environment of an older Python would remain, also with another PYTHON.
+CHECK := import sys; sys.version_info >= (3, 10) or sys.exit("Python 3.10 or newer \
+is needed, not " + sys.version.split()[0] + ": make PYTHON=python3.11 ...")
 # The policy of `make view` and `make demo`.
 POLICY ?= field_proximity
 
@@ -60,12 +63,14 @@ clean:
 	rm -rf $(VENV) docs/_build
 
 $(VENV)/run: pyproject.toml
+	@$(PYTHON) -c '$(CHECK)'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet --editable ".[view,study,export]"
 	touch $@
 
 $(VENV)/dev: pyproject.toml
+	@$(PYTHON) -c '$(CHECK)'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet --editable ".[dev]"

@@ -13,6 +13,7 @@ from pathlib import Path
 import gymnasium
 import pytest
 import torch
+from packaging.requirements import Requirement
 from setuptools.config.pyprojecttoml import read_configuration
 from tensordict import TensorDict
 
@@ -38,6 +39,30 @@ def test_the_package_lists_its_names_and_its_version():
     # The one that setuptools writes into the package.
     built = read_configuration(README.parent / "pyproject.toml")
     assert built["project"]["version"] == egoskin.__version__
+
+
+@pytest.mark.parametrize(("machine", "has"), [("x86_64", True), ("aarch64", False)])
+def test_embreex_is_required_only_where_it_has_wheels(machine, has):
+    project = read_configuration(README.parent / "pyproject.toml")["project"]
+    design = map(Requirement, project["optional-dependencies"]["design"])
+    here = {"platform_machine": machine}
+    names = [r.name for r in design if r.marker is None or r.marker.evaluate(here)]
+    assert names == ["trimesh", "rtree"] + ["embreex"] * has
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="has no make")
+def test_make_makes_no_folder_with_a_python_that_is_too_old(tmp_path):
+    shutil.copy(README.parent / "Makefile", tmp_path)
+    (tmp_path / "pyproject.toml").touch()
+    old = tmp_path / "old"
+    code = "import sys; sys.version_info = (3, 9, 18); exec(sys.argv[1])"
+    old.write_text(f"#!/bin/sh\nexec {sys.executable} -c '{code}' \"$2\"\n")
+    old.chmod(0o755)
+    command = ["make", "-C", tmp_path, f"PYTHON={old}", "train"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert done.stderr.startswith("Python 3.10 or newer is needed, not ")
+    assert not (tmp_path / ".venv").exists()
 
 
 def test_an_environment_has_the_skin_of_its_configuration_by_default():

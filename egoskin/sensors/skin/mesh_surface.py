@@ -60,7 +60,8 @@ def _trimesh() -> ModuleType:
         import trimesh
     except ImportError as error:
         raise ImportError(
-            "meshes need trimesh and embreex: pip install 'egoskin[design]'"
+            "meshes need trimesh and embreex (which has no wheel for Linux on ARM): "
+            "pip install 'egoskin[design]'"
         ) from error
     return trimesh
 
