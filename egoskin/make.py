@@ -26,7 +26,7 @@ from egoskin.envs.observations import HideObjects, Oracle, Privileged, Proprioce
 from egoskin.envs.physics import Engine, engine_of
 from egoskin.envs.standards import standard_of
 from egoskin.memory import check_memory, check_shared_memory
-from egoskin.parallel import WorkerPool, default_num_workers
+from egoskin.parallel import WorkerPool, allow_open_files, default_num_workers
 from egoskin.robots.config import RobotConfig
 from egoskin.robots.own import Robot, robot_of
 from egoskin.sensors import History, Skin
@@ -258,9 +258,11 @@ def make_env(
 
     Raises:
         ValueError: If ``num_workers`` does not divide ``num_envs``, memory is too
-            small, MuJoCo cannot build the scene, or as in `make_worker_env`.
+            small, too few files may be open, MuJoCo cannot build the scene, or as in
+            `make_worker_env`.
     """
     workers = check_num_workers(num_envs, num_workers)
+    allow_open_files(workers)
     if skin is None:
         # Built once, not in each worker.
         skin = config.skin.build(config.robot_config)

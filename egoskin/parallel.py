@@ -13,6 +13,7 @@ import atexit
 import ctypes
 import functools
 import os
+import resource
 import shutil
 import signal
 import subprocess
@@ -66,6 +67,11 @@ _GUARD = (
     "error: workers import the script that starts them, and this one would start them "
     'again: put its code into a function, called under `if __name__ == "__main__":`'
 )
+# Name of a socket in multiprocessing's folder, and the longest path of one [bytes].
+_SOCKET, _LONGEST_SOCKET = "/listener-12345678", 107
+# Files that a process with a pool has open, in total and for each worker: its pipes
+# and, while a checkpoint is made, the tensors of its state in shared memory.
+_FILES, _FILES_PER_WORKER = 128, 16
 # Exit priority at which multiprocessing removes its folder; lower runs later.
 _REMOVES_FOLDER = -100
 # Workers to kill when this process ends.
@@ -100,6 +106,26 @@ def default_num_workers(num_envs: int, cores: int | None = None) -> int:
     """
     cores = available_cores() if cores is None else cores
     return max(n for n in range(1, cores + 1) if num_envs % n == 0)
+
+
+def allow_open_files(num_workers: int) -> None:
+    """Raise this process's soft limit of open files to what its workers need.
+
+    It is often 1,024, which more than some 60 workers exceed.
+
+    Raises:
+        ValueError: If the hard limit is lower.
+    """
+    needed = _FILES + _FILES_PER_WORKER * num_workers
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft == resource.RLIM_INFINITY or needed <= soft:
+        return
+    if hard != resource.RLIM_INFINITY and needed > hard:
+        raise ValueError(
+            f"{num_workers} workers need up to {needed} open files, but the limit is "
+            f"{hard}: raise it (ulimit -n), or use fewer workers (--num-workers)"
+        )
+    resource.setrlimit(resource.RLIMIT_NOFILE, (needed, hard))
 
 
 def keep_freed_memory() -> None:
@@ -272,6 +298,7 @@ def _temporary_folder() -> str:
     removes the folder, and the semaphores that multiprocessing's tracker has left.
     """
     folder = util.get_temp_dir()
+    _check_socket_path(folder)
     # Prefix of the names of this process's semaphores in multiprocessing.
     name = Path(folder).name
     current_process()._config["semprefix"] = f"/{name}"
@@ -291,6 +318,16 @@ def _temporary_folder() -> str:
     # Runs before multiprocessing waits for the workers.
     atexit.register(_kill, _processes)
     return folder
+
+
+def _check_socket_path(folder: str) -> None:
+    """Raise ValueError if the path of a folder is too long for sockets in it."""
+    excess = len(os.fsencode(folder + _SOCKET)) - _LONGEST_SOCKET
+    if excess > 0:
+        raise ValueError(
+            f"the path of the folder for temporary files, {tempfile.gettempdir()}, is "
+            f"{excess} bytes too long for sockets: set TMPDIR to a shorter one"
+        )
 
 
 def _kill(processes: Iterable[BaseProcess]) -> None:
@@ -502,7 +539,9 @@ class WorkerPool(ParallelEnv):
             self._end()
             raise SystemExit(_GUARD)
         if code is not None and code < 0:
-            return f"was killed by {signal.Signals(-code).name}"
+            # The system does so if a machine, container or job runs out of memory.
+            hint = " (out of memory?)" * (-code == signal.SIGKILL)
+            return f"was killed by {signal.Signals(-code).name}{hint}"
         return f"ended with exit status {code}"
 
     def _fail(self, worker: int, reason: str) -> NoReturn:

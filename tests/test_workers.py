@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import ctypes
 import os
+import resource
 import signal
+import socket
 import struct
 import subprocess
 import sys
@@ -35,6 +37,7 @@ from egoskin.parallel import (
     WorkerEnv,
     WorkerError,
     WorkerPool,
+    allow_open_files,
     available_cores,
     default_num_workers,
 )
@@ -150,11 +153,63 @@ def test_a_killed_worker_is_named_with_its_signal(skin):
     os.kill(processes[1].pid, signal.SIGKILL)
     root["action"] = torch.zeros(*root.batch_size, 21)
     start = time.monotonic()
-    with pytest.raises(WorkerError, match="worker 1 of 2 was killed by SIGKILL"):
+    # The system does so when memory is short.
+    killed = r"worker 1 of 2 was killed by SIGKILL \(out of memory\?\)"
+    with pytest.raises(WorkerError, match=killed):
         pool.step_and_maybe_reset(root)
     assert time.monotonic() - start < 10
     assert not any(process.is_alive() for process in processes)
     pool.close()
+
+
+def test_a_low_soft_limit_of_open_files_is_raised_for_the_workers():
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (256, hard))
+    try:
+        allow_open_files(2)
+        assert resource.getrlimit(resource.RLIMIT_NOFILE) == (256, hard)
+        allow_open_files(16)
+        assert 256 < resource.getrlimit(resource.RLIMIT_NOFILE)[0] < 512
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+def test_more_workers_than_the_hard_limit_of_open_files_allows_are_refused(monkeypatch):
+    monkeypatch.setattr(resource, "getrlimit", lambda kind: (256, 256))
+    with pytest.raises(ValueError, match=r"16 workers need .* 256: .*ulimit -n"):
+        make_env(CONFIG, num_envs=16, seed=0, num_workers=16)
+
+
+def test_an_estimate_of_the_open_files_is_not_too_low(skin):
+    def count() -> int:
+        return len(os.listdir("/dev/fd"))
+
+    before = count()
+    pool = make_pool(skin, 4)
+    try:
+        pool.reset()
+        # Held until all have arrived.
+        states = pool._ask("simulation_state")
+        assert len(states) == 4
+        assert count() - before < workers._FILES // 2 + 4 * workers._FILES_PER_WORKER
+    finally:
+        pool.close()
+
+
+def test_a_folder_whose_sockets_would_have_too_long_paths_is_refused():
+    with tempfile.TemporaryDirectory(prefix="ego-") as parent:
+        longest = 107 - len("/listener-12345678") - len(parent) - 1
+        for excess, folder in enumerate(("a" * longest, "a" * (longest + 1))):
+            os.mkdir(path := f"{parent}/{folder}")
+            with socket.socket(socket.AF_UNIX) as server:
+                if excess:
+                    with pytest.raises(ValueError, match=r"1 bytes too long .*TMPDIR"):
+                        workers._check_socket_path(path)
+                    with pytest.raises(OSError, match="too long"):
+                        server.bind(f"{path}/listener-12345678")
+                else:
+                    workers._check_socket_path(path)
+                    server.bind(f"{path}/listener-12345678")
 
 
 def test_an_interrupted_pool_ends_its_workers(skin):
