@@ -71,7 +71,7 @@ _GUARD = (
 _SOCKET, _LONGEST_SOCKET = "/listener-12345678", 107
 # Files that a process with a pool has open, in total and for each worker: its pipes
 # and, while a checkpoint is made, the tensors of its state in shared memory.
-_FILES, _FILES_PER_WORKER = 128, 16
+_FILES, _FILES_PER_WORKER = 128, 20
 # Exit priority at which multiprocessing removes its folder; lower runs later.
 _REMOVES_FOLDER = -100
 # Workers to kill when this process ends.
