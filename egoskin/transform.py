@@ -2,7 +2,8 @@
 
 Contract: a row of the result depends only on the same row of the inputs and of the
 state. On a partial reset the environment takes only the rows that reset. On the CPU the
-others are not computed; a GPU computes all, if they have no state, because it would
+others are not computed, but keep their last values, for transforms with statistics of
+all rows (`VecNormV2`); a GPU computes all, if they have no state, because it would
 otherwise wait until the host has counted the rows.
 """
 
@@ -11,13 +12,14 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Iterable, Sequence
+from itertools import repeat
 from typing import TYPE_CHECKING
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
-from torchrl.envs import Transform
+from torchrl.envs import Compose, Transform, TransformedEnv
 
 from egoskin.rounding import pad_rows
 
@@ -65,10 +67,13 @@ class _KeyedTransform(Transform):
             in_keys=key_list("in_keys", in_keys, *self._NUM_IN),
             out_keys=key_list("out_keys", out_keys, *self._NUM_OUT),
         )
+        # Reference to the last values written in an environment.
+        self._written: Sequence[Tensor] | None = None
 
     def clone(self) -> Self:
         """Return a copy for another environment, which shares nothing that changes."""
         new = super().clone()
+        new._written = None
         for name, buffer in self.named_buffers(recurse=False):
             # Not registered again, which would add it to the state dict of both.
             setattr(new, name, buffer.clone())
@@ -140,6 +145,22 @@ class _KeyedTransform(Transform):
         for key, value in zip(self.out_keys, values, strict=True):
             tensordict.set(key, value.reshape(*batch, *value.shape[1:]))
 
+    def _write_rows(
+        self,
+        tensordict: TensorDictBase,
+        values: Sequence[Tensor],
+        rows: Tensor | None = None,
+    ) -> None:
+        """Write the values of all rows or, padded, of some; the others are the last."""
+        if rows is not None:
+            total, last = tensordict.batch_size.numel(), self._written or repeat(None)
+            values = [
+                _spread(new, rows, total, old)
+                for new, old in zip(values, last, strict=False)
+            ]
+        self._written = [value.detach() for value in values]
+        self._write(tensordict, values)
+
     def _check_one_each(self, method: str, results: object) -> None:
         """Raise TypeError unless there is one result for each out key.
 
@@ -174,6 +195,20 @@ class _KeyedTransform(Transform):
         return rows, pad_rows(rows if len(rows) else rows.new_zeros(1))
 
 
+def _after(chain: Transform, one: Transform) -> list[Transform]:
+    """Return the transforms of a chain that come after one of them."""
+    parts = _parts(chain)
+    (place,) = (i for i, part in enumerate(parts) if part is one)
+    return parts[place + 1 :]
+
+
+def _parts(chain: Transform) -> list[Transform]:
+    """Return the transforms of a chain, in order."""
+    if isinstance(chain, Compose):
+        return [part for link in chain for part in _parts(link)]
+    return [chain]
+
+
 def _on_device_of(spec: Composite, own: TensorSpec) -> TensorSpec:
     """Return a spec on the device of the spec that it becomes an entry of."""
     return own if spec.device is None else own.to(spec.device)
@@ -183,11 +218,16 @@ def _on_gpu(tensordict: TensorDictBase) -> bool:
     return tensordict.device is not None and tensordict.device.type != "cpu"
 
 
-def _spread(values: Tensor, rows: Tensor, total: int) -> Tensor:
-    """Scatter padded values of some rows ``[n, ...]`` into zeros ``[total, ...]``."""
-    full = values.new_zeros(total, *values.shape[1:])
-    full[rows] = values[: len(rows)]
-    return full
+def _spread(values: Tensor, rows: Tensor, total: int, last: Tensor | None) -> Tensor:
+    """Return padded values of some rows ``[n, ...]`` among the last of all rows.
+
+    Without last values ``[total, ...]`` of this kind, the other rows are zero.
+    """
+    shape = torch.Size((total, *values.shape[1:]))
+    kind = (shape, values.dtype, values.device)
+    if last is None or (last.shape, last.dtype, last.device) != kind:
+        last = values.new_zeros(shape)
+    return last.index_copy(0, rows, values[: len(rows)])
 
 
 class RowTransform(_KeyedTransform):
@@ -220,7 +260,7 @@ class RowTransform(_KeyedTransform):
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         inputs = self._read(next_tensordict, self.in_keys)
-        self._write(next_tensordict, self._computed(inputs))
+        self._write_rows(next_tensordict, self._computed(inputs))
         return next_tensordict
 
     def _first(self, inputs: Sequence[Tensor]) -> Sequence[Tensor]:
@@ -233,7 +273,8 @@ class RowTransform(_KeyedTransform):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the out keys into any tensordict that holds the in keys."""
-        return self._call(tensordict)
+        self._write(tensordict, self._computed(self._read(tensordict, self.in_keys)))
+        return tensordict
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
@@ -247,7 +288,7 @@ class RowTransform(_KeyedTransform):
         rows, index = partial
         inputs = self._read(tensordict_reset, self.in_keys)
         values = self._computed([x[index] for x in inputs])
-        self._write(tensordict_reset, [_spread(x, rows, total) for x in values])
+        self._write_rows(tensordict_reset, values, rows)
         return tensordict_reset
 
 
@@ -342,9 +383,9 @@ class StatefulTransform(_KeyedTransform):
         return state_spec
 
     def _check_kept(self) -> None:
-        """Raise ValueError if a later transform drops a state key.
+        """Raise ValueError if a later transform drops or changes a state key.
 
-        TorchRL would give every step the state of the last reset.
+        TorchRL would give every step the state of the last reset, or the changed state.
         """
         env = self.container
         if env is None or env.observation_spec is self._checked:
@@ -355,6 +396,14 @@ class StatefulTransform(_KeyedTransform):
                 f"a transform after {type(self).__name__} drops {dropped}, which the "
                 f"next step reads back: keep its state_keys, {self.state_keys}"
             )
+        chain = env.transform if isinstance(env, TransformedEnv) else self
+        for other in _after(chain, self):
+            if changed := [k for k in self.state_keys if k in (other.out_keys or ())]:
+                raise ValueError(
+                    f"{type(other).__name__} after {type(self).__name__} changes "
+                    f"{changed}, which the next step reads back: give it out_keys of "
+                    "its own"
+                )
         self._checked = env.observation_spec
 
     def _state_of(self, values: Sequence[Tensor]) -> list[Tensor]:
@@ -370,7 +419,7 @@ class StatefulTransform(_KeyedTransform):
         rows = torch.arange(len(inputs[0]), device=inputs[0].device)
         values = self.advance(rows, inputs, state)
         self._last = self._state_of(values)
-        self._write(next_tensordict, values)
+        self._write_rows(next_tensordict, values)
         return next_tensordict
 
     def _reset(
@@ -384,23 +433,22 @@ class StatefulTransform(_KeyedTransform):
             before = self._read(tensordict, self.state_keys)
         partial = self._rows_to_reset(tensordict, total)
         if partial is None:
-            rows = torch.arange(total, device=inputs[0].device)
-            values = self.start(rows, inputs, before)
-        else:
-            rows, index = partial
-            ended = None if before is None else [x[index] for x in before]
-            started = self.start(index, [x[index] for x in inputs], ended)
-            values = [_spread(x, rows, total) for x in started]
-        state = self._state_of(values)
-        if partial is not None and before is not None:
-            # The other rows keep their state until they are reset.
-            rows, _ = partial
-            state = [
-                old.index_copy(0, rows, new[rows])
-                for old, new in zip(before, state, strict=True)
-            ]
-        self._last = state
-        self._write(tensordict_reset, values)
+            every = torch.arange(total, device=inputs[0].device)
+            values = self.start(every, inputs, before)
+            self._last = self._state_of(values)
+            self._write_rows(tensordict_reset, values)
+            return tensordict_reset
+        rows, index = partial
+        ended = None if before is None else [x[index] for x in before]
+        values = self.start(index, [x[index] for x in inputs], ended)
+        # The other rows keep their state until they are reset.
+        self._last = [
+            _spread(new, rows, total, old)
+            for new, old in zip(
+                self._state_of(values), before or repeat(None), strict=False
+            )
+        ]
+        self._write_rows(tensordict_reset, values, rows)
         return tensordict_reset
 
     def _reset_on_native_autoreset(

@@ -305,6 +305,26 @@ def test_a_reset_computes_the_rows_that_reset_to_the_same_bits(build, full_state
 
 
 @every_transform
+def test_rows_that_do_not_reset_keep_their_last_values(build, full_state):
+    # Transforms with statistics of all rows, as VecNormV2, read them.
+    transform = build()
+    before, after = (select(full_state(64, s), transform.in_keys) for s in (0, 1))
+    last = transform._step(before, before.clone())
+    new = build()(after.clone())
+    mask = torch.arange(64) % 7 == 3
+    asked = TensorDict({"_reset": mask[:, None]}, batch_size=[64])
+    reset = transform._reset(asked, after.clone())
+    for key in transform.out_keys:
+        assert torch.equal(reset[key][mask], new[key][mask])
+        assert torch.equal(reset[key][~mask], last[key][~mask])
+    # A clone knows nothing of them, and may have another number of rows.
+    some = after[:32].clone()
+    reset = transform.clone()._reset(asked[:32], some)
+    for key in transform.out_keys:
+        assert torch.equal(reset[key][mask[:32]], new[key][:32][mask[:32]])
+
+
+@every_transform
 def test_a_reset_works_on_batches_of_workers(build, full_state):
     transform, state = build(), full_state(64)
     state = select(state, transform.in_keys).reshape(4, 16)

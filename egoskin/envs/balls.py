@@ -42,7 +42,8 @@ class Balls:
         self.thrower = thrower
         self._hz, self._num_objects = control_hz, len(objects)
         heights = [shape.half_height for shape in objects]
-        self._half_height = torch.tensor(heights, device=device)
+        number = torch.float32
+        self._half_height = torch.tensor(heights, dtype=number, device=device)
         zeros = torch.zeros(num_envs, dtype=torch.int64, device=device)
         flags = torch.zeros(num_envs, len(objects), dtype=torch.bool, device=device)
         self.state = {
@@ -55,8 +56,8 @@ class Balls:
             "is_first": flags.clone(),
             "passed": flags.clone(),
             # First ball, later balls: arrived so far, and avoided (without contact).
-            "arrived": torch.zeros(num_envs, 2, device=device),
-            "avoided": torch.zeros(num_envs, 2, device=device),
+            "arrived": torch.zeros(num_envs, 2, dtype=number, device=device),
+            "avoided": torch.zeros(num_envs, 2, dtype=number, device=device),
         }
         """All counters and flags, ``[B, ...]`` each, for saving and restoring."""
 

@@ -177,7 +177,9 @@ class DodgeballEnv(EnvBase):
             # The first reset starts episode 0.
             "episode": zeros - 1,
             "step": zeros,
-            "previous_action": torch.zeros(num_envs, len(robot.joints), device=device),
+            "previous_action": torch.zeros(
+                num_envs, len(robot.joints), dtype=torch.float32, device=device
+            ),
         }
         self.state_rows = [key for key in STATE if tactile or key.name != "tactile"]
         """Rows of `STATE` that are part of the output."""
@@ -201,8 +203,10 @@ class DodgeballEnv(EnvBase):
         on = self.device
         self.observation_spec = state_spec(self.state_rows, n, self._sizes, on)
         action = torch.Size((n, self._sizes["J"]))
-        self.action_spec = Unbounded(shape=action, device=on)
-        self.reward_spec = Unbounded(shape=torch.Size((n, 1)), device=on)
+        # Float32 whatever the default of the user's program is.
+        number, reward = torch.float32, torch.Size((n, 1))
+        self.action_spec = Unbounded(shape=action, device=on, dtype=number)
+        self.reward_spec = Unbounded(shape=reward, device=on, dtype=number)
         ends = ("done", "terminated", "truncated")
         end = Binary(shape=torch.Size((n, 1)), dtype=torch.bool, device=on)
         self.done_spec = Composite(
@@ -281,7 +285,8 @@ class DodgeballEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         counters, config = self._counters, self.config
-        action = tensordict["action"]
+        # As with other simulators, no gradient passes through a step.
+        action = tensordict["action"].detach()
         # q* = q_default + scale x action
         acting = self.randomization.delayed(action)
         target = self._default + self._action_scale * acting

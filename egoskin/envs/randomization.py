@@ -88,7 +88,9 @@ class Randomization:
         self.state: dict[str, Tensor] = {}
         """The state, ``[B, ...]`` each, for saving and restoring."""
         if most := config.delay_steps[1]:
-            late = torch.zeros(num_envs, most, num_joints, device=device)
+            late = torch.zeros(
+                num_envs, most, num_joints, dtype=torch.float32, device=device
+            )
             self.state |= {"delay": zeros.clone(), "late_actions": late}
         if config.pushes:
             self.state |= {"push": zeros.clone(), "next_push_step": zeros.clone()}

@@ -13,6 +13,7 @@ from torchrl.envs.utils import check_env_specs
 
 from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
 from egoskin.envs.physics import PhysicsConfig
+from egoskin.envs.randomization import RandomizationConfig
 from egoskin.envs.rewards import TERMS, RewardConfig, reward_terms
 from egoskin.envs.throws import ThrowConfig
 from egoskin.robots.builtin import H1_2
@@ -67,6 +68,38 @@ def throw(env: DodgeballEnv, ball: int, position, velocity=(0.0, 0, 0), rows=Non
 
 def names(flags: torch.Tensor) -> set[str]:
     return {name for name, flag in zip(H1_2.links, flags, strict=True) if flag}
+
+
+def test_no_gradient_passes_through_a_step():
+    # Nor does an action that requires gradients fail, or leave a graph behind.
+    env = make(2)
+    action = torch.zeros(2, JOINTS, requires_grad=True)
+    after, _ = advance(env, env.reset(), action)
+    assert not any(value.requires_grad for value in after.values())
+    plain = make(2)
+    same, _ = advance(plain, plain.reset())
+    assert_same(after, same)
+
+
+@pytest.mark.parametrize("target_velocity", ["zero", "finite_difference"])
+def test_all_numbers_are_float32_whatever_the_default_type_is(target_velocity):
+    options = {
+        "physics": PhysicsConfig(target_velocity=target_velocity),
+        "randomization": RandomizationConfig(delay_steps=(1, 2)),
+    }
+    actions = wild_actions(3)[:5]
+    expected = run(make(3, **options), actions)
+    try:
+        torch.set_default_dtype(torch.float64)
+        env = make(3, **options)
+        found = run(env, actions)
+        check_env_specs(env)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert {key: value.dtype for key, value in found.items(True, True)} == {
+        key: value.dtype for key, value in expected.items(True, True)
+    }
+    assert_same(found, expected)
 
 
 def test_the_environment_keeps_its_specs():

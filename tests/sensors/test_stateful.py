@@ -11,10 +11,12 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import (
+    Compose,
     EnvBase,
     ParallelEnv,
     SelectTransform,
     SerialEnv,
+    Transform,
     TransformedEnv,
 )
 from torchrl.envs.utils import check_env_specs
@@ -433,6 +435,46 @@ def test_a_later_transform_that_drops_the_state_is_refused(build):
     env = make(build, 3)
     env.append_transform(SelectTransform("joint_vel", *kept))
     env.rollout(3)
+
+
+class Seen(Transform):
+    """Claims to write its out keys; keeps what it is given at a reset."""
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        self.last = tensordict_reset.clone()
+        return tensordict_reset
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return next_tensordict
+
+
+@every_transform
+def test_a_later_transform_that_changes_the_state_is_refused(build):
+    env = make(build, 3)
+    state = build().state_keys[0]
+    env.append_transform(Compose(Seen([state], [state])))
+    text = rf"Seen after \w+ changes \['{state}'\], which the next step reads back"
+    with pytest.raises(ValueError, match=text):
+        env.rollout(3)
+    env = make(build, 3)
+    env.append_transform(Compose(Seen([state], [])))
+    env.rollout(3)
+
+
+@every_transform
+def test_rows_that_do_not_reset_keep_their_last_values(build):
+    env = make(build, 3)
+    root = env.reset()
+    for _ in range(2):
+        root["action"] = torch.zeros(3, 1)
+        root = env.step_mdp(env.step(root))
+    seen = Seen([], [])
+    env.append_transform(seen)
+    root["_reset"] = torch.tensor([[True], [False], [False]])
+    env.reset(root.clone())
+    assert_same_bits([seen.last[1:]], [root[1:]], build().out_keys)
 
 
 @every_transform

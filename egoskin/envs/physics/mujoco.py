@@ -58,7 +58,7 @@ class MujocoPhysics(Physics):
         num_joints = len(robot.joints)
         kp, kd = robot.joint_gains(config.gains)
         self._kd_over_kp = torch.from_numpy(kd / kp).float()
-        self._last_target = torch.zeros(num_envs, num_joints)
+        self._last_target = torch.zeros(num_envs, num_joints, dtype=torch.float32)
         joints = slice(7, 7 + num_joints)
         self._robot_q, self._object_q = slice(0, joints.stop), slice(joints.stop, None)
         self._robot_v = slice(0, joints.stop - 1)
