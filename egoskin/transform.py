@@ -197,9 +197,10 @@ class _KeyedTransform(Transform):
 
 def _after(chain: Transform, one: Transform) -> list[Transform]:
     """Return the transforms of a chain that come after one of them."""
-    parts = _parts(chain)
-    (place,) = (i for i, part in enumerate(parts) if part is one)
-    return parts[place + 1 :]
+    parts = iter(_parts(chain))
+    # Consumes the iterator up to that one; all of it if a wrapper hides that one.
+    any(part is one for part in parts)
+    return list(parts)
 
 
 def _parts(chain: Transform) -> list[Transform]:
