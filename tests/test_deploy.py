@@ -29,7 +29,8 @@ from egoskin.evaluation.throw_set import standard_task, throw_seed
 from egoskin.make import EnvConfig, make_worker_env
 from egoskin.policies.export import export_onnx, metadata
 from egoskin.policies.policy import Policy
-from egoskin.sensors import Field
+from egoskin.robots.builtin import H1_2
+from egoskin.sensors import Field, Ray, place_sensors
 from egoskin.sensors.config import SensorConfig, SkinConfig
 from egoskin.sensors.pipeline import READINGS
 from making import make_policy
@@ -93,6 +94,42 @@ def test_from_raw_states_and_distances_come_our_environments_targets(kind, tmp_p
         np.testing.assert_allclose(target, expected, 1e-4, 1e-4)
     if kind != "blind":
         assert rollout["distance"].isfinite().any()
+
+
+def test_sensors_of_two_kinds_are_in_the_order_of_the_skin(tmp_path):
+    # Alternating, each with a range of its own.
+    kinds = (Ray(grid=(2, 3), fov_deg=150.0), Field()) * 6
+    skin = replace(
+        place_sensors(H1_2, 12, seed=0),
+        coverage=kinds,
+        range=np.linspace(1.0, 5.0, 12),
+    )
+    skin.save(tmp_path / "skin.json")
+    config = EnvConfig(task=TASK, skin=SkinConfig(path=tmp_path / "skin.json"))
+    policy = make_policy(config)
+    free = {"margin": np.inf, "max_change": np.inf}
+    controller = deploy(policy, tmp_path, **free)
+    env = make_worker_env(config, policy.skin, num_envs=1, seed=1, keep_raw=True)
+    with torch.no_grad():
+        rollout = env.rollout(30, policy)[0]
+    rays, fields = rollout["distance_0"], rollout["distance_1"]
+    assert rays.isfinite().any()
+    assert fields.isfinite().any()
+    distances = torch.cat((rays.flatten(2), fields[..., None]), -1).flatten(1)
+    scale = np.array(controller.metadata["action_scale"])
+    default = np.array(controller.metadata["default_joint_pos"])
+    for td, distance in zip(rollout.unbind(0), distances.numpy(), strict=True):
+        target = controller.step(
+            base_quat=td["base_pose"][3:].numpy(),
+            base_ang_vel_b=td["base_ang_vel_b"].numpy(),
+            joint_pos=td["joint_pos"].numpy(),
+            joint_vel=td["joint_vel"].numpy(),
+            body_age=0.0,
+            distance=distance,
+        )
+        expected = default + scale * td["action"].numpy()
+        np.testing.assert_allclose(target, expected, 1e-4, 1e-4)
+    assert controller.stopped is None
 
 
 def test_every_signal_of_distances_is_compared():

@@ -108,10 +108,12 @@ def test_an_action_of_another_shape_is_refused():
         env.close()
 
 
-def test_actions_are_bounded_where_more_asks_for_no_more_torque(robot):
-    env = gymnasium.make(ENV_ID)
-    kp, _ = robot.joint_gains("rotor_inertia")
-    scale = 0.3 * robot.torque_limit / kp
+@pytest.mark.parametrize(("gains", "scale"), [("rotor_inertia", 0.3), ("real", 0.2)])
+def test_actions_are_bounded_where_more_asks_for_no_more_torque(gains, scale, robot):
+    task = {"action_scale": scale, "physics": {"gains": gains}}
+    env = gymnasium.make(ENV_ID, task=task)
+    kp, _ = robot.joint_gains(gains)
+    scale = scale * robot.torque_limit / kp
     for bound, end, sign in (("low", 0, 1), ("high", 1, -1)):
         target = robot.default_joint_pos + scale * getattr(env.action_space, bound)
         # At the end of its range, the joint is asked for its full torque.

@@ -100,6 +100,20 @@ def test_row_episode_counter_and_block_are_the_words_of_the_counter(
     assert (got[0].double() * 2**24).tolist() == expected
 
 
+def test_the_number_of_a_stream_never_changes():
+    # It is a word of the key: with another number, stored throw sets and resumed runs
+    # would draw others.
+    assert {stream.name: int(stream) for stream in Stream} == {
+        "START": 0,
+        "THROW": 1,
+        "SENSOR": 2,
+        "FIRST_DELAY": 3,
+        "ROBOT": 4,
+        "DELAY": 5,
+        "PUSH": 6,
+    }
+
+
 @given(st.lists(st.integers(0, 10**6), min_size=1, max_size=20), st.randoms())
 def test_draws_do_not_depend_on_batch_or_order(rows, random):
     shuffled = list(rows)

@@ -310,6 +310,18 @@ def test_the_workers_of_an_evaluation_are_those_of_all_its_parts(
     assert used == [(2, 2)]
 
 
+def test_the_throw_set_of_an_evaluation_is_that_asked_for(monkeypatch):
+    given = {}
+
+    def noted(*args, **options):
+        given.update(options)
+        raise SystemExit
+
+    monkeypatch.setattr(command, "evaluate", noted)
+    call("evaluate", "field_proximity", "--throw-set", "5", "--episodes", "8")
+    assert (given["throw_set"], given["episodes"]) == (5, 8)
+
+
 def test_a_table_names_the_ages_of_the_task():
     share = Estimate(mean=0.5, low=0.4, high=0.6)
     result = Evaluation(
@@ -352,6 +364,21 @@ def test_an_upper_bound_counts_what_policy_and_search_avoid(tmp_path: Path):
     assert 0 < avoided <= sum(row["search_avoids"] for row in rows)
     bad = fail("upper-bound", "field_proximity", "--reach", "0")
     assert "reach must be positive" in bad
+
+
+def test_the_options_of_an_upper_bound_reach_the_search(monkeypatch):
+    given = {}
+
+    def noted(policy, config, search, **options):
+        given.update(options, seed=search.seed)
+        raise SystemExit
+
+    monkeypatch.setattr("egoskin.commands.upper_bound.find_upper_bound", noted)
+    args = ("--throw-set", "3", "--throws", "5", "--ball", "2", "--reach", "0.5")
+    call("upper-bound", "field_proximity", *args, "--search.seed", "7")
+    del given["on_iteration"]
+    expected = {"throw_set": 3, "throws": 5, "ball": 2, "reach": 0.5, "seed": 7}
+    assert given == expected
 
 
 def test_all_throws_include_those_aimed_above_the_last_group():

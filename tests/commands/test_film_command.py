@@ -5,17 +5,23 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from PIL import Image
 
-from calling import SCRIPTS, call, fail
+from calling import SCRIPTS, call, fail, succeed
 from egoskin.envs.throws import Thrower
-from egoskin.evaluation.throw_set import play_throws, throw_seed
+from egoskin.evaluation.throw_set import play_throws, standard_task, throw_seed
 from egoskin.make import EnvConfig
+from egoskin.policies.policy import Policy, load_policy
 from egoskin.sensors import Skin
+from egoskin.viewer.film import Frame
+from egoskin.viewer.offscreen import CameraConfig
+from egoskin.viewer.recording import Recording
 
 
 def film(*args: str) -> str:
@@ -35,6 +41,65 @@ def test_it_writes_a_film_and_a_sheet(tmp_path: Path):
         assert made.size == (160, 90)
         assert sheet.width > sheet.height
     assert {p.name for p in tmp_path.iterdir()} == {"a.gif", "a.png"}
+
+
+def test_the_options_of_a_film_reach_its_parts(tmp_path: Path, monkeypatch):
+    given = {}
+    frames = [
+        Frame(
+            image=np.full((90, 160, 3), value, np.uint8),
+            time=0.0,
+            gap=np.inf,
+            num_detecting=0,
+            num_sensors=64,
+            num_avoided=0,
+            ending="cut",
+        )
+        for value in (50, 150)
+    ]
+
+    def paint(config, skin, **options):
+        given.update(options)
+        return nullcontext()
+
+    def record(config, skin, policy, **options):
+        given.update(options, config=config, policy=policy)
+        return Recording(row=7, states=[], ending=None)
+
+    def render(painter, config, skin, recording, **options):
+        given.update(options)
+        return frames
+
+    for name, part in (
+        ("painter_of", paint),
+        ("record_longest", record),
+        ("render_recording", render),
+    ):
+        monkeypatch.setattr(f"egoskin.commands.film.{name}", part)
+    out = tmp_path / "a.gif"
+    args = ["field_proximity", "--out", out, "--standard", "1", "--throw-set", "3"]
+    args += ["--episode", "2", "--longest-of", "5", "--hold", "--seconds", "0.5"]
+    args += ["--fps", "20", "--slowdown", "4", "--size", "160", "90"]
+    told = succeed("film", *args, "--camera.azimuth-deg", "120")
+    assert told.startswith("episode 7 of throw set 3: 0.00 s, 0 balls avoided, ends ")
+    policy = given.pop("policy")
+    assert isinstance(policy, Policy)
+    expected = standard_task(load_policy("field_proximity").env_config, "1")
+    assert given.pop("config") == expected
+    del given["on_step"], given["on_picture"]
+    assert given == {
+        "throw_set": 3,
+        "first": 2,
+        "episodes": 5,
+        "hold": True,
+        "max_seconds": 0.5,
+        "fps": 20.0,
+        "size": (160, 90),
+        "camera": CameraConfig(azimuth_deg=120.0),
+    }
+    with Image.open(out) as made:
+        # 20 / 4 pictures a second [ms].
+        assert made.info["duration"] == 200
 
 
 @pytest.mark.slow

@@ -68,6 +68,8 @@ def test_a_model_alone_cannot_be_trained(tmp_path: Path):
 def test_a_joint_without_a_range_and_a_weak_one_are_notes(tmp_path):
     model = MODEL.replace(' range="-1.5 1.5"', "")
     toml = TOML.replace("kp = 20, kd", "kp = 500, kd")
-    out = succeed("robot", "check", write_robot(tmp_path / "walker", toml, model))
+    folder = write_robot(tmp_path / "walker", toml, model)
+    out = succeed("robot", "check", folder, "--skin.num-sensors", "5")
+    assert "skin: 5 sensors on" in out
     assert "no range: left_shoulder, right_shoulder, left_hip" in out
     assert "by less than 0.1 rad: left_shoulder, right_shoulder;" in out

@@ -11,7 +11,7 @@ from PIL import Image
 
 from calling import call, fail, succeed
 from egoskin.robots.builtin import H1_2
-from egoskin.sensors import Field, Ray, Skin
+from egoskin.sensors import Field, Ray, Skin, place_sensors
 
 TABLE = """Index,X,Y,Z,NormX,NormY,NormZ,Radius,Parent,Object Name in Blender
 0,0.093,0.02,0.2,1.0,0.0,0.0,0.004,/bot/torso_link/visuals,visuals.004
@@ -35,6 +35,8 @@ def test_a_placed_skin_is_a_file_that_training_reads():
     skin = Skin.load(Path("skin.json"))
     assert len(skin) == 20
     skin.check_links(H1_2.links)
+    expected = place_sensors(H1_2, 20, seed=3)
+    np.testing.assert_array_equal(skin.position, expected.position)
     assert "skin.json: 20 sensors" in out
     run("place", "--num-sensors", "20", "--seed", "3", "--out", "again.json")
     assert Path("again.json").read_bytes() == Path("skin.json").read_bytes()

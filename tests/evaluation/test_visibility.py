@@ -538,6 +538,28 @@ def test_the_command_has_the_body_in_the_way_if_asked(monkeypatch):
     assert asked == [[False, False], [True, True]]
 
 
+def test_the_options_of_the_command_reach_the_analysis(monkeypatch):
+    pytest.importorskip("matplotlib")
+    given = {}
+
+    def analyse(robot, skin, sensors, ranges, throws, **options):
+        given.update(options, robot=robot.name, number=len(skin), throws=throws)
+        given.update(sensors=sensors, ranges=ranges)
+        raise SystemExit
+
+    monkeypatch.setattr("egoskin.commands.visibility.analyse", analyse)
+    args = ["--robot", "g1", "--skin.num-sensors", "9", "--coverages", "ray"]
+    args += ["--ray.grid", "2", "3", "--ranges", "0.4", "0.2"]
+    args += ["--throws.radius", "0.1", "--num-throws", "7", "--seed", "5"]
+    call("visibility", *args)
+    assert (given["robot"], given["number"]) == ("g1", 9)
+    ray = Ray(grid=(2, 3))
+    assert given["sensors"] == {"ray": SensorConfig(coverage="ray", ray=ray)}
+    assert given["ranges"] == [0.2, 0.4]
+    assert given["throws"] == ThrowConfig(radius=0.1)
+    assert (given["num_throws"], given["seed"]) == (7, 5)
+
+
 @pytest.mark.parametrize(
     ("own", "without_effect"),
     [

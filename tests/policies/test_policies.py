@@ -330,6 +330,13 @@ def test_claims_of_a_header_take_no_memory(changes, tmp_path):
         egoskin.load_policy(path)
 
 
+def test_a_policy_says_by_which_engine_it_was_trained(tmp_path):
+    save_changed(tmp_path / "warp.safetensors", {"engine": "warp"})
+    assert (
+        egoskin.load_policy(tmp_path / "warp.safetensors").policy_spec.engine == "warp"
+    )
+
+
 def test_sizes_that_the_tensors_do_not_have_are_refused(tmp_path):
     path = tmp_path / "other.safetensors"
     save_changed(path, {"num_actions": 22})

@@ -8,6 +8,8 @@ import mujoco
 import numpy as np
 import pytest
 
+from egoskin.robots.builtin import H1_2
+
 MODEL = Path(__file__).parents[2] / "egoskin" / "assets" / "h1_2.xml"
 
 LEG = ("hip_yaw", "hip_pitch", "hip_roll", "knee", "ankle_pitch", "ankle_roll")
@@ -91,6 +93,35 @@ def test_joint_has_unitrees_figures(model, joint, axis, limits, torque, armature
     np.testing.assert_array_equal(model.jnt_actfrcrange[j.id], (-torque, torque))
     assert model.jnt_actfrclimited[j.id]
     assert model.dof_armature[j.dofadr[0]] == armature
+
+
+def test_rotor_gains_follow_from_the_armature(model):
+    """kp = I w^2, kd = 2 zeta I w at 10 Hz and damping ratio 2, to one decimal."""
+    kp, kd = H1_2.joint_gains("rotor_inertia")
+    inertia, w = model.dof_armature[6:], 2 * np.pi * 10
+    np.testing.assert_allclose(kp, inertia * w**2, rtol=5e-3)
+    np.testing.assert_allclose(kd, 4 * inertia * w, rtol=0, atol=0.05)
+    assert H1_2.joint_gains(None)[0].tolist() == kp.tolist()
+
+
+@pytest.mark.parametrize(
+    ("joint", "kp", "kd", "position"),
+    [
+        ("left_hip_yaw_joint", 200, 2.5, 0.0),
+        ("right_hip_pitch_joint", 200, 2.5, -0.16),
+        ("left_knee_joint", 300, 4, 0.36),
+        ("right_ankle_pitch_joint", 40, 2, -0.2),
+        ("left_ankle_roll_joint", 40, 2, 0.0),
+        ("torso_joint", 300, 3, 0.0),
+        ("right_shoulder_pitch_joint", 120, 2, 0.4),
+        ("left_shoulder_yaw_joint", 120, 2, 0.0),
+        ("right_elbow_joint", 80, 1, 0.3),
+    ],
+)
+def test_real_gains_and_the_stance_are_unitrees(joint, kp, kd, position):
+    index = H1_2.joints.index(joint)
+    assert [gain[index] for gain in H1_2.joint_gains("real")] == [kp, kd]
+    assert H1_2.default_joint_pos[index] == position
 
 
 def test_joints_have_neither_damping_nor_friction_loss(model):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import resource
 import subprocess
 import sys
@@ -78,6 +79,16 @@ def test_the_seed_draws_the_networks_and_the_episodes(tmp_path):
     assert not all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
     assert torch.equal(start, same_start)
     assert not torch.isclose(start, other_start).all(-1).any()
+
+
+def test_a_run_without_a_folder_is_named_after_time_sensor_and_seed(
+    tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    config = replace(blind_run(tmp_path / "run", 64), run_dir=None, seed=3)
+    path = Run.create(config).path
+    assert re.fullmatch(r"runs/\d{8}-\d{6}-blind-seed3", str(path))
+    assert (tmp_path / path / "config.json").is_file()
 
 
 def test_one_process_trains_a_run_at_a_time(config: TrainConfig):
@@ -260,6 +271,8 @@ def test_a_film_has_no_more_frames_than_the_run_has_steps(
     (command,) = commands
     assert float(command[command.index("--fps") + 1]) == fps
     assert command[command.index("--size") + 1 :][:3] == ["480", "270", "--longest-of"]
+    # The throws are those of the training.
+    assert command[command.index("--standard") + 1] == "run"
 
 
 def test_a_long_log_does_not_slow_its_next_line(config: TrainConfig, tmp_path: Path):

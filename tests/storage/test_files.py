@@ -5,11 +5,17 @@ from __future__ import annotations
 import errno
 import os
 import socket
+import stat
 from pathlib import Path
 
 import pytest
 
-from egoskin.storage.files import check_regular, read_regular, write_output
+from egoskin.storage.files import (
+    check_regular,
+    read_regular,
+    write_file,
+    write_output,
+)
 
 
 def test_a_file_is_read_whole_and_through_a_link(tmp_path: Path):
@@ -91,6 +97,21 @@ def test_an_output_that_cannot_be_written_leaves_the_old_file(
         write_output(path, b"new")
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_content_and_name_of_a_file_are_on_disk_once_it_is_written(
+    tmp_path: Path, monkeypatch
+):
+    path, synced = tmp_path / "a.json", []
+
+    def note(descriptor: int) -> None:
+        is_folder = stat.S_ISDIR(os.fstat(descriptor).st_mode)
+        synced.append(("folder" if is_folder else "content", path.exists()))
+
+    monkeypatch.setattr(os, "fsync", note)
+    write_file(path, b"content")
+    # After a power failure, a name in the folder leads to the whole content.
+    assert synced == [("content", False), ("folder", True)]
 
 
 def test_an_output_is_written_through_a_link_and_into_a_pipe(tmp_path: Path):

@@ -13,9 +13,10 @@ from tensordict import TensorDict
 
 from egoskin.evaluation.throw_set import play_throws, throw_seed
 from egoskin.make import EnvConfig, make_worker_env
+from egoskin.robots.builtin import H1_2
 from egoskin.robots.config import RobotConfig
 from egoskin.robots.portable import portable
-from egoskin.sensors import Skin
+from egoskin.sensors import Skin, place_sensors
 from egoskin.sensors.config import SensorConfig
 from egoskin.shapes import Sphere
 from egoskin.viewer.film import Frame
@@ -152,6 +153,21 @@ def test_the_gap_is_from_surface_to_surface(painter: Painter, standing: TensorDi
     assert far - near == pytest.approx(1.0, abs=0.02)
 
 
+@pytest.mark.usefixtures("painter")
+def test_the_camera_looks_down_from_where_it_is_placed(standing: TensorDict):
+    camera = CameraConfig(distance=3.0, azimuth_deg=-60.0)
+    # A ball halfway to the camera, at the height that it looks at.
+    state = place_ball(standing, 0.75, -1.3, 1.0)
+    with painter_of(EnvConfig(), place_sensors(H1_2, 1), camera=camera) as painter:
+        red, _, blue = channels(painter.draw(state, time=0.0))
+    rows, columns = np.nonzero(red - blue > 60)
+    assert columns.mean() == pytest.approx(480, abs=20)
+    # 3 m away and 10 degrees up: 0.52 m above the ball and 1.45 m from it, which is
+    # 19.7 degrees down; the middle of the picture is 10 degrees down. 540 pixels show
+    # 45 degrees: 270 + 270 tan(9.7) / tan(22.5) = 381.
+    assert rows.mean() == pytest.approx(381, abs=20)
+
+
 def test_the_camera_follows_the_base(painter: Painter, standing: TensorDict):
     moved = standing.clone()
     moved["base_pose"][:2] = torch.tensor([30.0, 40.0])
@@ -192,6 +208,18 @@ def test_an_episode_shows_lines_only_in_range(
     assert all((f.num_detecting == 64) == shows for f in frames)
     assert all((count_blue(f) > 0) == shows for f in frames)
     assert [f.ending for f in frames] == [None] * 6 + ["cut"]
+
+
+def test_pictures_tell_how_many_balls_were_avoided(
+    painter: Painter, standing: TensorDict, skin: Skin
+):
+    standing["distance"] = torch.full((64,), torch.inf)
+    later = standing.clone()
+    later["balls_avoided"] = torch.tensor([2.0, 1.0])
+    states = [standing, later]
+    recording = Recording(row=0, states=[*states], ending=None)
+    frames = render_recording(painter, EnvConfig(), skin, recording, fps=60)
+    assert [frame.num_avoided for frame in frames] == [0, 3]
 
 
 @pytest.mark.parametrize(

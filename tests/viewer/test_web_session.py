@@ -173,6 +173,34 @@ def test_an_episode_ends_and_the_next_begins_alike(session: Session):
     assert (again.step, again.survived, again.ending) == (0, 0.0, None)
 
 
+def test_survival_is_the_time_since_the_first_throw(session: Session):
+    session.reset()
+    assert play(session, 10)[-1].survived == 0
+    session.throw(Throw(speed=1.0, azimuth=0.0, distance=8.0))
+    play(session, 15)
+    session.throw(Throw(speed=1.0, azimuth=0.0, distance=8.0))
+    # 30 steps at 60 Hz.
+    assert play(session, 15)[-1].survived == pytest.approx(0.5)
+
+
+def test_a_line_is_as_long_as_the_distance_that_its_sensor_measures(session: Session):
+    session.reset()
+    # Of two balls, one far behind and one near in front.
+    session.throw(Throw(speed=1.0, azimuth=math.pi, distance=8.0))
+    session.step()
+    session.throw(Throw(speed=1.0, azimuth=0.0, distance=1.8, height=1.0))
+    frame = play(session, 5)[-1]
+    assert frame.active.all()
+    assert session.skin is not None
+    session.body.place(frame.qpos)
+    points = session.body.sensor_points(session.skin)
+    length = np.linalg.norm(frame.line - points, axis=-1)
+    seen = frame.reading > 0
+    assert seen.any()
+    # Of a range of 2 m; the reading is 1 at contact.
+    np.testing.assert_allclose(length[seen], 2 * (1 - frame.reading[seen]), atol=1e-4)
+
+
 def test_a_binary_sensor_without_limit_detects_only_what_is_there(session: Session):
     own = session.config.sensor
     sensor = session.readable(signal="binary", range=math.inf)
