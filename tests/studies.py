@@ -12,8 +12,8 @@ from pathlib import Path
 import egoskin
 from egoskin.runs.run import Run
 from egoskin.storage.formats import content_hash, read_sealed, sealed_json
+from egoskin.study.folder import StudyFolder, policy_hash
 from egoskin.study.manifest import Manifest, PlannedRun
-from egoskin.study.store import StudyFolder, policy_hash
 from egoskin.study.stored import Record, to_json
 
 POLICY = Path(egoskin.__file__).parent / "assets/policies/blind.safetensors"

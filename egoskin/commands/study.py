@@ -31,10 +31,10 @@ from egoskin.storage.serialization import to_plain, write_json
 from egoskin.study.claims import is_claimed, owner
 from egoskin.study.cost import WORTH_MEASURING, Speed, cost, measure_all
 from egoskin.study.fields import settings
+from egoskin.study.folder import RunStatus, StudyFolder
 from egoskin.study.manifest import Manifest, PlannedRun, load_study, resolve
 from egoskin.study.runner import LocalRunner, Progress, Runner, slurm_script
 from egoskin.study.shipped import STUDIES
-from egoskin.study.store import RunStatus, StudyFolder
 
 # Cores of a common server.
 _MANY_CORES = 64
@@ -68,10 +68,10 @@ def requested(name: str | None, folder: Path | None) -> Manifest:
             raise ValueError("a study or the --dir of an existing one is required")
         return find_study(name)
     check_folder(folder, "--dir")
-    store = StudyFolder(folder)
+    study = StudyFolder(folder)
     if name is None:
-        return store.manifest()
-    return store.extended(find_study(name))
+        return study.manifest()
+    return study.extended(find_study(name))
 
 
 def find_study(name: str) -> Manifest:

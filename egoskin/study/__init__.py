@@ -4,7 +4,7 @@
 * `manifest`: definition of a study: cells, seeds, budget, evaluation
 * `shipped`: the studies that come with the package
 * `cost`: estimate of a study's cost
-* `store`: the study folder: state and result of each run
+* `folder`: the study folder: state and result of each run
 * `stored`: the files of a finished run
 * `claims`: locks, so that only one process works on a run, on one host or many
 * `evaluation`: a policy on the study's throw set

@@ -15,10 +15,10 @@ from matplotlib.figure import Figure
 
 from egoskin.storage.files import write_figure
 from egoskin.study.findings import MARGIN, SAME, Judged
+from egoskin.study.folder import Result
 from egoskin.study.manifest import Manifest
 from egoskin.study.metrics import frames_to, has_learnt
 from egoskin.study.statistics import Effect, Table, contrast, spread
-from egoskin.study.store import Result
 
 # Colours of Okabe and Ito, which are colour-blind safe, and markers.
 _STYLES = {

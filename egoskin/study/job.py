@@ -26,7 +26,7 @@ from egoskin.runs.run import RunLockedError
 from egoskin.runs.trainer import open_trainer, train
 from egoskin.study.claims import claimed
 from egoskin.study.evaluation import evaluate_policy
-from egoskin.study.store import StudyFolder, now
+from egoskin.study.folder import StudyFolder, now
 
 FAILED = 1
 """Exit status after an error, which has been written to stderr."""

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from egoskin.study.folder import Result
 from egoskin.study.manifest import Manifest
 from egoskin.study.statistics import Table
-from egoskin.study.store import Result
 
 # Final success is the mean of the learning curve over this last share of the frames;
 # below this final success, a run has not learnt.

@@ -20,6 +20,7 @@ import ray  # pyright: ignore[reportMissingImports]
 from ray.exceptions import RayError  # pyright: ignore[reportMissingImports]
 
 from egoskin.parallel import own_settings
+from egoskin.study.folder import StudyFolder
 from egoskin.study.job import FAILED
 from egoskin.study.manifest import PlannedRun
 from egoskin.study.runner import (
@@ -29,7 +30,6 @@ from egoskin.study.runner import (
     how_it_ended,
     start_job,
 )
-from egoskin.study.store import StudyFolder
 
 # Timeout for connecting to the address of a cluster [s].
 _CONNECT_S = 10.0

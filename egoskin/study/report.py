@@ -30,6 +30,7 @@ from egoskin.study.figures import (
     success_by_range,
 )
 from egoskin.study.findings import CELLS, Judged, Tested, judge_findings
+from egoskin.study.folder import Result, StudyFolder
 from egoskin.study.manifest import Manifest
 from egoskin.study.metrics import METRICS, runs_csv, tables
 from egoskin.study.page import page, table
@@ -41,7 +42,6 @@ from egoskin.study.statistics import (
     separation,
     spread,
 )
-from egoskin.study.store import Result, StudyFolder
 
 # The budget is the same for all runs: the share of it adds nothing to the frames.
 _SHOWN = [m for m in METRICS if m.name != "share_to_90"]

@@ -22,9 +22,9 @@ from typing import Any
 
 from egoskin.parallel import available_cores
 from egoskin.progress import can_overwrite, duration
+from egoskin.study.folder import START, RunStatus, StudyFolder, now
 from egoskin.study.job import CLAIMED, STOPPED, command
 from egoskin.study.manifest import Manifest, PlannedRun
-from egoskin.study.store import START, RunStatus, StudyFolder, now
 
 # Intervals at which processes are polled, and at which the folder, which may be on a
 # shared file system, is searched for runs to do if no process has ended [s].

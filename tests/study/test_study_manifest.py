@@ -16,6 +16,7 @@ from egoskin.runs.config import INIT_HASH, SKIN_HASH, TrainConfig
 from egoskin.storage.formats import content_hash, read_sealed, sealed_json
 from egoskin.storage.serialization import to_plain
 from egoskin.study.findings import CELLS, FINDINGS
+from egoskin.study.folder import StudyFolder
 from egoskin.study.manifest import (
     EvaluationPlan,
     Manifest,
@@ -25,7 +26,6 @@ from egoskin.study.manifest import (
 )
 from egoskin.study.metrics import METRICS
 from egoskin.study.shipped import PAPER, SMOKE, STUDIES
-from egoskin.study.store import StudyFolder
 from owning import TOML, write_robot
 from studies import POLICY, as_format_1
 

@@ -23,9 +23,9 @@ from test_study_runner import (
 from calling import wait_for
 from egoskin.runs.run import Run
 from egoskin.study.claims import is_locked
+from egoskin.study.folder import StudyFolder
 from egoskin.study.manifest import Manifest, resolve
 from egoskin.study.runner import STOP_TIMEOUT_S
-from egoskin.study.store import StudyFolder
 
 ray = pytest.importorskip("ray", reason="extra ray")
 pytestmark = [

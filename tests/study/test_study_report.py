@@ -31,12 +31,12 @@ from egoskin.study.figures import (
     success_by_range,
 )
 from egoskin.study.findings import judge_findings
+from egoskin.study.folder import StudyFolder
 from egoskin.study.manifest import Manifest, resolve
 from egoskin.study.metrics import METRICS, frames_to, runs_csv, tables
 from egoskin.study.page import page, table
 from egoskin.study.report import _difference_rows, write_report
 from egoskin.study.shipped import FINDINGS, SMOKE
-from egoskin.study.store import StudyFolder
 from studies import expected, store, store_all
 
 FIGURES = (

@@ -32,9 +32,11 @@ from egoskin.storage.formats import read_sealed, sealed_json
 from egoskin.storage.serialization import to_plain
 from egoskin.storage.tensor_file import load_tensors, save_tensors
 from egoskin.study import cost as cost_module
-from egoskin.study import evaluation, job, store
+from egoskin.study import evaluation, job
+from egoskin.study import folder as study_folder
 from egoskin.study.claims import claimed
 from egoskin.study.cost import Cost, Speed, cost, measure, measure_all
+from egoskin.study.folder import Failure, RunStatus, StudyFolder, policy_hash
 from egoskin.study.job import CLAIMED, STOPPED, Stop, work
 from egoskin.study.manifest import EvaluationPlan, Manifest, PlannedRun, Study, resolve
 from egoskin.study.metrics import runs_csv
@@ -45,7 +47,6 @@ from egoskin.study.runner import (
     how_it_ended,
     slurm_script,
 )
-from egoskin.study.store import Failure, RunStatus, StudyFolder, policy_hash
 from making import make_policy
 
 # 16 agents x 16 steps are 256 frames a rollout.
@@ -336,7 +337,7 @@ def test_a_link_to_a_run_that_cannot_be_read_is_removed(
     def fail(path: Path) -> None:
         raise OSError(f"the disk of {path} is gone")
 
-    monkeypatch.setattr(store, "read_json", fail)
+    monkeypatch.setattr(study_folder, "read_json", fail)
     with pytest.raises(OSError, match="is gone"):
         folder.adopt(folder.manifest(), made)
     assert not os.path.lexists(folder.run_path(NAME))

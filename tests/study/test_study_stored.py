@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from egoskin.runs.run import Run, TrainConfig
-from egoskin.study.store import StudyFolder
+from egoskin.study.folder import StudyFolder
 from egoskin.study.stored import load_run, record, thin
 
 STUDIES = Path(__file__).parents[2] / "studies"
