@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 import math
 import pickle
 from collections.abc import Iterator
@@ -14,13 +15,14 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
-from torchrl.collectors import Collector
+from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.envs import TransformedEnv
 from torchrl.modules import AdditiveGaussianModule, SafeSequential
 
 import egoskin
 from egoskin.agents.networks import NetworkConfig
 from egoskin.evaluation.throw_set import evaluate, standard_task
+from egoskin.parallel import WorkerPool
 from egoskin.policies.policy import Policy, PolicySpec, shipped_policies
 from egoskin.sensors import MASK_ALL
 from egoskin.sensors.config import SensorConfig
@@ -214,6 +216,34 @@ def test_torchrls_rollouts_and_collectors_run_a_policy(form):
     for batch in batches:
         given = batch.select(*policy.in_keys)
         torch.testing.assert_close(policy(given)["action"], batch["action"])
+
+
+def make_pool(seed: int) -> WorkerPool:
+    config = egoskin.EnvConfig()
+    return egoskin.make_env(config, num_envs=4, seed=seed, num_workers=2)
+
+
+@pytest.mark.slow
+def test_torchrls_collectors_of_several_processes_run_pools_of_workers(policy):
+    seeds = (0, 1)
+    collector = MultiSyncCollector(
+        [functools.partial(make_pool, seed) for seed in seeds],
+        policy,
+        frames_per_batch=80,
+        total_frames=160,
+        cat_results="stack",
+        auto_register_policy_transforms=False,
+    )
+    batches = torch.cat(list(collector), -1)
+    collector.shutdown()
+    assert batches.shape == (2, 2, 2, 20)
+    for seed, batch in zip(seeds, batches, strict=True):
+        env = make_pool(seed)
+        alone = env.rollout(20, policy, break_when_any_done=False)
+        env.close()
+        # The collector's processes compute what this one does.
+        for key in ("action", "signal", ("next", "reward")):
+            torch.testing.assert_close(batch[key], alone[key], rtol=0, atol=0)
 
 
 def test_exploration_noise_goes_on_top_of_a_policy(policy):
