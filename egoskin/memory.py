@@ -5,15 +5,11 @@ from __future__ import annotations
 import os
 import resource
 from collections.abc import Mapping
-from contextlib import suppress
-from pathlib import Path
 
 import torch
 
-_CGROUP_LIMITS = (
-    "/sys/fs/cgroup/memory.max",
-    "/sys/fs/cgroup/memory/memory.limit_in_bytes",
-)
+from egoskin.cgroups import memory_limit
+
 _SHARED = "/dev/shm"
 # Texts of out-of-memory errors that have no exception class of their own.
 _OUT_OF_MEMORY = (
@@ -31,10 +27,9 @@ _OUT_OF_MEMORY = (
 def machine_memory() -> int:
     """Return the largest amount of memory this process can use [bytes]."""
     limits = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]
-    for path in _CGROUP_LIMITS:
-        # The file may be absent; "max" means no limit.
-        with suppress(OSError, ValueError):
-            limits.append(int(Path(path).read_text()))
+    limit = memory_limit()
+    if limit is not None:
+        limits.append(limit)
     address_space, _ = resource.getrlimit(resource.RLIMIT_AS)
     if address_space != resource.RLIM_INFINITY:
         limits.append(address_space)

@@ -22,7 +22,7 @@ import time
 import traceback
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from multiprocessing import (
     active_children,
     current_process,
@@ -43,10 +43,10 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase, ParallelEnv, Transform, TransformedEnv
 
+from egoskin.cgroups import cpu_limit
 from egoskin.interrupts import ENDING, end_with_parent
 from egoskin.memory import is_out_of_memory
 
-_CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")
 # Interval at which the parent polls a worker that copies its results [s].
 _POLL = 2e-4
 # Interval between checks that the workers are alive [s].
@@ -90,11 +90,8 @@ def available_cores() -> int:
     # macOS has no affinity.
     affinity = getattr(os, "sched_getaffinity", None)
     cores = len(affinity(0)) if affinity else os.cpu_count() or 1
-    # The share of a container; absent, or "max 100000", without a limit.
-    with suppress(OSError, ValueError):
-        quota, period = map(int, _CPU_QUOTA.read_text().split())
-        cores = min(cores, max(quota // period, 1))
-    return cores
+    limit = cpu_limit()
+    return cores if limit is None else min(cores, max(int(limit), 1))
 
 
 def default_num_workers(num_envs: int, cores: int | None = None) -> int:

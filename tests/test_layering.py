@@ -17,6 +17,7 @@ MODULES = {
 TOOLS = [
     "hints",
     "bounds",
+    "cgroups",
     "memory",
     "rounding",
     "warp_philox",

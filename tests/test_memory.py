@@ -48,6 +48,11 @@ def test_a_limit_of_the_address_space_counts():
         resource.setrlimit(resource.RLIMIT_AS, before)
 
 
+def test_a_limit_of_the_control_group_counts(monkeypatch):
+    monkeypatch.setattr("egoskin.memory.memory_limit", lambda: 2**20)
+    assert machine_memory() == 2**20
+
+
 @pytest.mark.skipif(not os.path.isdir("/dev/shm"), reason="has no /dev/shm")
 def test_shared_memory_that_is_not_there_is_refused():
     check_shared_memory(1, "a byte")

@@ -602,20 +602,11 @@ def test_the_default_number_of_workers_is_the_largest_divisor_not_above_the_core
 
 
 @pytest.mark.parametrize(
-    ("quota", "cores"),
-    [
-        ("100000 100000", 1),
-        ("50000 100000", 1),
-        ("400000 100000", 2),
-        ("max 100000", 2),
-    ],
+    ("limit", "cores"), [(None, 2), (0.5, 1), (1.0, 1), (1.9, 1), (2.0, 2), (64.0, 2)]
 )
-def test_a_container_gets_no_more_cores_than_its_quota(
-    quota, cores, tmp_path, monkeypatch
-):
-    (tmp_path / "cpu.max").write_text(quota)
+def test_a_container_gets_no_more_cores_than_its_time(limit, cores, monkeypatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 1}, raising=False)
-    monkeypatch.setattr(workers, "_CPU_QUOTA", tmp_path / "cpu.max")
+    monkeypatch.setattr(workers, "cpu_limit", lambda: limit)
     assert available_cores() == cores
 
 
