@@ -100,6 +100,8 @@ def test_each_set_of_gains_is_tried(tmp_path):
     toml = TOML + '[gains.weak]\n"*" = { kp = 0.1, kd = 0.01 }\n'
     done = call("robot", "check", write_robot(tmp_path / "walker", toml))
     assert "gains stiff: it stands for 2 s by itself" in done.stdout
+    # 0.3 x 60 / 0.1 rad.
+    assert "gains weak: an action of 1 moves a joint by 180.00 to 180" in done.stdout
     assert (
         "gains weak: it falls " in done.stdout or "gains weak: without" in done.stdout
     )

@@ -172,12 +172,15 @@ def test_two_parts_of_a_mesh_collide_alike(tmp_path):
     # A trunk and a narrow head.
     head = trimesh.creation.box(bounds=[(0, 0, 0.6), (0.02, 0.03, 0.9)])
     model = with_mesh(trimesh.util.concatenate([BOX, head]), "shell")
+    own = 'condim="6" priority="1" group="1" solmix="2" rgba="1 0 0 1" friction="0.7'
+    model = model.replace('friction="0.7', own)
     robot = portable(read_folder(write_robot(tmp_path / "walker", model=model)))
     own = [
         g for g in range(robot.model.ngeom) if robot.model.geom_friction[g, 0] == 0.7
     ]
     assert len(own) == 2
-    for name in ("contype", "conaffinity", "friction", "solref", "bodyid"):
+    names = ("contype", "conaffinity", "condim", "priority", "group", "rgba")
+    for name in (*names, "friction", "solmix", "solref", "bodyid"):
         values = getattr(robot.model, f"geom_{name}")[own]
         np.testing.assert_array_equal(values[0], values[1])
 
@@ -362,3 +365,14 @@ def test_a_collision_mesh_of_a_urdf_is_found(folder, visuals, tmp_path):
     out = succeed("robot", "check", home)
     assert "1.0 to 1.0 times the volume of their convex hulls: hull (box)" in out
     assert "  note   foot: collision meshes that are not found, or neither" in out
+
+
+def test_a_mesh_of_a_urdf_is_found_in_its_folder_of_meshes(tmp_path):
+    folder = '<mujoco><compiler meshdir="shapes"/></mujoco><link'
+    (tmp_path / "stump.urdf").write_text(URDF.replace("<link", folder, 1))
+    (tmp_path / "robot.toml").write_text(TOML)
+    (tmp_path / "shapes").mkdir()
+    trimesh.creation.box((100, 200, 300)).export(tmp_path / "shapes" / "hull.stl")
+    made = make_portable(read_folder(tmp_path))
+    assert [fit.link for fit in made.fits] == ["hull"]
+    assert made.lost == ["foot"]

@@ -64,11 +64,15 @@ def test_a_folder_is_a_robot(tmp_path):
     assert robot.name == "walker"
     assert robot.feet == ("left_foot", "right_foot")
     assert robot.skin_links == ("trunk", "left_arm", "right_arm")
+    legs = ("left_leg", "left_foot", "right_leg", "right_foot")
+    assert robot.untargeted_links == legs
     assert robot.default_joint_pos.tolist() == [0.1, 0, 0, 0, 0, 0]
     kp, kd = robot.joint_gains(None)
     assert kp.tolist() == [20, 20, 150, 150, 150, 150]
     assert kd.tolist() == [1, 1, 5, 5, 5, 5]
     assert find_robot(str(tmp_path / "walker" / "robot.toml")).links == robot.links
+    named = write_robot(tmp_path / "named", f'name = "strider"\n{TOML}')
+    assert find_robot(str(named)).name == "strider"
 
 
 def test_a_variable_of_a_python_file_is_a_robot(tmp_path):

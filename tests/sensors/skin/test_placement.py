@@ -161,6 +161,13 @@ def test_stand_off_lifts_sensors_along_the_normal(small_robot, method):
     np.testing.assert_allclose(offset, 0.13 * skin.normal, atol=2e-6)
 
 
+def test_no_sensor_stands_on_a_hidden_surface(small_robot):
+    # 30 mm off the inner ball is outside the outer one.
+    robot = small_robot("<geom size='.1'/><geom size='.08'/>")
+    skin = place_sensors(robot, 100, stand_off=0.03)
+    np.testing.assert_allclose(np.linalg.norm(skin.position, axis=-1), 0.13, atol=2e-6)
+
+
 def test_no_sensor_stands_inside_a_neighbour(small_robot):
     # Two plates with a gap of 20 mm: 30 mm off one is inside the other.
     robot = small_robot(
