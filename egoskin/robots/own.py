@@ -159,12 +159,13 @@ def _from_python(path: Path, variable: str) -> RobotConfig:
         raise ValueError(f"no file {path}: a robot is given as my_robot.py:ROBOT")
     try:
         names = runpy.run_path(str(path))
-    # The file may raise anything.
-    except Exception as error:
+    # The file may raise anything, or end the program.
+    except (Exception, SystemExit) as error:
         lines = [
             f.lineno for f in extract_tb(error.__traceback__) if f.filename == str(path)
         ]
-        if isinstance(error, SyntaxError):
+        # Not of a file that it imports.
+        if isinstance(error, SyntaxError) and error.filename == str(path):
             lines.append(error.lineno)
         where = f":{lines[-1]}" if lines else ""
         raise ValueError(f"{path}{where}: {type(error).__name__}: {error}") from error

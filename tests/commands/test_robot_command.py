@@ -73,3 +73,55 @@ def test_a_joint_without_a_range_and_a_weak_one_are_notes(tmp_path):
     assert "skin: 5 sensors on" in out
     assert "no range: left_shoulder, right_shoulder, left_hip" in out
     assert "by less than 0.1 rad: left_shoulder, right_shoulder;" in out
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ("skin_links=()", "no skin_links to place sensors on"),
+        ("skin_links=('trunk', 'nose')", "skin_links that are not links: nose"),
+        ("untargeted_links=('nose',)", "untargeted_links that are not links: nose"),
+        ("feet=('left_foot', 'nose')", "feet that are not links: nose"),
+    ],
+)
+def test_links_that_a_python_file_invents_are_told(change, told, tmp_path):
+    folder = write_robot(tmp_path / "walker")
+    (tmp_path / "mine.py").write_text(
+        "from dataclasses import replace\nfrom pathlib import Path\n"
+        "from egoskin.robots.own import read_folder\n"
+        f"ROBOT = replace(read_folder(Path({str(folder)!r})), {change})\n"
+    )
+    done = call("robot", "check", f"{tmp_path}/mine.py:ROBOT")
+    assert done.returncode == 2
+    assert f"wrong  {told}" in done.stdout
+
+
+def test_each_set_of_gains_is_tried(tmp_path):
+    toml = TOML + '[gains.weak]\n"*" = { kp = 0.1, kd = 0.01 }\n'
+    done = call("robot", "check", write_robot(tmp_path / "walker", toml))
+    assert "gains stiff: it stands for 2 s by itself" in done.stdout
+    # 0.3 x 60 / 0.1 rad.
+    assert "gains weak: an action of 1 moves a joint by 180.00 to 180" in done.stdout
+    assert (
+        "gains weak: it falls " in done.stdout or "gains weak: without" in done.stdout
+    )
+
+
+def test_a_robot_that_touches_itself_is_told_so(tmp_path):
+    out = succeed("robot", "check", write_robot(tmp_path / "walker"))
+    assert "touches itself" not in out
+    # Both arms in one place, inside the trunk, with which they do not collide.
+    model = MODEL.replace('"0 0.25 0.3"', '"0 0 0.3"')
+    model = model.replace('"0 -0.25 0.3"', '"0 -0.05 0.3"')
+    done = call("robot", "check", write_robot(tmp_path / "walker", model=model))
+    assert "note   it touches itself in its default pose" in done.stdout
+
+
+def test_a_robot_whose_simulation_fails_is_told_so(tmp_path):
+    # Arms of 10 milligrams, without armature, on very stiff springs.
+    model = MODEL.replace('armature="0.02"', 'armature="0"')
+    model = model.replace('-0.3" mass="1"', '-0.3" mass="1e-5"')
+    toml = TOML.replace("{ kp = 20, kd = 1 }", "{ kp = 1e6, kd = 0 }")
+    done = call("robot", "check", write_robot(tmp_path / "walker", toml, model))
+    assert "wrong  gains stiff: the simulation fails after 0.0" in done.stdout
+    assert "it stands" not in done.stdout.partition("gains stiff")[2]

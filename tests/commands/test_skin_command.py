@@ -55,6 +55,9 @@ def test_the_options_of_a_placement_reach_it():
     assert set(skin.links) == {"torso_link"}
     gaps = np.linalg.norm(skin.position[:, None] - skin.position, axis=-1)
     assert gaps[~np.eye(12, dtype=bool)].min() >= 0.05 - 1e-5
+    options = {"num_sensors": 12, "method": "poisson_disk", "seed": 0}
+    options |= {"spacing": 0.05, "stand_off": 0.009}
+    assert {name: skin.provenance[name] for name in options} == options
 
 
 def test_a_skin_can_be_placed_on_meshes():
@@ -292,6 +295,7 @@ def test_meshes_that_are_not_the_robots_are_left_out():
             ["place", "--density", "torso_link=1", "torso_link=5", "--out", "a.json"],
             "--density has a name twice",
         ),
+        (["place", "--density", "torso_link=", "--out", "a.json"], "takes name=value"),
         (["place", "--links", "torso_lnk", "--out", "a.json"], "torso_lnk"),
         (["place", "--num-sensors", "0", "--out", "a.json"], "0"),
         (["place", "--meshes", "none", "--out", "a.json"], "none"),

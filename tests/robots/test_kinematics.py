@@ -97,6 +97,28 @@ def test_a_chain_that_does_not_say_what_is_meant_is_refused(old, new, expected):
         LinkKinematics(chain, links)
 
 
+def test_no_pose_takes_a_link_beyond_its_reach(every_link, random_joint_pos):
+    reach = dict(zip(H1_2.links, every_link.reach(), strict=True))
+    position, _ = every_link.poses_b(random_joint_pos(200, 2))
+    farthest = position.norm(dim=-1).amax(0)
+    assert (farthest <= torch.tensor([*reach.values()]) + TOLERANCE).all()
+    # Limbs are alike on both sides: a branch does not count for another one.
+    for link in H1_2.links:
+        assert reach[link.replace("left", "right")] == pytest.approx(reach[link])
+
+
+def test_a_slide_takes_a_link_anywhere():
+    # 0.3 and 0.4 m aside.
+    urdf = URDF.replace(
+        """link="a"/>
+""",
+        """link="a"/><origin xyz="0.3 0.4 0"/>
+""",
+    )
+    chain = pk.build_chain_from_urdf(urdf)
+    assert LinkKinematics(chain, ["b", "a"]).reach() == [math.inf, pytest.approx(0.5)]
+
+
 @given(st.lists(st.sampled_from(H1_2.links), min_size=1, max_size=6, unique=True))
 def test_pruning_changes_no_bit(every_link, random_joint_pos, links):
     joint_pos = random_joint_pos(32)

@@ -172,12 +172,15 @@ def test_two_parts_of_a_mesh_collide_alike(tmp_path):
     # A trunk and a narrow head.
     head = trimesh.creation.box(bounds=[(0, 0, 0.6), (0.02, 0.03, 0.9)])
     model = with_mesh(trimesh.util.concatenate([BOX, head]), "shell")
+    own = 'condim="6" priority="1" group="1" solmix="2" rgba="1 0 0 1" friction="0.7'
+    model = model.replace('friction="0.7', own)
     robot = portable(read_folder(write_robot(tmp_path / "walker", model=model)))
     own = [
         g for g in range(robot.model.ngeom) if robot.model.geom_friction[g, 0] == 0.7
     ]
     assert len(own) == 2
-    for name in ("contype", "conaffinity", "friction", "solref", "bodyid"):
+    names = ("contype", "conaffinity", "condim", "priority", "group", "rgba")
+    for name in (*names, "friction", "solmix", "solref", "bodyid"):
         values = getattr(robot.model, f"geom_{name}")[own]
         np.testing.assert_array_equal(values[0], values[1])
 
@@ -281,13 +284,34 @@ def test_links_that_overlap_because_of_their_meshes_do_not_collide(tmp_path):
     assert data.ncon == 0
 
 
+def test_links_that_overlap_in_the_default_pose_alone_do_not_collide(tmp_path):
+    # Half a turn of the neck takes the head from beside the trunk's mesh into it.
+    model = with_mesh().replace(
+        '<body name="right_arm"',
+        '<body name="neck" pos="0.05 0 0.7"><joint name="neck" axis="0 0 1" '
+        'range="-4 4"/><geom size="0.01" mass="1"/>'
+        '<body name="head" pos="0 -0.15 0"><joint name="nod" axis="0 1 0"/>'
+        '<geom size="0.02" mass="1"/></body></body><body name="right_arm"',
+    )
+    for pose, excluded in (("0", False), ("3.14159", True)):
+        toml = (
+            'model = "walker.xml"\nbase = "trunk"\nfeet = ["*_foot"]\n'
+            'skin_links = ["trunk"]\n'
+            f"[default_pose]\nneck = {pose}\n"
+            '[gains.a]\n"*" = { kp = 20, kd = 1 }\n'
+        )
+        robot = portable(read_folder(write_robot(tmp_path, toml, model)))
+        pairs = [{e.bodyname1, e.bodyname2} for e in robot.spec().excludes]
+        assert ({"head", "trunk"} in pairs) == excluded
+
+
 URDF = """
 <robot name="stump">
   <link name="hull">
     <inertial><mass value="3"/>
       <inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>
     <visual><geometry><mesh filename="package://stump/look.dae"/></geometry></visual>
-    <collision><origin xyz="0 0 0.2" rpy="0 0 0"/>
+    <collision><origin xyz="0 0 0.2" rpy="0 0 1.570796"/>
       <geometry>
         <mesh filename="package://stump/meshes/hull.stl" scale="0.001 0.001 0.001"/>
       </geometry></collision>
@@ -334,9 +358,21 @@ def test_a_collision_mesh_of_a_urdf_is_found(folder, visuals, tmp_path):
     robot = portable(read_folder(home))
     hull, foot = robot.primitives
     assert (hull.link, hull.kind, foot.link) == ("hull", "box", "foot")
-    np.testing.assert_allclose(hull.size, (0.05, 0.1, 0.15), atol=3e-5)
+    # A quarter turn about z: x and y change places.
+    np.testing.assert_allclose(hull.size, (0.1, 0.05, 0.15), atol=3e-5)
     np.testing.assert_allclose(hull.position, (0, 0, 0.2), atol=1e-6)
     assert robot.model.body_mass.sum() == pytest.approx(4)
     out = succeed("robot", "check", home)
     assert "1.0 to 1.0 times the volume of their convex hulls: hull (box)" in out
     assert "  note   foot: collision meshes that are not found, or neither" in out
+
+
+def test_a_mesh_of_a_urdf_is_found_in_its_folder_of_meshes(tmp_path):
+    folder = '<mujoco><compiler meshdir="shapes"/></mujoco><link'
+    (tmp_path / "stump.urdf").write_text(URDF.replace("<link", folder, 1))
+    (tmp_path / "robot.toml").write_text(TOML)
+    (tmp_path / "shapes").mkdir()
+    trimesh.creation.box((100, 200, 300)).export(tmp_path / "shapes" / "hull.stl")
+    made = make_portable(read_folder(tmp_path))
+    assert [fit.link for fit in made.fits] == ["hull"]
+    assert made.lost == ["foot"]

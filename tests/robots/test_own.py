@@ -64,11 +64,15 @@ def test_a_folder_is_a_robot(tmp_path):
     assert robot.name == "walker"
     assert robot.feet == ("left_foot", "right_foot")
     assert robot.skin_links == ("trunk", "left_arm", "right_arm")
+    legs = ("left_leg", "left_foot", "right_leg", "right_foot")
+    assert robot.untargeted_links == legs
     assert robot.default_joint_pos.tolist() == [0.1, 0, 0, 0, 0, 0]
     kp, kd = robot.joint_gains(None)
     assert kp.tolist() == [20, 20, 150, 150, 150, 150]
     assert kd.tolist() == [1, 1, 5, 5, 5, 5]
     assert find_robot(str(tmp_path / "walker" / "robot.toml")).links == robot.links
+    named = write_robot(tmp_path / "named", f'name = "strider"\n{TOML}')
+    assert find_robot(str(named)).name == "strider"
 
 
 def test_a_variable_of_a_python_file_is_a_robot(tmp_path):
@@ -95,11 +99,14 @@ def test_a_variable_of_a_python_file_is_a_robot(tmp_path):
         ("x = 1\nimport nothing_of_this_name", 2, "ModuleNotFoundError"),
         ("x = 1\n\ny = = 2", 3, "SyntaxError"),
         ("def f():\n    raise RuntimeError('no')\nf()", 2, "RuntimeError: no"),
+        ("import sys\n\nsys.exit(0)", 3, "SystemExit: 0"),
+        ("import runpy\nrunpy.run_path(BROKEN)", 2, "SyntaxError"),
     ],
 )
 def test_errors_in_a_python_file_are_told_with_their_line(text, line, error, tmp_path):
-    file = tmp_path / "mine.py"
-    file.write_text(text)
+    file, broken = tmp_path / "mine.py", tmp_path / "broken.py"
+    broken.write_text("\n" * 9 + "y = = 2")
+    file.write_text(text.replace("BROKEN", repr(str(broken))))
     with pytest.raises(ValueError, match=rf"mine\.py:{line}: {error}"):
         find_robot(f"{file}:ROBOT")
 
@@ -126,6 +133,12 @@ def test_errors_in_a_python_file_are_told_with_their_line(text, line, error, tmp
         ('"*_shoulder" =', '"*_*" =', 16, "matches '*_hip' and '*_*'"),
         ('"*_shoulder" =', '"left_*er" =', 13, "none of its patterns"),
         ("[gains.stiff]", "[gains]", 14, "table of joints|N m/rad"),
+        (
+            "{ kp = 20, kd = 1 }",
+            '{ kp = 20, kd = 1 }\n[gains.soft]\n"*_hip" = { kp = 2, kd = 1 }',
+            17,
+            "gains.soft: joint 'left_shoulder' must match one pattern",
+        ),
     ],
 )
 def test_what_is_wrong_is_told_with_its_line(old, new, line, text, tmp_path):
@@ -187,6 +200,20 @@ def test_paths_of_the_file_are_not_stored(tmp_path):
     robot = portable(read_folder(write_robot(tmp_path / "walker", model=model)))
     plain = portable(read_folder(write_robot(tmp_path / "walker")))
     assert robot.model_xml == plain.model_xml
+
+
+def test_materials_stay_without_their_textures(tmp_path):
+    assets = (
+        '<asset><texture name="t" type="2d" builtin="checker" width="8" height="8"/>'
+        '<material name="m" texture="t" rgba="1 0.5 0 1"/></asset><worldbody>'
+    )
+    model = MODEL.replace("<worldbody>", assets)
+    model = model.replace('<geom type="box"', '<geom material="m" type="box"', 1)
+    robot = portable(read_folder(write_robot(tmp_path, model=model)))
+    assert robot.model.ntex == 0
+    assert robot.model.mat("m").rgba.tolist() == [1, 0.5, 0, 1]
+    trunk = robot.model.body("trunk")
+    assert robot.model.geom_matid[trunk.geomadr[0]] == 0
 
 
 def test_commands_take_the_robot_of_trainings(tmp_path):

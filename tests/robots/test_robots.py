@@ -137,6 +137,17 @@ def test_height_of_the_humanoid_above_its_soles():
     assert HUMANOID.default_base_height == pytest.approx(1.218 + 0.075, abs=2e-3)
 
 
+def test_a_pose_that_lifts_the_leg_lowers_the_base(small_robot):
+    robot = small_robot(
+        "<geom size='.1'/><body name='leg'><joint axis='0 1 0'/>"
+        "<geom size='.05' pos='0 0 -.5'/></body>"
+    )
+    assert robot.default_base_height == pytest.approx(0.55)
+    # A quarter turn: it rests on its own ball.
+    assert robot.base_height(np.array([np.pi / 2])) == pytest.approx(0.1)
+    assert robot.default_base_height == pytest.approx(0.55)
+
+
 def test_shapes_that_touch_only_in_a_pair_are_collision_shapes(tmp_path):
     path = tmp_path / "pair.xml"
     path.write_text(

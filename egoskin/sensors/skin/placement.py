@@ -28,6 +28,8 @@ _DARTS_PER_SQUARE = 40
 _MAX_DARTS = 2_000_000
 # The candidates of more sensors would not fit in memory.
 MAX_SENSORS = _MAX_DARTS // _CANDIDATES
+# Bounds of the spacing [m]: the squares of some numbers beyond are 0 or overflow.
+_FINEST, _COARSEST = 1e-9, 1e9
 # Points to estimate the outer area and the rejected shares.
 _AREA_POINTS = 4000
 
@@ -183,6 +185,10 @@ def _check(
         raise ValueError(
             "spacing must be positive and needs method='poisson_disk', got "
             f"{spacing} with {method!r}"
+        )
+    if spacing is not None and not _FINEST <= spacing <= _COARSEST:
+        raise ValueError(
+            f"spacing must be from {_FINEST:g} to {_COARSEST:g} m, got {spacing}"
         )
     if num_sensors is None and spacing is None:
         raise ValueError("num_sensors=None needs a spacing")

@@ -300,6 +300,12 @@ def test_a_wrong_unit_is_noticed(header, row, length, load):
         load(f"{header}\n{row}\n")
 
 
+def test_one_sensor_may_be_at_the_origin_of_its_link(load):
+    rows = [f"1,0,0,1,,,,0.01,{TORSO}", f"2,93,20,200,,,,0.01,{TORSO}"]
+    skin = load("\n".join((PRINT, *rows)))
+    np.testing.assert_allclose(skin.position, [[0, 0, 0.001], FRONT], atol=1e-15)
+
+
 @pytest.mark.parametrize(
     "change",
     [
@@ -575,6 +581,25 @@ def test_missing_normals_need_a_shape_with_a_surface_nearby(small_robot, load):
     # The centre of the sphere.
     with pytest.raises(ValueError, match="nearest surface point of base is not unique"):
         load(content, **options, primitives=robot.primitives)
+
+
+def test_distances_from_the_surface_are_those_of_known_surfaces(small_robot, load):
+    robot = small_robot("<geom size='.2'/><body name='bare'/>")
+    options = {"robot_name": "small", "links": robot.links}
+    options |= {"primitives": robot.primitives, "skip_invalid": True}
+    row = "{},{},0,0,1,0,0,{},{},v"
+    bare = row.format(2, 0.1, 0.01, "bare")
+    content = current(
+        row.format(0, 0.203, 0.01, "base"),
+        row.format(1, 0.26, 0.01, "base"),
+        bare,
+        # Left out: its radius is 50 m.
+        row.format(3, 1.2, 50, "base"),
+    )
+    skin = load(content, **options)
+    assert skin.links == ("base", "base", "bare")
+    assert skin.provenance["distance_to_primitives"] == [0.003, 0.06]
+    assert "distance_to_primitives" not in load(current(bare), **options).provenance
 
 
 # --- xacro and URDF ---------------------------------------------------------------

@@ -285,6 +285,12 @@ def test_meshes_of_a_model_are_scaled_and_posed(mjcf):
     assert meshes["base"][0].metadata["name"] == "brick.stl"
 
 
+def test_a_mesh_in_the_same_place_of_two_bodies_is_no_duplicate(mjcf):
+    mjcf.write_text(mjcf.read_text().replace("pos='0 0 1' euler='0 0 90'", ""))
+    meshes = meshes_of_mjcf(mjcf, group=2)
+    assert {body: len(found) for body, found in meshes.items()} == {"base": 1, "b": 1}
+
+
 def test_a_group_selects_meshes_of_a_model(mjcf):
     assert len(meshes_of_mjcf(mjcf, group=3)["b"]) == 1
     with pytest.raises(ValueError, match="no mesh geoms in group 5"):

@@ -161,6 +161,13 @@ def test_stand_off_lifts_sensors_along_the_normal(small_robot, method):
     np.testing.assert_allclose(offset, 0.13 * skin.normal, atol=2e-6)
 
 
+def test_no_sensor_stands_on_a_hidden_surface(small_robot):
+    # 30 mm off the inner ball is outside the outer one.
+    robot = small_robot("<geom size='.1'/><geom size='.08'/>")
+    skin = place_sensors(robot, 100, stand_off=0.03)
+    np.testing.assert_allclose(np.linalg.norm(skin.position, axis=-1), 0.13, atol=2e-6)
+
+
 def test_no_sensor_stands_inside_a_neighbour(small_robot):
     # Two plates with a gap of 20 mm: 30 mm off one is inside the other.
     robot = small_robot(
@@ -226,6 +233,21 @@ def test_density_scales_the_spacing_by_its_root(small_robot):
     assert 0.05 <= dense + 2e-6 < 0.0525
     # 4 times as many per area.
     assert on_b.sum() / (~on_b).sum() == pytest.approx(4, rel=0.1)
+
+
+def test_a_density_of_the_whole_skin_is_a_finer_spacing(small_robot):
+    robot, whole = small_robot("<geom size='.2'/>"), {"base": 4.0}
+    dense, fine = (
+        place_sensors(robot, None, method="poisson_disk", density=d, spacing=s)
+        for d, s in ((whole, 0.1), (None, 0.05))
+    )
+    np.testing.assert_array_equal(dense.position, fine.position)
+    # Of a given number of sensors, densities are relative.
+    same, plain = (
+        place_sensors(robot, 30, method="poisson_disk", density=d)
+        for d in (whole, None)
+    )
+    np.testing.assert_array_equal(same.position, plain.position)
 
 
 @pytest.mark.parametrize("n", [1, 2, 30, 200])
@@ -322,6 +344,8 @@ def test_darts_are_thrown_in_lots_until_there_are_enough(small_robot, monkeypatc
         ({"spacing": 0.1}, "needs method='poisson_disk'"),
         ({"method": "poisson_disk", "spacing": 0.0}, "spacing must be positive"),
         ({"method": "poisson_disk", "spacing": 0.2}, r"only \d+ sensors fit"),
+        ({"method": "poisson_disk", "spacing": 1e-200}, "spacing must be .* 1e-09 to"),
+        ({"method": "poisson_disk", "spacing": 1e200}, "spacing must be .* 1e-09 to"),
         ({"stand_off": -0.01}, "stand_off must be finite and not negative"),
         ({"density": {"head": 2.0}}, "density: 'head' matches none of torso_link"),
         ({"density": {"torso*": 1.0, "*_link": 2.0}}, "must match exactly one"),

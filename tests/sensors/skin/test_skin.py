@@ -96,6 +96,9 @@ def test_a_misplaced_skin_is_off_by_the_deviations_given():
     again = skin.misplaced(0.002, 3.0, seed=1)
     np.testing.assert_array_equal(again.normal, moved.normal)
     assert moved.provenance["misplaced"]["seed"] == 1
+    other = skin.misplaced(0.002, 3.0, seed=2)
+    assert not np.isclose(other.position, moved.position).all(-1).any()
+    assert not np.isclose(other.normal, moved.normal).all(-1).any()
 
 
 def test_a_skin_misplaced_by_nothing_has_its_own_frames():
@@ -155,6 +158,19 @@ def test_a_saved_skin_is_the_same_skin(skin, tmp_path):
     assert loaded.provenance == skin.provenance
     np.testing.assert_array_equal(loaded.position, skin.position)
     np.testing.assert_array_equal(loaded.normal, skin.normal)
+
+
+def test_ranges_rolls_and_radii_are_saved(tmp_path):
+    values = {
+        "range": [0.5, np.nan, 2],
+        "roll_deg": [-100, 0, 30.5],
+        "radius": [np.nan, 0.004, 0.02],
+    }
+    skin = make_skin([[1, 0, 0]] * 3, **values)
+    skin.save(tmp_path / "skin.json")
+    loaded = Skin.load(tmp_path / "skin.json")
+    for name, value in values.items():
+        np.testing.assert_array_equal(getattr(loaded, name), value)
 
 
 def test_the_file_is_json_with_one_sensor_on_each_line(skin, tmp_path):
@@ -229,6 +245,11 @@ def skin_content(*sensors: object) -> dict:
         (skin_content({**SENSOR, "normal": [0, 10**400, 0]}), "'normal' must be three"),
         (skin_content({**SENSOR, "range": 10**400}), "'range' must be a number"),
         (skin_content({**SENSOR, "radius": float("nan")}), "'radius' must be a number"),
+        (skin_content({**SENSOR, "radius": "inf"}), "'radius' must be a number"),
+        (
+            skin_content({**SENSOR, "roll_deg": [9]}),
+            r"'roll_deg' must be a number, got",
+        ),
         ("1" * 5000, "limit"),
         ("[" * 100_000, "nested too deeply"),
         ({**skin_content(), "sensors": None}, "'sensors' must be a list, got None"),
@@ -301,6 +322,8 @@ def test_sensors_are_selected_by_index_or_flag(skin):
     assert skin.select([2, 0]).links == (skin.links[2], skin.links[0])
     with pytest.raises(ValueError, match=r"must be \(64,\), one for each, got \(2,\)"):
         skin.select([True, False])
+    with pytest.raises(ValueError, match="no sensor 64: there are 64"):
+        skin.select([0, 64])
 
 
 @pytest.mark.parametrize("coverage", [Ray(), ("ray",)])

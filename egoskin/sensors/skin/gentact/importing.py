@@ -172,8 +172,10 @@ def _load(
         "skipped": export.skipped,
         "parents": names.found,
     }
-    if np.isfinite(distance).all():
-        extent = (distance.min(), distance.max())
+    # On links without primitives it is unknown.
+    known = distance[np.isfinite(distance)]
+    if len(known):
+        extent = (known.min(), known.max())
         provenance["distance_to_primitives"] = [round(float(d), 4) for d in extent]
     skin = Skin(
         robot=names.robot_name,
