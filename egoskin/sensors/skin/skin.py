@@ -141,12 +141,6 @@ def _check_sensor(index: int, sensor: object, types: Mapping[str, Coverage]) -> 
             raise ValueError(
                 f"{where}: {name!r} must be three numbers, got {sensor[name]!r}"
             )
-    away = math.hypot(*sensor["position"])
-    if away > FARTHEST:
-        raise ValueError(
-            f"{where} lies {away:.3g} m from the origin of its link: positions must be "
-            "in metres"
-        )
     for name in ("range", "roll_deg", "radius"):
         if name == "range" and sensor.get(name) == "inf":
             continue
@@ -182,8 +176,9 @@ class Skin:
 
     Raises:
         ValueError: If the arrays differ in length, positions, normals or rolls are not
-            finite, ranges or radii are not positive, normals are not unit vectors, or
-            a coverage is none.
+            finite, a position is more than `FARTHEST` from its link's origin, ranges
+            or radii are not positive, a radius is infinite, normals are not unit
+            vectors, or a coverage is none.
     """
 
     robot: str
@@ -237,8 +232,17 @@ class Skin:
                 raise ValueError(f"{name} must be {shape}, got {array.shape}")
             if not np.isfinite(array).all():
                 raise ValueError(f"{name} holds values that are not finite")
+        if np.isinf(self.radius).any():
+            raise ValueError("radius holds values that are infinite")
         if not self.links:
             raise ValueError("a skin needs at least one sensor")
+        away = np.linalg.norm(self.position, axis=-1)
+        if (away > FARTHEST).any():
+            worst = int(away.argmax())
+            raise ValueError(
+                f"sensor {worst} lies {away[worst]:.3g} m from the origin of its link: "
+                "positions must be in metres"
+            )
         length = np.linalg.norm(self.normal, axis=-1)
         if (np.abs(length - 1) > _UNIT_TOLERANCE).any():
             worst = int(np.abs(length - 1).argmax())

@@ -47,7 +47,7 @@ def current(*rows: str) -> str:
     return "\n".join((CURRENT, *rows)) + "\n"
 
 
-# Two sensors 3 mm off the torso's front (a box face) and back in each dialect.
+# Two sensors in front of the torso and behind it, in each dialect.
 FRONT, BACK = (0.093, 0.02, 0.2), (-0.093, -0.01, 0.3)
 TORSO = "/root/bot/torso_link/visuals"
 DIALECTS = {

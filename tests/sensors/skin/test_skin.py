@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -314,6 +315,18 @@ def test_a_missing_file_is_refused_with_its_name():
 def test_arrays_of_the_wrong_shape_are_refused(name):
     with pytest.raises(ValueError, match=rf"{name} must be \(1, 3\), got \(2, 3\)"):
         replace(make_skin([0, 0, 1]), **{name: np.zeros((2, 3))})
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"position": [[0, 0, 120.0]]}, "sensor 0 lies 120 m .* in metres"),
+        ({"radius": [math.inf]}, "radius holds values that are infinite"),
+    ],
+)
+def test_what_no_file_may_hold_is_refused(values, message):
+    with pytest.raises(ValueError, match=message):
+        replace(make_skin([0, 0, 1]), **values)
 
 
 def test_sensors_are_selected_by_index_or_flag(skin):
