@@ -606,6 +606,7 @@ def test_the_default_number_of_workers_is_the_largest_divisor_not_above_the_core
     [
         ("100000 100000", 1),
         ("50000 100000", 1),
+        ("150000 100000", 1),
         ("400000 100000", 2),
         ("max 100000", 2),
     ],
@@ -617,6 +618,25 @@ def test_a_container_gets_no_more_cores_than_its_quota(
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 1}, raising=False)
     monkeypatch.setattr(workers, "_CPU_QUOTA", tmp_path / "cpu.max")
     assert available_cores() == cores
+
+
+def test_a_pool_that_is_closed_leaves_no_files(skin):
+    pool = make_pool(skin, 1)
+    assert pool._reports.is_dir()
+    pool.reset()
+    pool.close()
+    assert not pool._reports.exists()
+
+
+def test_a_worker_without_memory_is_reported_without_a_traceback(tmp_path):
+    for error, lines in ((MemoryError("no more"), 1), (ValueError("no more"), 4)):
+        report = tmp_path / "report.txt"
+        with pytest.raises(type(error)), workers._reported(report):
+            raise error
+        text = report.read_text().splitlines()
+        assert len(text) >= lines
+        assert (len(text) == 1) == (lines == 1)
+        assert "no more" in text[-1]
 
 
 def test_workers_that_do_not_divide_the_agents_are_refused(skin):
