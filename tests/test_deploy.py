@@ -231,6 +231,14 @@ def test_a_stop_from_the_first_step_on_leaves_the_robot_as_it_is(controller, sta
     assert controller.stopped == "the operator let go of the button"
 
 
+def test_targets_may_be_changed_by_whoever_receives_them(controller, state):
+    target = controller.step(**state)
+    kept = target.copy()
+    target += 99.0
+    controller.stop("the operator let go of the button")
+    np.testing.assert_array_equal(controller.step(**state), kept)
+
+
 @pytest.mark.parametrize("position", [100.0, -100.0, np.inf])
 def test_a_wrong_encoder_at_the_start_gives_no_target_beyond_the_limits(
     controller, state, position

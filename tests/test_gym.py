@@ -216,6 +216,17 @@ def test_infos_are_made_as_gymnasium_makes_them():
     assert seen[0] == seen[1]
 
 
+def test_environments_without_a_seed_differ():
+    seen = []
+    for _ in range(2):
+        env = gymnasium.make(ENV_ID, **SOON)
+        env.reset()
+        # The ball's state is among what the critic reads.
+        *_, info = env.step(np.zeros(21, dtype=np.float32))
+        seen.append(info["privileged_observation"])
+    assert (seen[0] != seen[1]).any()
+
+
 @pytest.mark.slow
 def test_a_seed_begins_anew_with_any_number_of_workers():
     results = []

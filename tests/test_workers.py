@@ -610,6 +610,25 @@ def test_a_container_gets_no_more_cores_than_its_time(limit, cores, monkeypatch)
     assert available_cores() == cores
 
 
+def test_a_pool_that_is_closed_leaves_no_files(skin):
+    pool = make_pool(skin, 1)
+    assert pool._reports.is_dir()
+    pool.reset()
+    pool.close()
+    assert not pool._reports.exists()
+
+
+def test_a_worker_without_memory_is_reported_without_a_traceback(tmp_path):
+    for error, lines in ((MemoryError("no more"), 1), (ValueError("no more"), 4)):
+        report = tmp_path / "report.txt"
+        with pytest.raises(type(error)), workers._reported(report):
+            raise error
+        text = report.read_text().splitlines()
+        assert len(text) >= lines
+        assert (len(text) == 1) == (lines == 1)
+        assert "no more" in text[-1]
+
+
 def test_workers_that_do_not_divide_the_agents_are_refused(skin):
     with pytest.raises(ValueError, match="valid: 1, 2, 4, 8, 16, 32"):
         make_pool(skin, 3)

@@ -86,6 +86,29 @@ def test_the_empty_plan_is_the_policy(policy: Policy, bound: UpperBound):
     torch.testing.assert_close(bound.height, height.reshape(THROWS, -1)[:, 0])
 
 
+def test_heights_are_those_of_the_ball_that_is_asked_for(
+    policy: Policy, monkeypatch: pytest.MonkeyPatch
+):
+    def play(env, policy, start, plan, steps, ball) -> tuple[torch.Tensor, ...]:
+        whole = torch.ones(len(plan), dtype=torch.bool)
+        return whole, whole, torch.full((len(plan),), steps)
+
+    def start_at_once(env, policy, config, reach, ball) -> upper_bound._Start:
+        return _until_in_reach(env, policy, config, reach)
+
+    monkeypatch.setattr(upper_bound, "_play", play)
+    monkeypatch.setattr(upper_bound, "_until_in_reach", start_at_once)
+    config = task(policy)
+    search = SearchConfig(samples=4, iterations=1)
+    which = {"throw_set": 0, "throws": 2, "reach": 2.0}
+    bound = find_upper_bound(policy, config, search, ball=2, **which)
+    watcher = Watcher(
+        replace(config, task=replace(config.task, episode_length_s=2e3)), 0, 2
+    )
+    height, _ = watcher._thrower.at_standing_robot(watcher._draw)
+    torch.testing.assert_close(bound.height, height.reshape(2, -1)[:, 1])
+
+
 @pytest.mark.slow
 def test_the_second_ball_comes_at_a_robot_that_has_dodged_the_first(policy: Policy):
     config = standard_task(policy.env_config)

@@ -241,6 +241,31 @@ def test_share_of_directions_and_of_surface_is_that_of_the_cap(ball_robot, max_r
     assert cone["half_angle"] == pytest.approx(180 - border, abs=5)
 
 
+def test_the_throws_that_are_analysed_are_those_of_the_seed(ball_robot):
+    # From the left, about the middle of the robot, 3 m above ground.
+    throws = ThrowConfig(
+        flight="straight",
+        aim="box",
+        box_half_width=0.0,
+        box_height=(2.9, 3.1),
+        azimuth_deg=(80.0, 100.0),
+    )
+    skin = sensors(((0, RHO, 0), (0, 1, 0)))
+    one, other = (
+        analyse(ball_robot, skin, FIELD, [0.1], throws, num_throws=40, seed=seed)
+        for seed in (3, 4)
+    )
+    assert not torch.equal(one.contact_height, other.contact_height)
+    assert not torch.equal(one.surface.gap, other.surface.gap)
+    (cell,) = one.report()["cells"]
+    hits = {k: v["hits"] for k, v in cell["warning_by_azimuth"].items()}
+    assert hits == {"front": 0, "left": 40, "back": 0, "right": 0}
+    # The ball's centre is within both radii of the robot's.
+    away = one.contact_height - StandingRobot(ball_robot).origin[2]
+    assert away.abs().max() < RHO + BALL.radius
+    assert one.surface_link == ("base",) * len(one.surface_link)
+
+
 def test_a_ball_cannot_come_through_the_floor(small_robot):
     robot = small_robot(f"<geom size='{RHO}'/>")  # stands on the floor
     body = StandingRobot(robot)

@@ -24,6 +24,7 @@ from egoskin.study.differences import differences
 from egoskin.study.figures import (
     _draw_curves,
     equivalence,
+    forest,
     learning_curves,
     places,
     sample_efficiency,
@@ -446,6 +447,88 @@ def test_a_run_that_has_not_learnt_has_a_mark_of_its_own(tmp_path: Path):
     # A cell of which no run has learnt has no mean.
     means = [x for x in axes.lines if x.get_marker() == "o" and len(x.get_xdata())]
     assert {y for x in means for y in np.asarray(x.get_ydata()).tolist()} == {0}
+
+
+def test_the_success_over_the_range_is_drawn_for_each_signal_and_geometry(
+    manifest: Manifest,
+):
+    field = {0.5: [20.0, 30.0, 40.0], 1.0: [50.0, 61.0, 62.0]}
+    table = {
+        f"field-proximity-{reach:g}m": dict(enumerate(values))
+        for reach, values in field.items()
+    }
+    table["ray-binary-1m-reduce-min"] = {0: 11.0}
+    table["ray-binary-1m"] = {0: 12.0}
+    table["ray-localization-1m"] = {0: 13.0}
+    figure = success_by_range(manifest, table)
+    assert figure is not None
+    fields, rays, closest = figure.axes
+    # The outer two of three seeds count a quarter of the middle one.
+    (line,) = (x for x in fields.lines if x.get_label() == "proximity")
+    np.testing.assert_allclose(line.get_ydata(), [30, (61 + 0.25 * 112) / 1.5])
+    # At its range, but for the shift that tells signals apart.
+    np.testing.assert_allclose(line.get_xdata(), [0.5, 1.0], rtol=0.05)
+    dots = [x for x in fields.lines if x.get_marker() == "."]
+    assert [np.asarray(x.get_ydata()).tolist() for x in dots] == list(field.values())
+    for axes, binary in ((rays, 12.0), (closest, 11.0)):
+        drawn = {
+            x.get_label(): np.asarray(x.get_ydata()).tolist()
+            for x in axes.lines
+            if len(x.get_xdata()) and not str(x.get_label()).startswith("_")
+        }
+        # Localization is the same for both.
+        assert drawn == {"localization": [13.0], "binary": [binary]}
+
+
+def test_each_panel_of_learning_curves_has_the_cells_of_its_range(tmp_path: Path):
+    cells = ({"sensor.range": 1.0}, {"sensor.range": 2.0})
+    mine = resolve(dataclasses.replace(FINDINGS, name="mine", cells=cells, seeds=(0,)))
+    folder = StudyFolder(tmp_path)
+    folder.plan(mine)
+    for run, success in zip(mine.runs, (40.0, 80.0), strict=True):
+        store(folder, mine, run, success)
+    figure = learning_curves(mine, folder.results(mine))
+    assert figure is not None
+    for axes, reach, success in zip(figure.axes, (1, 2), (40.0, 80.0), strict=True):
+        assert axes.get_title() == f"field, {reach} m"
+        (line,) = axes.lines
+        # In millions and per cent; it ends at 1 - exp(-5) of the success.
+        assert line.get_xdata()[-1] == pytest.approx(mine.runs[0].end / 1e6)
+        assert line.get_ydata()[-1] == pytest.approx(success * 0.9933, rel=1e-3)
+
+
+def test_a_forest_has_the_region_and_the_effect_of_each_claim():
+    cells = ("field-proximity-1m", "field-localization-1m")
+    success = {cells[0]: {0: 58.0, 1: 61.0}, cells[1]: {0: 60.0, 1: 60.0}}
+    judged = judge_findings({"success_3s": success, "share_to_90": {}})
+    (two,) = (j for j in judged if j.finding.label == "2")
+    (axes,) = forest([two]).axes
+    regions = [(bar.get_x(), bar.get_width()) for bar in axes.patches]
+    assert regions == [(-5.0, 10.0)] * 2
+    (point,) = (x for x in axes.lines if x.get_marker() == "o")
+    # In the row of its claim, below the title.
+    assert (point.get_xdata()[0], point.get_ydata()[0]) == (-0.5, 1.0)
+    texts = {text.get_text(): text.get_position() for text in axes.texts}
+    assert texts[" a cell has no run"] == (0, 2.0)
+
+
+def test_the_steps_to_half_and_to_most_of_the_success_are_drawn_in_millions(
+    tmp_path: Path,
+):
+    folder, mine = StudyFolder(tmp_path), resolve(SMOKE)
+    run = mine.run("field-proximity-2m-seed0")
+    store(folder, mine, run, 60.0)
+    result = folder.result(run)
+    figure = sample_efficiency(mine, [result])
+    assert figure is not None
+    (axes,) = figure.axes
+    points = [x for x in axes.lines if x.get_marker() == "o" and len(x.get_xdata())]
+    found = {x.get_markerfacecolor(): x.get_xdata()[0] for x in points}
+    # Hollow at 50 %, full at 90 %, as in the legend.
+    half = found.pop("white")
+    (most,) = found.values()
+    assert half == pytest.approx(0.1371 * run.end / 1e6, rel=0.01)
+    assert most == pytest.approx(0.4473 * run.end / 1e6, rel=0.01)
 
 
 def test_a_success_of_zero_is_not_cut_at_the_axis(manifest: Manifest):

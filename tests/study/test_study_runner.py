@@ -156,6 +156,28 @@ def test_a_policy_without_the_last_checkpoint_is_not_trained_to_its_end(
     assert not folder.is_trained(planned)
 
 
+def test_without_a_checkpoint_the_metrics_tell_the_end_of_a_training(
+    folder: StudyFolder,
+):
+    planned = folder.manifest().run(NAME)
+    run = Run.open(folder.run_path(NAME))
+    run.checkpoint_path.unlink()
+    assert folder.is_trained(planned)
+    path = run.path / "metrics.csv"
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text("".join(lines[:-1]))
+    assert not folder.is_trained(planned)
+
+
+def test_a_run_that_is_planned_for_longer_is_refused(folder: StudyFolder):
+    manifest = folder.manifest()
+    (cell,) = manifest.cells
+    shorter = dataclasses.replace(cell.config, total_frames=BATCH)
+    short = PlannedRun(cell=dataclasses.replace(cell, config=shorter), seed=0)
+    with pytest.raises(ValueError, match="planned for 512 frames, the study for 256"):
+        folder.open_run(short)
+
+
 def test_a_stop_leaves_a_checkpoint_and_no_result(tmp_path: Path, capsys):
     folder = StudyFolder(tmp_path / "study")
     folder.plan(resolve(SHORT))

@@ -132,6 +132,21 @@ def test_a_line_leads_from_a_sensor_that_detects_to_the_ball(
     assert count_blue(after) > 30
 
 
+def test_of_two_balls_a_line_leads_to_the_nearer_one(
+    painter: Painter, standing: TensorDict
+):
+    alone = place_ball(standing, 0.5, 0.9, 1.4)
+    # Out of view, behind the camera.
+    both = alone.clone()
+    both["object_active"][1] = True
+    both["object_pose"][1, :3] = torch.tensor([30.0, 17.0, 1.0])
+    lit = np.arange(64) < 10
+    one, two = (painter.draw(state, lit, time=0.0) for state in (alone, both))
+    # Up to rounding.
+    assert np.abs(one.image.astype(int) - two.image).max() < 10
+    assert one.gap == two.gap
+
+
 def test_a_sensor_that_detects_is_lit(painter: Painter, standing: TensorDict):
     # No ball in play: no line; only the sensors change.
     lit = np.ones(64, dtype=bool)
@@ -166,6 +181,24 @@ def test_the_camera_looks_down_from_where_it_is_placed(standing: TensorDict):
     # 19.7 degrees down; the middle of the picture is 10 degrees down. 540 pixels show
     # 45 degrees: 270 + 270 tan(9.7) / tan(22.5) = 381.
     assert rows.mean() == pytest.approx(381, abs=20)
+
+
+def test_camera_and_sensors_turn_with_the_robots_first_heading(
+    painter: Painter, standing: TensorDict
+):
+    turned = standing.clone()
+    # By 90 degrees.
+    turned["base_pose"][3:] = torch.tensor([0.5, 0.0, 0.0, 0.5]).sqrt()
+    lit, changed = np.ones(64, dtype=bool), []
+    for state in (standing, turned):
+        # The camera is placed anew when the time decreases.
+        painter.draw(state, time=1.0)
+        dim, bright = painter.draw(state, time=0.0), painter.draw(state, lit, time=0.0)
+        changed.append((dim.image != bright.image).any(-1))
+    # The pixels of all sensors, whatever is behind them.
+    assert changed[0].sum() > 100
+    assert (changed[0] != changed[1]).sum() < 0.1 * changed[0].sum()
+    painter.draw(standing, time=-1.0)
 
 
 def test_the_camera_follows_the_base(painter: Painter, standing: TensorDict):

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import psutil
 import pytest
@@ -28,6 +29,7 @@ from egoskin.viewer.web import session as session_module
 from egoskin.viewer.web.body import mesh_of
 from egoskin.viewer.web.page import Page, _short
 from egoskin.viewer.web.panel import EPISODES, MEMORY
+from egoskin.viewer.web.scene import colour_of
 from egoskin.viewer.web.session import Frame
 from making import make_agent
 from sensing import KINDS, SHAPES
@@ -779,3 +781,136 @@ def test_two_robots_are_seen_beside_the_panel_on_a_dense_screen(
         way = np.array([0, side, 1.0]) - camera.position
         scale = height / 2 / np.tan(camera.fov / 2) / (way @ forward)
         assert 0 < width / 2 + scale * (way @ right) < width - 340
+
+
+# --- what is drawn, and what the buttons do -----------------------------------------
+
+
+def heading_of(qpos: np.ndarray) -> float:
+    """Return the heading of an upright robot [rad]."""
+    return 2 * float(np.arctan2(qpos[6], qpos[3]))
+
+
+@pytest.mark.parametrize(
+    ("side", "bearing"),
+    [("Front", 0), ("Left", 90), ("Behind", 180), ("Right", -90)],
+)
+def test_a_side_of_the_panel_is_that_side_of_the_robot(
+    page: Page, side: str, bearing: float
+):
+    (buttons,) = (
+        handle
+        for handle in page.server.gui._gui_input_handle_from_uuid.values()
+        if handle._impl.props.label == "From"
+    )
+    visitor = Visitor(page.server.get_port())
+    try:
+        visitor.choose(buttons, side)
+        wait_for(lambda: page.sessions[0].first_throw is not None or serve(page))
+    finally:
+        visitor.leave()
+        page._commands.queue.clear()
+    page.play()
+    frame = page.sessions[0].frame
+    x, y = frame.balls[0, :2] - frame.qpos[:2]
+    off = np.arctan2(y, x) - heading_of(frame.qpos) - np.radians(bearing)
+    assert np.cos(off) > 0.99
+
+
+@pytest.mark.parametrize(("away", "distance"), [(0.7, 1.5), (5.0, 5.0), (30.0, 8.0)])
+def test_a_ball_from_the_floor_is_neither_too_near_nor_too_far(
+    page: Page, away: float, distance: float
+):
+    page.click(np.array([-away, 0.0, 2.0]), np.array([0.0, 0.0, -1.0]))
+    page.play()
+    frame = page.sessions[0].frame
+    start = np.linalg.norm(frame.balls[0, :2] - frame.qpos[:2])
+    # In a step it comes some centimetres nearer.
+    assert start == pytest.approx(distance, abs=0.15)
+
+
+def test_a_stronger_reading_is_redder_and_none_is_dark():
+    none, weak, strong = colour_of(np.array([0.0, 0.1, 1.0])).astype(int)
+    assert none.max() < 60
+    assert weak[2] - weak[0] > 200
+    assert strong[0] - strong[2] > 100
+
+
+def test_every_sensor_is_drawn_at_its_place_in_its_own_colour(page: Page):
+    page.throw_from(0.0)
+    while page.sessions[0].frame.reading.max() < 0.3:
+        page.play()
+    masked = int(page.sessions[0].frame.reading.argmin())
+    page.mask(0, {masked})
+    session, scene = page.sessions[0], page._scenes[0]
+    frame, skin = session.frame, session.skin
+    assert skin is not None
+    session.body.place(frame.qpos)
+    places, seen = session.body.sensor_points(skin), []
+    for which, mesh in scene._sensors:
+        # Of the link that it is drawn on.
+        link = scene._links[int(mesh.name.split("/link_")[1].split("/")[0])]
+        turn = np.zeros(9)
+        mujoco.mju_quat2Mat(turn, np.asarray(link.wxyz, float))
+        drawn = mesh.batched_positions @ turn.reshape(3, 3).T + link.position
+        np.testing.assert_allclose(drawn, places[which], atol=1e-3)
+        expected = colour_of(frame.reading[which])
+        expected[which == masked] = (214, 216, 221)
+        np.testing.assert_array_equal(mesh.batched_colors, expected)
+        seen += which.tolist()
+    assert sorted(seen) == list(range(len(skin)))
+    colours = np.concatenate([mesh.batched_colors for _, mesh in scene._sensors])
+    assert len(np.unique(colours, axis=0)) > 2
+
+
+def test_lines_of_fields_are_blue_and_of_rays_yellow(page: Page):
+    session = page.sessions[0]
+
+    def line_colours() -> np.ndarray:
+        page.throw_from(0.0)
+        for _ in range(90):
+            page.play()
+            if np.isfinite(session.frame.line).any():
+                break
+        page._draw(page._shown)
+        assert page._scenes[0]._lines.visible
+        return page._scenes[0]._lines.colors.reshape(-1, 3).astype(int)
+
+    red, _, blue = line_colours().T
+    assert (blue > red).all()
+    page.panel._kind.value = "ray, closest beam"
+    page.sense("kind")
+    sensor = session.config.sensor
+    assert (sensor.coverage, sensor.reduce) == ("ray", "min")
+    red, _, blue = line_colours().T
+    assert (red > blue).all()
+    page.load(0, "field_proximity")
+
+
+def test_the_newest_readings_are_at_the_right_of_the_map(page: Page):
+    # Two sensors in three of five steps.
+    readings = np.array([[0.1, 0.0], [0.0, 0.0], [0.0, 1.0]])
+    page.panel.show_map([readings], 5)
+    # Each reading has 2 x 2 pixels.
+    image = page.panel._map.image[::2, ::2]
+    shown = (image != colour_of(np.zeros(1))).any(-1)
+    expected = [[False, False, True, False, False], [False] * 4 + [True]]
+    np.testing.assert_array_equal(shown, expected)
+
+
+def test_plots_end_now_and_tell_the_strongest_reading_and_the_value(
+    page: Page, monkeypatch
+):
+    page.play()
+    frame, readings = page.sessions[0].frame, np.zeros((3, 64))
+    readings[0, 5], readings[2, :2] = 0.5, (0.25, 0.75)
+    page._memory.clear()
+    for i, reading in enumerate(readings):
+        page._memory.append([dataclasses.replace(frame, reading=reading, value=10 - i)])
+    # Policies of the package have no critic.
+    monkeypatch.setattr(page.sessions[0], "critic", "some critic")
+    page._show()
+    seconds, strongest = page.panel._nearest.data
+    np.testing.assert_allclose(seconds, np.array([-2, -1, 0]) / 60)
+    np.testing.assert_allclose(strongest, [0.5, 0.0, 0.75])
+    np.testing.assert_allclose(page.panel._value.data, (seconds, [10, 9, 8]))

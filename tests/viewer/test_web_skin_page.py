@@ -17,6 +17,7 @@ from calling import fail
 from egoskin.robots.builtin import H1_2
 from egoskin.robots.config import read_robot
 from egoskin.viewer.web import skin_page
+from egoskin.viewer.web.body import Body
 from egoskin.viewer.web.skin_page import SkinPage, colour_directions, group_joints
 from visiting import Visitor
 
@@ -181,6 +182,60 @@ def test_a_robot_of_ones_own_that_stands_fixed_is_shown(tmp_path):
         np.testing.assert_allclose(np.ptp(red[0].vertices[:, 2]), 0.4)
     finally:
         page.close()
+
+
+def test_the_share_of_directions_is_that_of_their_solid_angle(page: SkinPage):
+    # Seen from more than 30 degrees above the horizon: (1 - sin 30) / 2 of the sphere,
+    # but a third of the map's cells.
+    clearance = np.zeros((36, 72))
+    clearance[24:] = 0.5
+    page.show(clearance, 1.0)
+    assert page._result.content.startswith("**25.0%**")
+    cloud = page.server.scene._handle_from_node_name["/directions"]
+    centre = page.body.standing(page.joint_pos)[:3]
+    outward = cloud.points - centre
+    outward /= np.linalg.norm(outward, axis=1)[:, None]
+    is_red = (cloud.colors == (200, 30, 40)).all(1)
+    np.testing.assert_array_equal(is_red, outward[:, 2] < 0.5)
+
+
+@pytest.mark.parametrize("kind", ["field", "ray"])
+def test_the_chosen_kind_of_sensors_is_looked_with(
+    page: SkinPage, kind: str, monkeypatch
+):
+    given = []
+    monkeypatch.setattr(
+        skin_page, "see_directions", lambda *args, **_: given.append(args)
+    )
+    monkeypatch.setattr(page, "show", lambda *_: page._end(""))
+    page.move(2, 0.2)
+    page._kind.value = kind
+    look(page)
+    page._kind.value = "field"
+    ((robot, _, sensor, _),) = given
+    assert sensor.coverage == kind
+    # In the pose that is shown.
+    np.testing.assert_allclose(robot.default_joint_pos, page.joint_pos)
+    page.reset()
+
+
+def test_shapes_are_drawn_turned_moved_and_in_their_materials_colour(tmp_path):
+    path = tmp_path / "arm.xml"
+    path.write_text(
+        "<mujoco model='arm'><asset><material name='blue' rgba='0 0 1 1'/></asset>"
+        "<worldbody><body name='shoulder' pos='0 0 1'>"
+        "<geom type='box' size='0.1 0.2 0.3' pos='1 0 0' euler='0 0 90'/>"
+        "<geom size='0.1' material='blue'/><body name='upper'>"
+        "<joint name='lift' axis='0 1 0'/><geom size='0.1'/>"
+        "</body></body></worldbody></mujoco>"
+    )
+    grey, blue, upper = Body(read_robot(path)).parts()
+    assert grey.body == blue.body == upper.body - 1
+    assert blue.rgba == (0, 0, 1, 1)
+    low, high = grey.vertices.min(0), grey.vertices.max(0)
+    # In the frame of the link; a quarter turn exchanges two of the box's sides.
+    np.testing.assert_allclose(low, (0.8, -0.1, -0.3), atol=1e-6)
+    np.testing.assert_allclose(high, (1.2, 0.1, 0.3), atol=1e-6)
 
 
 def test_a_robot_whose_shapes_are_all_left_out_is_shown(tmp_path):
