@@ -31,6 +31,9 @@ from egoskin.study.manifest import Manifest, PlannedRun
 _POLL, _LOOK = 0.2, 5.0
 # Intervals between progress lines: on a terminal, in a file [s].
 _SHOW_LIVE, _SHOW_FILE = 2.0, 60.0
+# Memory of each run on a cluster [GB]: one with full ray grids has 2.3 GB while it is
+# evaluated.
+_MEMORY_GB = 3
 STOP_TIMEOUT_S = 120.0
 """How long a run may take to stop with a checkpoint [s]."""
 
@@ -298,6 +301,7 @@ def slurm_script(
 #SBATCH --nodes=1
 #SBATCH --ntasks=1
 #SBATCH --cpus-per-task={cores}
+#SBATCH --mem-per-cpu={_MEMORY_GB}G
 #SBATCH --time={minutes}
 #SBATCH --signal=B:TERM@180
 #SBATCH --requeue

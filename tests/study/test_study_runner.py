@@ -694,7 +694,8 @@ def test_the_slurm_script_shares_the_folder_among_its_elements():
     text = slurm_script(manifest, Path("/a/b"), cores=8, elements=3, hours=1.5)
     assert text.startswith("#!/bin/bash\n")
     assert "until `status` shows that all runs are done" in text
-    for line in ("--array=0-2", "--cpus-per-task=8", "--time=90", "--signal=B:TERM@"):
+    lines = ("--array=0-2", "--cpus-per-task=8", "--mem-per-cpu=3G", "--time=90")
+    for line in (*lines, "--signal=B:TERM@"):
         assert f"#SBATCH {line}" in text
     assert '--dir /a/b --parallel "$SLURM_CPUS_PER_TASK"' in text
     text = slurm_script(manifest, Path("/a/b c"), cores=8, elements=3, hours=1.5)
