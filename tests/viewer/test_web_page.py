@@ -559,6 +559,7 @@ def test_a_click_meets_the_nearer_robot(pair: Page):
     point = session.body.sensor_points(skin)[left] + pair._scenes[1].place
     pair.click(point + np.array([0, 2, 0]), np.array([0.0, -1.0, 0.0]))
     assert [len(session.masked) for session in pair.sessions] == [0, 1]
+    assert pair.panel._masked.content.startswith("**0 of 64 and 1 of 64** sensors")
     pair.mask_all(False)
 
 

@@ -343,10 +343,8 @@ class Page(ServedPage):
 
     def mask(self, i: int, sensors: Collection[int]) -> None:
         """Mask exactly these sensors of a robot."""
-        session = self.sessions[i]
-        session.mask(sensors)
-        if session.skin is not None:
-            self.panel.show_masked(len(sensors), len(session.skin))
+        self.sessions[i].mask(sensors)
+        self.panel.show_masked(self.sessions)
         if not self._replayed:
             self._shown = [session.frame for session in self.sessions]
         self._draw(self._shown)

@@ -284,11 +284,16 @@ class Panel:
             "Only options with as many values can be selected, and the policy may do "
             "worse with them. The number and positions of the sensors are fixed."
         )
-        self.show_masked(len(session.masked), len(session.skin))
+        self.show_masked(sessions)
 
-    def show_masked(self, masked: int, total: int) -> None:
-        """Show how many sensors are masked."""
-        self._masked.content = f"**{masked} of {total}** sensors masked. {_MASK_HELP}"
+    def show_masked(self, sessions: Sequence[Session]) -> None:
+        """Show how many sensors of each robot that has any are masked."""
+        counts = " and ".join(
+            f"{len(session.masked)} of {len(session.skin)}"
+            for session in sessions
+            if session.skin is not None
+        )
+        self._masked.content = f"**{counts}** sensors masked. {_MASK_HELP}"
 
     def show_map(self, readings: Sequence[np.ndarray], steps: int) -> None:
         """Show readings over time.
