@@ -186,6 +186,8 @@ class _Toml:
         self.path, self.text = path, read_regular(path).decode("utf-8-sig", "replace")
         try:
             self.content: dict[str, Any] = tomllib.loads(self.text)
+        except RecursionError:
+            raise ValueError(f"{path}: nested too deeply") from None
         except tomllib.TOMLDecodeError as error:
             # The text ends in (at line 3, column 5), or (at end of document).
             text = str(error)

@@ -195,6 +195,12 @@ def test_a_cylinder_between_two_points_is_where_it_was(tmp_path):
         np.testing.assert_allclose(*values, atol=1e-5)
 
 
+def test_a_file_that_is_nested_too_deeply_is_refused_with_its_name(tmp_path):
+    toml = f"x = {'[' * 10_000}{']' * 10_000}"
+    with pytest.raises(ValueError, match=r"robot\.toml: nested too deeply"):
+        read_folder(write_robot(tmp_path, toml))
+
+
 def test_paths_of_the_file_are_not_stored(tmp_path):
     model = MODEL.replace("<compiler ", f'<compiler meshdir="{tmp_path}" ')
     robot = portable(read_folder(write_robot(tmp_path / "walker", model=model)))
