@@ -18,6 +18,7 @@ import numpy as np
 import onnx
 import pytest
 import torch
+from tensordict import TensorDict
 
 import egoskin
 from calling import SCRIPTS
@@ -62,6 +63,23 @@ def deploy(policy: Policy, folder: Path, **kwargs: Any) -> Controller:
     return Controller(path, **kwargs)
 
 
+def check_target(controller: Controller, td: TensorDict, **given: Any) -> None:
+    """Check that a controller's target is that of our environment in the same step."""
+    target = controller.step(
+        base_quat=td["base_pose"][3:].numpy(),
+        base_ang_vel_b=td["base_ang_vel_b"].numpy(),
+        joint_pos=td["joint_pos"].numpy(),
+        joint_vel=td["joint_vel"].numpy(),
+        **given,
+    )
+    assert controller.stopped is None
+    scale = np.array(controller.metadata["action_scale"])
+    default = np.array(controller.metadata["default_joint_pos"])
+    # q* = q_default + scale x action
+    expected = default + scale * td["action"].numpy()
+    np.testing.assert_allclose(target, expected, 1e-4, 1e-4)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_from_raw_states_and_distances_come_our_environments_targets(kind, tmp_path):
     policy = make_policy(KINDS[kind])
@@ -74,24 +92,11 @@ def test_from_raw_states_and_distances_come_our_environments_targets(kind, tmp_p
     with torch.no_grad():
         # The robot falls, so all orientations occur.
         rollout = env.rollout(40, policy)[0]
-    scale = np.array(controller.metadata["action_scale"])
-    default = np.array(controller.metadata["default_joint_pos"])
     for td in rollout.unbind(0):
         reading = {}
         if kind != "blind":
             reading = {"distance": td["distance"].numpy(), "skin_age": 0.01}
-        target = controller.step(
-            base_quat=td["base_pose"][3:].numpy(),
-            base_ang_vel_b=td["base_ang_vel_b"].numpy(),
-            joint_pos=td["joint_pos"].numpy(),
-            joint_vel=td["joint_vel"].numpy(),
-            body_age=0.01,
-            **reading,
-        )
-        assert controller.stopped is None
-        # q* = q_default + scale x action
-        expected = default + scale * td["action"].numpy()
-        np.testing.assert_allclose(target, expected, 1e-4, 1e-4)
+        check_target(controller, td, body_age=0.01, **reading)
     if kind != "blind":
         assert rollout["distance"].isfinite().any()
 
@@ -116,20 +121,8 @@ def test_sensors_of_two_kinds_are_in_the_order_of_the_skin(tmp_path):
     assert rays.isfinite().any()
     assert fields.isfinite().any()
     distances = torch.cat((rays.flatten(2), fields[..., None]), -1).flatten(1)
-    scale = np.array(controller.metadata["action_scale"])
-    default = np.array(controller.metadata["default_joint_pos"])
     for td, distance in zip(rollout.unbind(0), distances.numpy(), strict=True):
-        target = controller.step(
-            base_quat=td["base_pose"][3:].numpy(),
-            base_ang_vel_b=td["base_ang_vel_b"].numpy(),
-            joint_pos=td["joint_pos"].numpy(),
-            joint_vel=td["joint_vel"].numpy(),
-            body_age=0.0,
-            distance=distance,
-        )
-        expected = default + scale * td["action"].numpy()
-        np.testing.assert_allclose(target, expected, 1e-4, 1e-4)
-    assert controller.stopped is None
+        check_target(controller, td, body_age=0.0, distance=distance)
 
 
 def test_every_signal_of_distances_is_compared():
