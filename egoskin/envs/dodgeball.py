@@ -116,7 +116,8 @@ class DodgeballEnv(EnvBase):
         hold: Whether the robot is held rigid in its start pose.
         tactile: Whether to return the links touched, under the key ``tactile``.
         engine: Physics engine.
-        device: Device of the simulation and of all tensors.
+        device: Device of the simulation and of all tensors. ``to`` moves inputs and
+            outputs to another one; the simulation stays.
 
     Raises:
         ValueError: If the robot's base does not float, or a joint is not a hinge, or a
@@ -148,7 +149,8 @@ class DodgeballEnv(EnvBase):
             if wrong := interval.violation(number):
                 raise ValueError(f"{name} must {wrong}, got {number}")
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
-        device = self.device
+        # Where it is computed; `self.device`, of inputs and outputs, can be changed.
+        self._simulated_on = device = self.device
         self.robot, self.config = robot, config
         self._seed, self._num_threads, self._engine = seed, num_threads, engine
         throws = config.throws
@@ -221,7 +223,7 @@ class DodgeballEnv(EnvBase):
                 self.scene,
                 self.batch_size[0],
                 num_threads=self._num_threads,
-                device=self.device,
+                device=self._simulated_on,
             )
         return self._physics
 
@@ -239,7 +241,8 @@ class DodgeballEnv(EnvBase):
     ) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None:
-            mask = torch.ones(self.batch_size[0], dtype=torch.bool, device=self.device)
+            mask = torch.ones_like(self._rows, dtype=torch.bool)
+        mask = mask.to(self._simulated_on)
         rows = mask.reshape(-1).nonzero()[:, 0]
         if len(rows):
             self._start_episodes(rows)
@@ -286,7 +289,7 @@ class DodgeballEnv(EnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         counters, config = self._counters, self.config
         # As with other simulators, no gradient passes through a step.
-        action = tensordict["action"].detach()
+        action = tensordict["action"].detach().to(self._simulated_on)
         # q* = q_default + scale x action
         acting = self.randomization.delayed(action)
         target = self._default + self._action_scale * acting
@@ -326,7 +329,7 @@ class DodgeballEnv(EnvBase):
             joint_deviation=state.joint_pos - self._default,
             power=result.power,
             base_lin_vel_w=state.base_lin_vel_w,
-            displacement_w=out["displacement_w"],
+            displacement_w=state.base_pose[:, :2],
             action_change=action - counters["previous_action"],
             terminated=terminated,
         )

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from egoskin.agents.ppo import PPO
@@ -13,7 +14,7 @@ from egoskin.agents.rollout import collect
 from egoskin.envs.physics import MujocoPhysics
 from egoskin.envs.randomization import RandomizationConfig
 from egoskin.evaluation.throw_set import play_throws
-from egoskin.make import EnvConfig, make_worker_env
+from egoskin.make import EnvConfig, make_env, make_worker_env
 from egoskin.policies.policy import PolicySpec, load_policy
 from egoskin.runs.config import TrainConfig
 from egoskin.runs.run import Run
@@ -96,6 +97,31 @@ def test_a_rollout_is_computed_on_the_device(config, monkeypatch):
     for key, value in found.items():
         assert isinstance(value, Labelled), key
         assert torch.equal(value.content, expected[key]), key
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_an_environment_moved_to_the_device_still_simulates_on_the_cpu(workers):
+    def steps(device: torch.device | None = None) -> list[TensorDictBase]:
+        own = {"config": CONFIGS["ray, reduced"], "num_envs": 4, "seed": 0}
+        env = make_env(**own, num_workers=2) if workers else make_worker_env(**own)
+        if device is not None:
+            env = env.to(device)
+        torch.manual_seed(0)
+        root, found = env.reset(), []
+        for _ in range(40):
+            root["action"] = 3 * torch.randn(env.action_spec.shape).to(env.device)
+            step, root = env.step_and_maybe_reset(root)
+            found.append(step)
+        env.close()
+        return found
+
+    expected = steps()
+    assert any(step["next", "done"].any() for step in expected)
+    with second_device() as device:
+        for found, step in zip(steps(device), expected, strict=True):
+            for key, value in found.items(True, True):
+                assert isinstance(value, Labelled), key
+                assert torch.equal(value.content, step[key]), key
 
 
 def test_a_run_on_the_device_is_saved_and_resumed(engine, tmp_path, monkeypatch):
