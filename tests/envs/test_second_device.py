@@ -11,7 +11,6 @@ from torch import Tensor
 
 from egoskin.agents.ppo import PPO
 from egoskin.agents.rollout import collect
-from egoskin.envs.physics import MujocoPhysics
 from egoskin.envs.randomization import RandomizationConfig
 from egoskin.evaluation.throw_set import play_throws
 from egoskin.make import EnvConfig, make_env, make_worker_env
@@ -56,7 +55,14 @@ CONFIGS = {
 @pytest.fixture
 def engine(monkeypatch):
     """The engine of the device, whatever name it is asked for by."""
+    _use_device(monkeypatch)
+
+
+def _use_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From here on, all environments are on the device."""
     monkeypatch.setattr("egoskin.make.engine_of", lambda name: OnSecondDevice)
+    for module in ("make", "runs.trainer"):
+        monkeypatch.setattr(f"egoskin.{module}.device_of", lambda name: DEVICE)
 
 
 def test_tensors_of_two_devices_do_not_meet():
@@ -89,7 +95,7 @@ def rollout(config: EnvConfig, device: torch.device | str) -> dict[str, Tensor]:
 @pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
 def test_a_rollout_is_computed_on_the_device(config, monkeypatch):
     expected = rollout(config, "cpu")
-    monkeypatch.setattr("egoskin.make.engine_of", lambda name: OnSecondDevice)
+    _use_device(monkeypatch)
     with second_device() as device:
         found = rollout(config, device)
     assert found.keys() == expected.keys()
@@ -132,7 +138,6 @@ def test_a_run_on_the_device_is_saved_and_resumed(engine, tmp_path, monkeypatch)
         return {"loss_actor": zero, "loss_critic": zero, "entropy": zero}
 
     monkeypatch.setattr(PPO, "step", step)
-    monkeypatch.setattr("egoskin.runs.trainer.device_of", lambda name: DEVICE)
     config = TrainConfig(engine="warp", num_envs=32, run_dir=tmp_path / "run")
     with second_device():
         with open_trainer(Run.create(config)) as trainer:
@@ -146,15 +151,15 @@ def test_a_run_on_the_device_is_saved_and_resumed(engine, tmp_path, monkeypatch)
         assert found[key] == expected[key]
 
 
-def test_a_policy_is_evaluated_on_the_device(engine, monkeypatch):
+def test_a_policy_is_evaluated_on_the_device(monkeypatch):
     policy = load_policy("field_proximity")
-    args = (policy, policy.env_config, policy.skin)
+    args = (policy.env_config, policy.skin)
+    expected = play_throws(policy, *args, throw_set=0, episodes=4)
+    _use_device(monkeypatch)
+    policy = load_policy("field_proximity")
     with second_device() as device:
         found = play_throws(
-            *args, throw_set=0, episodes=4, engine="warp", device=device
+            policy, *args, throw_set=0, episodes=4, engine="warp", device=device
         )
-    monkeypatch.setattr("egoskin.make.engine_of", lambda name: MujocoPhysics)
-    policy = load_policy("field_proximity")
-    expected = play_throws(*(policy, *args[1:]), throw_set=0, episodes=4)
     assert torch.equal(found.steps, expected.steps)
     assert torch.equal(found.hit, expected.hit)
