@@ -8,6 +8,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from egoskin.gradients import is_differentiated
+
 
 def pad_rows(rows: Tensor) -> Tensor:
     """Return row indices padded to a multiple of 32 by repeating the first.
@@ -34,8 +36,16 @@ def exact_sqrt(x: Tensor) -> Tensor:
     precision, rounded to float32, is always exact.
 
     Args:
-        x: Any tensor; for float64 the result is that of PyTorch.
+        x: Any tensor; for float64 the result is that of PyTorch. At 0 the derivative is
+            taken as 0: infinity would become NaN in whatever the argument depends on.
     """
+    if is_differentiated(x):
+        zero = x == 0
+        return torch.where(zero, 0.0, _root(x.masked_fill(zero, 1.0)))
+    return _root(x)
+
+
+def _root(x: Tensor) -> Tensor:
     if torch.compiler.is_compiling() or x.dtype != torch.float32:
         return x.sqrt()
     return x.double().sqrt_().float()

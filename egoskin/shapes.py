@@ -36,8 +36,8 @@ from typing import Protocol, runtime_checkable
 import mujoco
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
+from egoskin.gradients import is_differentiated
 from egoskin.hints import did_you_mean
 from egoskin.rounding import exact_sqrt
 
@@ -300,10 +300,15 @@ class Ellipsoid:
         Computed by iteration. For semi-axes from 0.02 m to 2 m and points inside or up
         to 3 m away, also in symmetry planes and on axes, the error is at most 1e-6 m in
         float32 and 1e-12 m in float64; farther away, at most that fraction of the
-        distance.
+        distance. Inside, derivatives are 0.
         """
         least = min(self.semi_axes) ** 2
         u = self._multiplier(x, y, z)
+        if any(map(is_differentiated, (x, y, z))):
+            # Inside, near the inner planes, the multiplier's derivative overflows.
+            inside = u < least
+            x, y, z = (torch.where(inside, p.detach(), p) for p in (x, y, z))
+            u = self._multiplier(x, y, z)
         s = u - least
         # The dual of min |p - x|^2 with x on the surface, which is maximal at the root:
         # d^2 = s (sum_i p_i^2 / (a_i^2 + s) - 1). The error of s enters squared, and no
@@ -481,25 +486,13 @@ def _slab_interval(half: float, p: Tensor, d: Tensor) -> Interval:
     # away in all other cases. It also makes the face belong to the slab.
     low, high, inverse = -half - p - _TINY, half - p + _TINY, 1.0 / d
     first, second = low * inverse, high * inverse
-    if first.requires_grad or is_dual(first):
+    if is_differentiated(first):
         # The infinite ends of a parallel line are constant, not of gradient 0 * inf.
         parallel = d == 0
         inverse = 1.0 / d.masked_fill(parallel, 1.0)
         first = torch.where(parallel, first.detach(), low * inverse)
         second = torch.where(parallel, second.detach(), high * inverse)
     return first.minimum(second), first.maximum(second)
-
-
-def is_dual(x: Tensor) -> bool:
-    """Whether a tensor has a forward-mode derivative, or belongs to `torch.func`.
-
-    Neither is seen in its data. Under ``torch.compile``, where neither can be known, it
-    is taken for granted.
-    """
-    if torch.compiler.is_compiling():
-        return True
-    wrapped = torch._C._functorch.is_functorch_wrapped_tensor(x)
-    return wrapped or forward_ad.unpack_dual(x).tangent is not None
 
 
 def _overlap(a: Interval, b: Interval) -> Interval:

@@ -38,7 +38,8 @@ class FieldSensor(ProximitySensor):
     closest point lies within that angle of the normal.
 
     Finite readings above 0 are differentiable with respect to poses and joint
-    positions, in reverse and forward mode (not under `torch.vmap`).
+    positions, in reverse and forward mode (not under `torch.vmap`: use
+    `torch.func.jacrev`). The derivative of a reading of 0 is 0.
 
     Args:
         skin: The sensors. A coverage or range set in the skin takes precedence.
@@ -48,7 +49,9 @@ class FieldSensor(ProximitySensor):
             None if the skin sets a range for every sensor.
         coverage: Coverage of sensors for which the skin sets none.
         body: The robot's shapes, for occlusion: an object is seen if the straight path
-            to its closest point is free. Empty: no occlusion.
+            to its closest point is free. A sensor inside a shape of its own link is
+            taken to be on the surface above it; one inside a shape of another link sees
+            nothing. Empty: no occlusion.
         per_object: Write one distance per object, ``distance [*B, S, O]``.
         compile: Use kernels if all objects are balls and there is no occlusion: in C++
             if it can be compiled, on CUDA in Warp if it is installed; only for float32
@@ -93,10 +96,11 @@ class FieldSensor(ProximitySensor):
         cos_half = None
         if any(f.half_angle_deg < 180 for f in fields):
             cosines = [
-                # Rounding would hide an object straight behind a sensor of 180 degrees.
-                math.cos(math.radians(f.half_angle_deg))
-                if f.half_angle_deg < 180
-                else -math.inf
+                # Rounding would hide an object straight behind a sensor of 180 degrees,
+                # and straight beside one of 90 degrees, whose cosine would be 6e-17.
+                {180: -math.inf, 90: 0.0}.get(
+                    f.half_angle_deg, math.cos(math.radians(f.half_angle_deg))
+                )
                 for f in fields
             ]
             cos_half = torch.tensor(cosines, dtype=torch.float64)[:, None]

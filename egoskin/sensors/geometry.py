@@ -26,6 +26,7 @@ from torch import Tensor
 from torchrl.data import Binary as BinarySpec
 from torchrl.data import Composite, TensorSpec, Unbounded
 
+from egoskin.gradients import is_differentiated
 from egoskin.robots.config import Primitive
 from egoskin.robots.kinematics import LinkKinematics, quat_to_entries
 from egoskin.rounding import matmul, matvec
@@ -267,6 +268,10 @@ class ProximitySensor(RowTransform):
         self, base_pose: Tensor, joint_pos: Tensor, object_pose: Tensor, active: Tensor
     ) -> Scene:
         """Return the scene of the four inputs."""
+        if any(map(is_differentiated, (base_pose, joint_pos, object_pose))):
+            # An object that is not active may have any pose, of zeros or NaN too, but
+            # 0 times its derivatives must be 0: this one is far from all sensors.
+            object_pose = torch.where(active[..., None], object_pose, 1e3)
         poison = self._poison(base_pose, joint_pos, object_pose)
         objects = (object_pose + poison[..., None]).permute(1, 2, 0).contiguous()
         skin = {

@@ -12,7 +12,8 @@ from egoskin.rounding import matvec
 from egoskin.shapes import shape_of
 
 # A path is blocked if a longer part of it than this lies inside one primitive [m]. The
-# surface that a sensor sits on therefore does not block it, nor paths along a surface.
+# surface that a sensor sits on therefore does not block it, nor do paths that graze a
+# round one; a path exactly in a flat face is blocked, as the face belongs to the shape.
 _DEPTH = 1e-3
 # Sensors less than this below a surface are on it: skin files have six decimals [m].
 _ROUNDING = 1e-5

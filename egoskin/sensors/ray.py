@@ -11,6 +11,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
+from egoskin.gradients import is_differentiated
 from egoskin.robots.config import Primitive
 from egoskin.rounding import matmul, matvec
 from egoskin.sensors.geometry import (
@@ -24,7 +25,7 @@ from egoskin.sensors.kernels.binding import VECTOR
 from egoskin.sensors.signals import Binary, Proximity
 from egoskin.sensors.skin.coverage import Ray
 from egoskin.sensors.skin.skin import Skin
-from egoskin.shapes import Solid, first_hit, is_dual
+from egoskin.shapes import Solid, first_hit
 from egoskin.sparse import SparseRows
 
 # Margin for rounding when pairs of sensor and object are culled [m].
@@ -47,7 +48,8 @@ class RaySensor(ProximitySensor):
     the field of view are computed (a few per cent); the result is the same.
 
     Finite readings above 0 are differentiable with respect to poses and joint
-    positions, in reverse and forward mode (not under `torch.vmap`).
+    positions, in reverse and forward mode (not under `torch.vmap`: use
+    `torch.func.jacrev`). The derivative of a reading of 0 is 0.
 
     Args:
         skin: The sensors. A coverage or range set in the skin takes precedence; all
@@ -58,7 +60,7 @@ class RaySensor(ProximitySensor):
             None if the skin sets a range for every sensor.
         coverage: Coverage of sensors for which the skin sets none.
         reduce: "min" writes only the minimum over each sensor's beams.
-        body: The robot's shapes, for occlusion; empty: no occlusion.
+        body: The robot's shapes, for occlusion, as in `FieldSensor`; empty: none.
         per_object: Write one distance per object, in a last dimension ``O``.
         compile: Use kernels if all objects are balls and there is no occlusion: in C++
             if it can be compiled, on CUDA in Warp if it is installed; only for float32
@@ -343,7 +345,7 @@ def _padded(directions: np.ndarray) -> np.ndarray:
 
 def _numpy_serves(x: Tensor) -> bool:
     """Whether NumPy may operate on a tensor's memory."""
-    return x.is_cpu and not x.requires_grad and not is_dual(x)
+    return x.is_cpu and not is_differentiated(x)
 
 
 def _nonzero(x: Tensor) -> Tensor:

@@ -268,6 +268,7 @@ def test_a_hemisphere_sees_what_lies_above_its_plane():
     # The closest point of a ball lies towards its centre.
     assert look(sensor, (0.6, 0, 0.8)) == (pytest.approx(0.85), [True])
     assert look(sensor, (1, 0, 1e-6)) == (pytest.approx(0.85), [True])
+    assert look(sensor, (1, 0, 0)) == (pytest.approx(0.85), [True])
     assert look(sensor, (1, 0, -1e-6)) == (math.inf, [False])
     assert look(sensor, (0, 0, -1)) == (math.inf, [False])
 

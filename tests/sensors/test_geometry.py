@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from functools import partial
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -134,6 +135,56 @@ def test_forward_derivatives_are_those_of_finite_differences(
     error = (tangent[smooth] - expected).abs()
     assert error.quantile(0.99) < 1e-5
     assert expected.abs().quantile(0.5) > 0.01
+
+
+@pytest.mark.parametrize("body", [(), H1_2.primitives], ids=["free", "occluded"])
+@pytest.mark.parametrize("shape", SHAPES)
+@every_kind
+def test_inactive_objects_do_not_change_gradients(
+    skin, random_state, kind, shape, body
+):
+    state = random_state(16, seed=1, dtype=torch.float64)
+    state["object_active"][:, 0], state["object_active"][:, 1] = True, False
+    objects = (Sphere(radius=0.2), shape)
+    sensor = kind(skin, H1_2.chain, objects, 2.0, body=body)
+
+    def gradients(number: float | None) -> list[torch.Tensor]:
+        poses = [state[key].clone() for key in KEYS[:3]]
+        if number is not None:
+            poses[2][:, 1] = number
+        poses = [x.requires_grad_() for x in poses]
+        distance, _ = sensor.compute(*poses, state["object_active"])
+        distance[distance.isfinite()].sum().backward()
+        return [x.grad for x in poses]
+
+    expected = gradients(None)
+    assert expected[1].abs().max() > 0.01
+    for number in (0.0, 1.0, math.nan, math.inf):
+        for a, b in zip(gradients(number), expected, strict=True):
+            assert torch.equal(a, b), number
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+@pytest.mark.parametrize("shape", SHAPES)
+@every_kind
+def test_gradients_are_finite_where_the_distance_has_none(kind, shape, dtype):
+    """Sensors at the centre of an object and on its surface, besides one far away."""
+    position = np.array([[0.0, 0, 0], [shape.half_height, 0, 0], [0.3, 0, 0.6]])
+    chain, links = H1_2.chain, ("pelvis",) * 3
+    skin = Skin(robot="h1_2", links=links, position=position, normal=np.eye(3)[[0] * 3])
+    sensor = kind(skin, chain, shape, 2.0)
+    # The object's z axis points along the base's x axis.
+    half = math.sqrt(0.5)
+    inputs = [
+        torch.tensor([[0.0, 0, 1, 1, 0, 0, 0]], dtype=dtype),
+        torch.zeros(1, len(H1_2.joints), dtype=dtype),
+        torch.tensor([[[0.0, 0, 1, half, 0, half, 0]]], dtype=dtype),
+    ]
+    poses = [x.requires_grad_() for x in inputs]
+    distance, _ = sensor.compute(*poses, torch.ones(1, 1, dtype=torch.bool))
+    assert distance[0, 0].max() == 0.0
+    distance[distance.isfinite()].sum().backward()
+    assert all(x.grad is not None and x.grad.isfinite().all() for x in poses)
 
 
 @every_kind

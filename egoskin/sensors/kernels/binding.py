@@ -13,9 +13,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from egoskin.gradients import is_dual
 from egoskin.robots.kinematics import LinkKinematics
 from egoskin.sensors.kernels.compilation import load_library
-from egoskin.shapes import Sphere, is_dual
+from egoskin.shapes import Sphere
 
 if TYPE_CHECKING:
     from egoskin.sensors.kernels.warp import WarpKernels
