@@ -61,6 +61,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("GOMP_SPINCOUNT", "0")
 
 if TYPE_CHECKING:
+    from egoskin.evaluation.throw_set import evaluate, standard_task
     from egoskin.make import EnvConfig, make_env, make_worker_env
     from egoskin.policies.policy import Policy, load_policy
 
@@ -68,13 +69,23 @@ __version__ = "0.1.0"
 
 _EXPORTS = {
     "EnvConfig": "egoskin.make",
+    "evaluate": "egoskin.evaluation.throw_set",
     "make_env": "egoskin.make",
     "make_worker_env": "egoskin.make",
     "Policy": "egoskin.policies.policy",
     "load_policy": "egoskin.policies.policy",
+    "standard_task": "egoskin.evaluation.throw_set",
 }
 
-__all__ = ["EnvConfig", "Policy", "load_policy", "make_env", "make_worker_env"]
+__all__ = [
+    "EnvConfig",
+    "Policy",
+    "evaluate",
+    "load_policy",
+    "make_env",
+    "make_worker_env",
+    "standard_task",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -83,7 +83,7 @@ def check_bounds(config: Any) -> None:
     """Raise BoundsError if a number of a dataclass is out of bounds, or a name unknown.
 
     Numbers are checked against the `Interval` of their field, names against its
-    literals. Nested dataclasses are not checked; they check their own fields.
+    literals. Nested dataclasses must be such; they check their own fields.
 
     Args:
         config: The dataclass; it calls this first in its ``__post_init__``.
@@ -100,6 +100,11 @@ def check_bounds(config: Any) -> None:
         value = getattr(config, name)
         if value not in choices:
             text = f"{name} must be one of {', '.join(choices)}, got {value!r}"
+            raise BoundsError(type(config), text)
+    for field in dataclasses.fields(config):
+        value, kind = getattr(config, field.name), field.default_factory
+        if dataclasses.is_dataclass(kind) and not isinstance(value, kind):
+            text = f"{field.name} must be a {kind.__name__}, got {type(value).__name__}"
             raise BoundsError(type(config), text)
 
 

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -236,6 +236,7 @@ def make_env(
     num_workers: int | None = None,
     num_threads: int = 1,
     hold: bool = False,
+    keep_raw: bool = False,
     bare: bool = False,
     sparse: bool = False,
     mask: Sequence[str] = (),
@@ -252,6 +253,8 @@ def make_env(
             above the number of cores.
         num_threads: Physics threads of each worker.
         hold: Whether the robots are held rigid in their default pose.
+        keep_raw: Whether to keep the raw state in the output (of `DodgeballEnv`), from
+            which transforms of your own compute, say, another reward.
         bare: Whether to leave out observations and sensors.
         sparse: Whether to output the state, not the signal; see `make_worker_env`.
         mask: Links whose sensors detect nothing, or `egoskin.sensors.MASK_ALL`.
@@ -267,9 +270,14 @@ def make_env(
         # Built once, not in each worker.
         skin = config.skin.build(config.robot_config)
     # Errors in the scene and lack of memory are reported before the workers start.
-    one = make_worker_env(
-        config, skin, num_envs=1, seed=seed, bare=bare, sparse=sparse, mask=mask
-    )
+    options: dict[str, Any] = {
+        "seed": seed,
+        "keep_raw": keep_raw,
+        "bare": bare,
+        "sparse": sparse,
+        "mask": mask,
+    }
+    one = make_worker_env(config, skin, num_envs=1, **options)
     assert isinstance(one.base_env, DodgeballEnv)
     one.base_env.check_scene()
     check_env_memory(one, num_envs)
@@ -281,13 +289,10 @@ def make_env(
                 config,
                 skin,
                 num_envs=rows,
-                seed=seed,
                 row_offset=i * rows,
                 num_threads=num_threads,
                 hold=hold,
-                bare=bare,
-                sparse=sparse,
-                mask=mask,
+                **options,
             )
             for i in range(workers)
         ]

@@ -41,6 +41,7 @@ import torch
 import torchrl._utils
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl._utils import seed_generator
 from torchrl.envs import EnvBase, ParallelEnv, Transform, TransformedEnv
 
 from egoskin.cgroups import cpu_limit
@@ -363,6 +364,17 @@ class WorkerPool(ParallelEnv):
         )
         # TorchRL permanently lowers the parent's threads when the workers start.
         self.num_threads = threads
+
+    def set_seed(
+        self, seed: int | None = None, static_seed: bool = False
+    ) -> int | None:
+        """Set the seed of all workers; return TorchRL's next seed.
+
+        All workers get the same one, as their rows already differ: the results do not
+        depend on their number.
+        """
+        super().set_seed(seed, static_seed=True)
+        return seed if static_seed or seed is None else seed_generator(seed)
 
     def simulation_state(self) -> dict[str, Tensor]:
         """Return the state of all rows, in the order of the workers."""

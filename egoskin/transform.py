@@ -119,6 +119,12 @@ class _KeyedTransform(Transform):
             ) from error
         self._check_one_each("out_specs", specs)
         for key, spec in zip(self.out_keys, specs, strict=True):
+            if key in observation_spec.keys(True) and key not in self.in_keys:
+                raise ValueError(
+                    f"{type(self).__name__} would overwrite {key!r}, which it does not "
+                    "read, and which the environment or a transform before it writes: "
+                    "give one of them out_keys of its own"
+                )
             observation_spec[key] = _on_device_of(observation_spec, spec)
         return observation_spec
 
@@ -160,6 +166,19 @@ class _KeyedTransform(Transform):
             ]
         self._written = [value.detach() for value in values]
         self._write(tensordict, values)
+
+    def _valid(
+        self, method: str, values: Sequence[Tensor], rows: int
+    ) -> Sequence[Tensor]:
+        """Return a method's results; raise unless there is a row for each input row."""
+        self._check_one_each(method, values)
+        for key, value in zip(self.out_keys, values, strict=True):
+            if not value.ndim or len(value) != rows:
+                raise ValueError(
+                    f"{type(self).__name__}.{method} must return a row for each of the "
+                    f"{rows} rows of its inputs, got {list(value.shape)} for {key!r}"
+                )
+        return values
 
     def _check_one_each(self, method: str, results: object) -> None:
         """Raise TypeError unless there is one result for each out key.
@@ -267,10 +286,8 @@ class RowTransform(_KeyedTransform):
     def _first(self, inputs: Sequence[Tensor]) -> Sequence[Tensor]:
         return self._computed(inputs)
 
-    def _computed(self, inputs: Sequence[Tensor]) -> tuple[Tensor, ...]:
-        values = self.compute(*inputs)
-        self._check_one_each("compute", values)
-        return values
+    def _computed(self, inputs: Sequence[Tensor]) -> Sequence[Tensor]:
+        return self._valid("compute", self.compute(*inputs), len(inputs[0]))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the out keys into any tensordict that holds the in keys."""
@@ -309,6 +326,9 @@ class StatefulTransform(_KeyedTransform):
         in_keys: Keys read; never written.
         out_keys: Keys written.
         state_keys: The out keys that the next step reads back.
+
+    Raises:
+        ValueError: If the keys are not lists, or a state key is no out key.
     """
 
     def __init__(
@@ -318,8 +338,12 @@ class StatefulTransform(_KeyedTransform):
         state_keys: Sequence[NestedKey],
     ) -> None:
         super().__init__(in_keys, out_keys)
-        assert set(state_keys) <= set(out_keys)
-        self.state_keys = list(state_keys)
+        self.state_keys = key_list("state_keys", state_keys)
+        if others := [key for key in self.state_keys if key not in self.out_keys]:
+            raise ValueError(
+                f"state_keys must be among the out_keys, {self.out_keys}; not so: "
+                f"{others}"
+            )
         # Reference to the last state written. On a reset after a step, TorchRL only
         # passes which rows reset; this is the state at the end of their episodes.
         self._last: list[Tensor] | None = None
@@ -370,7 +394,20 @@ class StatefulTransform(_KeyedTransform):
 
     def _first(self, inputs: Sequence[Tensor]) -> Sequence[Tensor]:
         row = torch.zeros(1, dtype=torch.int64, device=inputs[0].device)
-        return self.start(row, inputs, None)
+        return self._started(row, inputs, None)
+
+    def _started(
+        self,
+        rows: Tensor,
+        inputs: Sequence[Tensor],
+        before: Sequence[Tensor] | None,
+    ) -> Sequence[Tensor]:
+        return self._valid("start", self.start(rows, inputs, before), len(rows))
+
+    def _advanced(
+        self, rows: Tensor, inputs: Sequence[Tensor], state: Sequence[Tensor]
+    ) -> Sequence[Tensor]:
+        return self._valid("advance", self.advance(rows, inputs, state), len(rows))
 
     def transform_state_spec(self, state_spec: TensorSpec) -> TensorSpec:
         """Return the spec with the state keys added."""
@@ -418,7 +455,7 @@ class StatefulTransform(_KeyedTransform):
         inputs = self._read(next_tensordict, self.in_keys)
         state = self._read(tensordict, self.state_keys)
         rows = torch.arange(len(inputs[0]), device=inputs[0].device)
-        values = self.advance(rows, inputs, state)
+        values = self._advanced(rows, inputs, state)
         self._last = self._state_of(values)
         self._write_rows(next_tensordict, values)
         return next_tensordict
@@ -435,13 +472,13 @@ class StatefulTransform(_KeyedTransform):
         partial = self._rows_to_reset(tensordict, total)
         if partial is None:
             every = torch.arange(total, device=inputs[0].device)
-            values = self.start(every, inputs, before)
+            values = self._started(every, inputs, before)
             self._last = self._state_of(values)
             self._write_rows(tensordict_reset, values)
             return tensordict_reset
         rows, index = partial
         ended = None if before is None else [x[index] for x in before]
-        values = self.start(index, [x[index] for x in inputs], ended)
+        values = self._started(index, [x[index] for x in inputs], ended)
         # The other rows keep their state until they are reset.
         self._last = [
             _spread(new, rows, total, old)
@@ -501,13 +538,15 @@ class StatefulTransform(_KeyedTransform):
         steps = []
         for t in range(batch[-1]):
             now = [x[:, t] for x in inputs]
-            values = None if state is None else self.advance(rows, now, state)
+            values = None if state is None else self._advanced(rows, now, state)
             if values is None:
-                values = self.start(rows, now, None)
+                values = self._started(rows, now, None)
             elif starts[:, t].any():
                 values = [
                     torch.where(starts[:, t].reshape(-1, *[1] * (new.ndim - 1)), new, x)
-                    for new, x in zip(self.start(rows, now, state), values, strict=True)
+                    for new, x in zip(
+                        self._started(rows, now, state), values, strict=True
+                    )
                 ]
             state = self._state_of(values)
             steps.append(values)

@@ -112,3 +112,10 @@ def test_each_name_of_a_training_is_checked(kind, name):
 def test_the_place_of_a_configuration_in_another_is_known():
     assert path_to(ThrowConfig, TrainConfig) == "env.task.throws."
     assert path_to(TrainConfig, TrainConfig) == ""
+
+
+def test_a_group_of_fields_must_be_its_dataclass():
+    for name, value in (("env", {"history": 3}), ("ppo", None)):
+        message = f"{name} must be a .*Config, got {type(value).__name__}"
+        with pytest.raises(ValueError, match=message):
+            TrainConfig(**{name: value})

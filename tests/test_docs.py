@@ -173,6 +173,7 @@ TUTORIALS = [
     "tutorial-gentact",
     pytest.param("tutorial-study", marks=SLOW),
     "tutorial-deploy",
+    "tutorial-train",
     pytest.param("sensors", marks=SLOW),
     pytest.param("your-robot", marks=SLOW),
 ]

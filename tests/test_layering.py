@@ -19,6 +19,7 @@ TOOLS = [
     "bounds",
     "cgroups",
     "memory",
+    "gradients",
     "rounding",
     "warp_philox",
     "rng",

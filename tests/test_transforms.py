@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -39,7 +40,7 @@ from egoskin.sensors import (
     place_sensors,
 )
 from egoskin.sensors.config import SensorConfig
-from egoskin.transform import RowTransform
+from egoskin.transform import RowTransform, StatefulTransform
 from throwing import TASK, assert_same, wild_actions
 
 SKIN = place_sensors(H1_2, 12, seed=0)
@@ -204,9 +205,67 @@ def test_results_that_are_not_one_for_each_key_are_refused(method, given):
         ask(given_to_it)
 
 
+class Summed(StatefulTransform):
+    """The sum of an input over an episode, by an author who may make mistakes."""
+
+    def __init__(self, mistake: str = "", state_keys: Sequence[str] = ("sum",)) -> None:
+        super().__init__(in_keys=["x"], out_keys=["sum"], state_keys=state_keys)
+        self._mistake = mistake
+
+    def start(self, rows, inputs, before) -> Any:
+        return inputs[0] if self._mistake == "start, bare" else (inputs[0],)
+
+    def advance(self, rows, inputs, state) -> Any:
+        total = state[0] + inputs[0]
+        return {
+            "advance, bare": total,
+            "advance, none": (),
+            "advance, a row": (total[:1],),
+            "advance, a number": (total.sum(),),
+        }.get(self._mistake, (total,))
+
+
+def test_results_of_a_transform_with_a_state_are_checked():
+    values, done = torch.arange(6.0).reshape(2, 3, 1), torch.zeros(2, 3, 1) > 0
+    data = TensorDict({"x": values, "next": {"done": done}}, [2, 3])
+    assert torch.equal(Summed()(data)["sum"], values.cumsum(1))
+    for mistake, error, message in (
+        ("start, bare", TypeError, r"Summed\.start must return a tuple .* got Tensor"),
+        ("advance, bare", TypeError, r"Summed\.advance must return a tuple .*Tensor"),
+        ("advance, none", TypeError, r"Summed\.advance must return .* got tuple of 0"),
+        (
+            *("advance, a row", ValueError),
+            r"Summed\.advance must .* a row for each of the 2 .* \[1, 1\] for 'sum'",
+        ),
+        ("advance, a number", ValueError, r"got \[\] for 'sum'"),
+    ):
+        with pytest.raises(error, match=message):
+            Summed(mistake)(data)
+
+
+def test_what_another_transform_writes_is_not_overwritten():
+    sensor = FieldSensor(SKIN, H1_2.chain, BALLS, 1.0)
+    spec = Composite(distance=Unbounded((1, 12)), shape=[1])
+    spec = Proximity(sensor).transform_observation_spec(spec)
+    with pytest.raises(ValueError, match="Binary would overwrite 'signal', which it"):
+        Binary(sensor).transform_observation_spec(spec)
+    spec = Binary(sensor, out_keys=["seen"]).transform_observation_spec(spec)
+    assert {"signal", "seen"} < {*spec}
+
+
+def test_measurements_without_the_dimension_that_is_reduced_are_refused():
+    data = TensorDict({"distance": torch.ones(4, 12)}, [4])
+    with pytest.raises(ValueError, match=r"BeamMinimum needs beams, .* is \[\*B, 12\]"):
+        BeamMinimum()(data)
+    with pytest.raises(ValueError, match=r"'distance' must be \[\*B, S, \.\.\.\], got"):
+        Proximity(1.0)(TensorDict({"distance": torch.ones(4)}, [4]))
+
+
 @pytest.mark.parametrize(
     ("build", "message"),
     [
+        (lambda: Summed(state_keys=("total",)), r"state_keys must be among the out_ke"),
+        (lambda: Summed(state_keys="sum"), "state_keys must be a list of keys, got"),
         # Only `Proximity` and `Binary` take the sensor.
         (
             lambda: Localization(FieldSensor(SKIN, H1_2.chain, BALLS, 1.0)),

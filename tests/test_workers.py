@@ -104,6 +104,22 @@ def test_results_do_not_depend_on_the_number_of_workers(skin):
     assert_same(results[0], results[2])
 
 
+def test_a_seed_set_later_does_not_depend_on_the_number_of_workers(skin):
+    results = []
+    for number in (1, 2, 4):
+        pool = make_pool(skin, number)
+        try:
+            following = pool.set_seed(7)
+            found = steps(pool, pool.reset(), 20, seed=0)[0]
+            results.append((following, pool.set_seed(7, static_seed=True), found))
+        finally:
+            pool.close()
+    assert len({(following, static) for following, static, _ in results}) == 1
+    assert results[0][0] != results[0][1] == 7
+    assert_same(results[0][2], results[1][2])
+    assert_same(results[0][2], results[2][2])
+
+
 def test_a_saved_state_continues_bit_for_bit_on_other_workers(skin):
     pool = make_pool(skin, 2)
     try:

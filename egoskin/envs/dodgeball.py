@@ -103,7 +103,7 @@ class DodgeballEnv(EnvBase):
 
     All draws are functions of (seed, global row, episode, ...): rows
     ``row_offset`` to ``row_offset + num_envs`` give the same episodes whichever
-    process simulates them. With a ParallelEnv, call
+    process simulates them. With a ParallelEnv of your own, call
     ``set_seed(seed, static_seed=True)``.
 
     Args:

@@ -160,7 +160,9 @@ def play_throws(
     """Return how the episodes of a throw set end.
 
     Args:
-        policy: Writes ``action`` into a TensorDict; None is the zero action.
+        policy: Writes ``action`` into a TensorDict; None is the zero action. What it
+            writes under ``next`` is given to it at the next step, as the memory of a
+            recurrent policy, and if it reads ``is_init``, that is true at the first.
         config: Robot, task, sensors.
         skin: The skin.
         throw_set: Seed of the throw set.
@@ -210,14 +212,23 @@ def play_throws(
     balls = {k: torch.zeros(episodes, 2) for k in ("balls_arrived", "balls_avoided")}
     try:
         root: TensorDictBase = env.reset()
+        # What the policy is given besides the environment's keys.
+        memory: dict[Any, Tensor] = {}
+        starts = "is_init" in getattr(policy, "in_keys", ())
         first_throw = root["first_throw_step"].reshape(-1).cpu().clone()
         last = config.task.max_first_throw_step + config.task.episode_steps
         for step in range(1, last + 1):
-            flat = root.reshape(-1)
+            flat = root.reshape(-1).copy()
+            if starts:
+                memory["is_init"] = torch.full_like(flat["done"], step == 1)
+            flat.update(memory)
             if policy is None:
                 action = torch.zeros(env.action_spec.shape, device=env.device)
             else:
-                action = policy(flat)["action"]
+                written = policy(flat)
+                action = written["action"]
+                if "next" in written.keys():
+                    memory = dict(written["next"].items(True, True))
                 # MuJoCo treats NaN as zero, so the results would look normal.
                 if not action.isfinite().all():
                     raise ValueError(

@@ -8,7 +8,7 @@ properties of the configuration.
 from __future__ import annotations
 
 import fnmatch
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
@@ -103,6 +103,11 @@ class Primitive:
     """Centre in the link frame [m], ``[3]``."""
     rotation: np.ndarray
     """Orientation in the link frame (a capsule's axis is z), ``[3, 3]``."""
+
+    def __post_init__(self) -> None:
+        """Accept lists."""
+        for name in ("size", "position", "rotation"):
+            object.__setattr__(self, name, np.asarray(getattr(self, name), float))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -218,6 +223,17 @@ class RobotConfig:
         first = self.model.body_jntadr[self._bodies[0]]
         free = mujoco.mjtJoint.mjJNT_FREE
         return bool(first >= 0 and self.model.jnt_type[first] == free)
+
+    @property
+    def base_pose(self) -> np.ndarray:
+        """Pose of the base in the world where the file puts it, ``[7]``.
+
+        Position [m] and quaternion (w, x, y, z). If the base does not float, it is what
+        sensors read as ``base_pose``.
+        """
+        data = self._in_pose(self.default_joint_pos)
+        base = self._bodies[0]
+        return np.concatenate((data.xpos[base], data.xquat[base]))
 
     def check_floating_base(self) -> None:
         """Raise ValueError unless the base floats, upright, and the rest are hinges."""
@@ -400,15 +416,27 @@ class RobotConfig:
         return build_chain(self.model, self.base)
 
 
-def read_robot(path: Path | str) -> RobotConfig:
+def read_robot(
+    path: Path | str,
+    *,
+    base: str | None = None,
+    skin_links: Sequence[str] | None = None,
+) -> RobotConfig:
     """Return the robot of an MJCF or URDF file, to place or import sensors on.
 
-    The base is the only body attached to the world if it has a free joint or none, else
-    (with several such bodies, or a hinge between them) the world itself. All links may
-    carry skin. The name is the model's, or else the file's.
+    The name is the model's, or else the file's.
+
+    Args:
+        path: The file.
+        base: Base of the robot; bodies that are not below it are left out (those of a
+            scene, say). By default the only body attached to the world if it has a free
+            joint or none, else (with several such bodies, or a hinge between them) the
+            world itself.
+        skin_links: Links that may carry skin; by default all.
 
     Raises:
-        ValueError: If MuJoCo cannot read the file as MJCF or URDF.
+        ValueError: If MuJoCo cannot read the file as MJCF or URDF, or the base or a
+            link is not in it.
         OSError: If there is no such file.
     """
     path = Path(path)
@@ -418,17 +446,22 @@ def read_robot(path: Path | str) -> RobotConfig:
         raise ValueError(f"{path} must be an MJCF (.xml) or a URDF (.urdf, .xml)")
     whole = RobotConfig(name=path.stem, model_path=path, base="world", skin_links=())
     model, name = whole.model, whole.spec().modelname
-    in_world = np.flatnonzero(model.body_parentid[1:] == 0) + 1
-    of_base = model.jnt_type[model.jnt_bodyid == in_world[0]] if len(in_world) else []
-    # Joints of the base are not part of its chain.
-    one = len(in_world) == 1 and all(t == mujoco.mjtJoint.mjJNT_FREE for t in of_base)
-    return replace(
-        whole,
-        # MuJoCo's default name of a model.
-        name=whole.name if name in ("", "MuJoCo Model") else name,
-        base=body_name(model, int(in_world[0])) if one else "world",
-        skin_links=whole.links,
-    )
+    if base is None:
+        in_world = np.flatnonzero(model.body_parentid[1:] == 0) + 1
+        kinds = model.jnt_type[model.jnt_bodyid == in_world[0]] if len(in_world) else []
+        # Joints of the base are not part of its chain.
+        one = len(in_world) == 1 and all(k == mujoco.mjtJoint.mjJNT_FREE for k in kinds)
+        base = body_name(model, int(in_world[0])) if one else "world"
+    # MuJoCo's default name of a model.
+    name = whole.name if name in ("", "MuJoCo Model") else name
+    robot = replace(whole, name=name, base=base)
+    links = robot.links if skin_links is None else tuple(skin_links)
+    if others := [link for link in links if link not in robot.links]:
+        raise ValueError(
+            f"{path}: no links {others} below base {base!r}; it has "
+            f"{', '.join(robot.links)}"
+        )
+    return replace(robot, skin_links=links)
 
 
 def round_off(radius: float, half_length: float) -> tuple[str, list[float]]:

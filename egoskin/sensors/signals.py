@@ -66,8 +66,11 @@ class _Reading(RowTransform):
         """Return the signal, ``[B, S ...]`` flattened.
 
         Raises:
-            ValueError: If there are several ranges, but not one for each sensor.
+            ValueError: If there are several ranges, but not one for each sensor, or no
+                dimension of sensors.
         """
+        if inputs[0].ndim < 2:
+            raise ValueError(f"{self.in_keys[0]!r} must be [*B, S, ...], got [*B]")
         ranges, sensors = len(self._range), inputs[0].shape[1]
         if ranges > 1 and ranges != sensors:
             raise ValueError(
@@ -240,7 +243,16 @@ class BeamMinimum(RowTransform):
         super().__init__(in_keys, out_keys)
 
     def compute(self, *inputs: Tensor) -> tuple[Tensor, ...]:
-        """Return the minima, ``[B, S]``."""
+        """Return the minima, ``[B, S]``.
+
+        Raises:
+            ValueError: If the measurements have no dimension of beams.
+        """
+        if inputs[0].ndim < 3:
+            raise ValueError(
+                f"BeamMinimum needs beams, [*B, S, K], but {self.in_keys[0]!r} is [*B, "
+                f"{', '.join(map(str, inputs[0].shape[1:]))}]"
+            )
         return (inputs[0].amin(-1),)
 
 

@@ -292,6 +292,8 @@ def slurm_script(
     minutes = max(round(60 * hours), 1)
     logs = shlex.quote(str(folder / "logs" / "slurm-%A-%a.log"))
     path = shlex.quote(str(folder))
+    # Of this environment, which the nodes need not have activated.
+    python = shlex.quote(sys.executable)
     return f"""#!/bin/bash
 # Study {manifest.study}: {len(manifest.runs)} runs, shared by all elements.
 # An element that reaches its time limit stops with checkpoints; one that is killed
@@ -306,5 +308,5 @@ def slurm_script(
 #SBATCH --signal=B:TERM@180
 #SBATCH --requeue
 #SBATCH --output={logs}
-exec egoskin study run --dir {path} --parallel "$SLURM_CPUS_PER_TASK"
+exec {python} -m egoskin study run --dir {path} --parallel "$SLURM_CPUS_PER_TASK"
 """

@@ -213,6 +213,29 @@ def test_a_throw_set_ends_the_same_in_this_process_and_on_2_workers():
     assert len(one.steps) == 32
 
 
+@pytest.mark.parametrize("workers", [None, 2])
+def test_a_policy_is_given_its_memory(workers):
+    seen: list[torch.Tensor] = []
+
+    class Counting(torch.nn.Module):
+        """Counts its calls in an entry that the environment does not know."""
+
+        in_keys = ("signal", "is_init", "count")
+
+        def forward(self, td):
+            before = torch.where(td["is_init"], 0.0, td.get("count", torch.zeros(1)))
+            seen.append(before.clone())
+            td["next", "count"] = before + 1
+            return td.set("action", torch.zeros(*td.shape, 21))
+
+    case = make_case()
+    play_throws(Counting(), **case, throw_set=3, num_workers=workers)
+    assert len(seen) > 20
+    for step, counts in enumerate(seen):
+        assert counts.shape == (32, 1)
+        assert (counts == step).all()
+
+
 @pytest.mark.parametrize("version", ["2", "1"])
 def test_every_standard_throw_meets_a_robot_that_does_not_move(version):
     case = make_case(version)

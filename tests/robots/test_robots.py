@@ -18,10 +18,10 @@ from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
 from egoskin.envs.physics import PhysicsConfig, Scene
 from egoskin.envs.physics.model import build_scene
 from egoskin.robots.builtin import H1_2
-from egoskin.robots.config import Gain, RobotConfig, read_robot
+from egoskin.robots.config import Gain, Primitive, RobotConfig, read_robot
 from egoskin.robots.kinematics import LinkKinematics
 from egoskin.robots.surface import default_frames, distance_to
-from egoskin.sensors import FieldSensor, place_sensors
+from egoskin.sensors import FieldSensor, Skin, place_sensors
 from egoskin.shapes import Sphere
 
 HUMANOID = RobotConfig(
@@ -268,6 +268,63 @@ def test_an_mjcf_is_a_robot_whatever_stands_in_its_world(tmp_path):
         robot = read_robot(str(path))
         assert (robot.name, robot.base, robot.links) == ("two", base, links)
     assert read_robot(H1_2.model_path).links == H1_2.links
+
+
+def test_a_robot_may_be_one_body_of_a_scene(tmp_path):
+    path = tmp_path / "scene.xml"
+    path.write_text(
+        "<mujoco><worldbody><geom type='plane' size='1 1 1'/>"
+        "<body name='ball' mocap='true'><geom size='.1'/></body>"
+        "<body name='bot'><freejoint/><geom size='.1'/><body name='arm'><joint/>"
+        "<geom size='.1'/></body></body></worldbody></mujoco>"
+    )
+    with pytest.raises(
+        ValueError, match=r"free joint as the base \(read_robot\(path, b"
+    ):
+        _ = read_robot(path).chain
+    robot = read_robot(path, base="bot")
+    assert (robot.base, robot.links, robot.skin_links) == ("bot", *[("bot", "arm")] * 2)
+    assert robot.floats
+    assert {p.link for p in robot.primitives} == {"bot", "arm"}
+    skin = place_sensors(read_robot(path, base="bot", skin_links=["arm"]), 5)
+    assert {*skin.links} == {"arm"}
+    for options, message in (
+        ({"base": "bat"}, "the model has no body 'bat', did you mean 'bot'"),
+        (
+            {"base": "bot", "skin_links": ["ball"]},
+            r"no links \['ball'\] below base 'bot'",
+        ),
+    ):
+        with pytest.raises(ValueError, match=message):
+            read_robot(path, **options)
+
+
+def test_the_base_is_where_the_file_puts_it(tmp_path):
+    path = tmp_path / "arm.xml"
+    path.write_text(
+        "<mujoco><worldbody><body name='stand' pos='0.3 -0.2 0.5' euler='0 0 90'>"
+        "<geom size='.1'/><body name='b' pos='1 0 0'><joint name='j'/>"
+        "<geom size='.1'/></body></body></worldbody></mujoco>"
+    )
+    robot, half = read_robot(path), np.sqrt(0.5)
+    expected = [0.3, -0.2, 0.5, half, 0, 0, half]
+    np.testing.assert_allclose(robot.base_pose, expected, atol=1e-12)
+    # A ball beyond the arm, which points along the world's y axis.
+    skin = Skin(
+        robot="arm", links=("b",), position=np.zeros((1, 3)), normal=np.eye(3)[:1]
+    )
+    sensor = FieldSensor(skin, robot.chain, Sphere(radius=0.1), 2.0)
+    ball = torch.tensor([[[0.3, 1.3, 0.5, 1.0, 0, 0, 0]]], dtype=torch.float64)
+    base = torch.from_numpy(robot.base_pose)[None]
+    inputs = base, torch.zeros(1, 1).double(), ball, torch.ones(1, 1) > 0
+    assert float(sensor.compute(*inputs)[0]) == pytest.approx(0.4, abs=1e-6)
+
+
+def test_shapes_of_a_body_may_be_given_as_lists():
+    shape = Primitive(
+        link="a", kind="box", size=[1, 2, 3], position=[0, 0, 0], rotation=np.eye(3)
+    )
+    assert (shape.size.tolist(), shape.position.shape) == ([1.0, 2.0, 3.0], (3,))
 
 
 @pytest.mark.parametrize(

@@ -407,7 +407,12 @@ def test_a_link_without_sensors_in_this_skin_is_refused():
 
 @pytest.mark.parametrize(
     ("mask", "message"),
-    [([3, 99], "no sensor 99: there are 24"), ([True, False], "flags of sensors")],
+    [
+        ([3, 99], "no sensor 99: there are 24"),
+        ([True, False], "flags of sensors"),
+        (["torso_link"], r"sensors must be indices or flags, got \['torso_link'\]"),
+        ([0.5], r"sensors must be indices or flags, got \[0.5\]"),
+    ],
 )
 def test_a_mask_that_does_not_fit_is_refused_and_changes_nothing(mask, message):
     sensor = FieldSensor(SKIN, H1_2.chain, Sphere(radius=0.15), 2.0)
@@ -417,11 +422,16 @@ def test_a_mask_that_does_not_fit_is_refused_and_changes_nothing(mask, message):
         sensor.mask(mask)
     assert torch.equal(sensor._range, before)
     corruption = Corruption([Noise(constant=0.1)], dt=0.02, seed=0)
-    corruption.mask(mask)
     stored = TensorDict(
         distance=torch.ones(2, 3, 24),
         is_init=torch.zeros(2, 3, 1, dtype=torch.bool),
         batch_size=[2, 3],
     )
-    with pytest.raises(ValueError, match=message):
+
+    # It learns the number of sensors from the measurements only.
+    def use() -> None:
+        corruption.mask(mask)
         corruption(stored)
+
+    with pytest.raises(ValueError, match=message):
+        use()

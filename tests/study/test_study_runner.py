@@ -8,6 +8,7 @@ import io
 import json
 import os
 import select
+import shlex
 import shutil
 import signal
 import socket
@@ -699,7 +700,8 @@ def test_the_slurm_script_shares_the_folder_among_its_elements():
         assert f"#SBATCH {line}" in text
     assert '--dir /a/b --parallel "$SLURM_CPUS_PER_TASK"' in text
     text = slurm_script(manifest, Path("/a/b c"), cores=8, elements=3, hours=1.5)
-    assert "exec egoskin study run --dir '/a/b c' --parallel" in text
+    command = f"exec {shlex.quote(sys.executable)} -m egoskin study run"
+    assert f"{command} --dir '/a/b c' --parallel" in text
     assert "#SBATCH --output='/a/b c/logs/slurm-%A-%a.log'" in text
 
 

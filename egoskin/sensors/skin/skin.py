@@ -61,6 +61,8 @@ def indices(sensors: Indices, number: int | None = None) -> list[int]:
             sensor.
     """
     array = np.asarray(sensors)
+    if array.size and array.dtype.kind not in "biu":
+        raise ValueError(f"sensors must be indices or flags, got {sensors!r}")
     if array.dtype == bool:
         if array.ndim != 1 or number not in (None, len(array)):
             raise ValueError(
