@@ -18,7 +18,7 @@ import torch
 import tyro
 
 from egoskin.commands.errors import parse_subcommand
-from egoskin.commands.skin import views
+from egoskin.commands.skin import bare_links, views
 from egoskin.envs.dodgeball import DodgeballConfig, DodgeballEnv
 from egoskin.envs.physics import PhysicsConfig
 from egoskin.envs.throws import ThrowConfig
@@ -29,6 +29,7 @@ from egoskin.robots.config import RobotConfig
 from egoskin.robots.own import raw_robot
 from egoskin.robots.portable import Portable, make_portable
 from egoskin.sensors.config import SkinConfig
+from egoskin.sensors.skin.fit import fit_notes
 from egoskin.storage.files import check_output
 from egoskin.viewer.film import save_picture
 
@@ -56,7 +57,7 @@ class Check:
             ValueError: If the robot cannot be trained.
         """
         check_output(self.out, "--out", (".png",))
-        robot = raw_robot(self.robot)
+        robot = original = raw_robot(self.robot)
         meshes: list[Finding] = []
         if ROBOTS.get(robot.name) is not robot:
             made = make_portable(robot)
@@ -67,7 +68,7 @@ class Check:
             f"{counted(len(robot.links), 'link')}, {mass:.2f} kg"
         )
         wrong = 0
-        for finding in (*meshes, *findings(robot, self.skin)):
+        for finding in (*meshes, *findings(robot, self.skin, original)):
             print(f"  {finding.kind:<5}  {finding.text}", flush=True)
             wrong += finding.kind == "wrong"
         if self.out is not None:
@@ -103,14 +104,17 @@ def _meshes(made: Portable) -> Iterator[Finding]:
         )
 
 
-def findings(robot: RobotConfig, skin: SkinConfig) -> Iterator[Finding]:
+def findings(
+    robot: RobotConfig, skin: SkinConfig, original: RobotConfig | None = None
+) -> Iterator[Finding]:
     """Check a robot, from its model to how it stands.
 
     Args:
         robot: The robot.
         skin: Placement of its sensors.
+        original: The robot with its visual shapes, if that is another one.
     """
-    static = [*check_model(robot), *_skin(robot, skin)]
+    static = [*check_model(robot), *_skin(robot, skin, original or robot)]
     yield from static
     if any(finding.kind == "wrong" for finding in static):
         yield Finding("note", "whether it stands is tested once this is fixed")
@@ -119,7 +123,9 @@ def findings(robot: RobotConfig, skin: SkinConfig) -> Iterator[Finding]:
     yield from _standing(robot)
 
 
-def _skin(robot: RobotConfig, skin: SkinConfig) -> Iterator[Finding]:
+def _skin(
+    robot: RobotConfig, skin: SkinConfig, original: RobotConfig
+) -> Iterator[Finding]:
     """Check the links that carry sensors, at which the throws are aimed."""
     if not robot.skin_links:
         yield Finding("wrong", "no skin_links to place sensors on and to aim balls at")
@@ -135,6 +141,10 @@ def _skin(robot: RobotConfig, skin: SkinConfig) -> Iterator[Finding]:
         return
     on = counted(len(set(made.links)), "link")
     yield Finding("ok", f"skin: {counted(len(made), 'sensor')} on {on}")
+    for text in bare_links(robot, robot.skin_links, original):
+        yield Finding("note", f"skin: {text}, and balls pass through")
+    for text in fit_notes(made, robot):
+        yield Finding("note", f"skin: {text}")
 
 
 def _actuation(robot: RobotConfig) -> Iterator[Finding]:

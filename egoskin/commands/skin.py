@@ -29,6 +29,7 @@ from egoskin.robots.config import RobotConfig
 from egoskin.robots.own import find_robot
 from egoskin.sensors import Skin
 from egoskin.sensors.skin.coverage import Coverage
+from egoskin.sensors.skin.fit import fit_notes
 from egoskin.sensors.skin.gentact import load_gentact, save_gentact
 from egoskin.sensors.skin.mesh_surface import Meshes, meshes_in_folder, meshes_of_mjcf
 from egoskin.sensors.skin.placement import place_sensors
@@ -126,6 +127,8 @@ class Place:
         )
         skin.save(self.out)
         print(table(skin, str(self.out)))
+        for text in bare_links(robot, self.links or robot.skin_links):
+            print(f"note: {text}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -223,6 +226,8 @@ class Show:
         if robot is not None:
             skin.check_robot(robot.name, robot.links, str(self.skin))
         print(table(skin, str(self.skin)))
+        for text in fit_notes(skin, robot) if robot is not None else ():
+            print(f"note: {text}")
         if self.picture is not None:
             if robot is None:
                 raise ValueError(
@@ -243,6 +248,29 @@ def describe(coverage: Coverage | None) -> str:
         if getattr(coverage, f.name) != getattr(default, f.name)
     ]
     return " ".join([type(coverage).__name__.lower(), *changed])
+
+
+def bare_links(
+    robot: RobotConfig, links: Sequence[str], original: RobotConfig | None = None
+) -> list[str]:
+    """Return a line about links that look as if they could carry sensors, but cannot.
+
+    Args:
+        robot: The robot.
+        links: The links.
+        original: The robot with its visual shapes, if that is another one.
+    """
+    seen = original or robot
+    bare = [
+        link
+        for link in links
+        if not robot.has_shape(link)
+        and (seen.is_urdf or seen.has_shape(link, visual=True))
+    ]
+    if not bare:
+        return []
+    hint = " (meshes of a URDF are left out: give them as --meshes)" * robot.is_urdf
+    return [f"no collision shape on {', '.join(bare)}: no sensors there{hint}"]
 
 
 def table(skin: Skin, title: str) -> str:

@@ -369,6 +369,12 @@ class RobotConfig:
         on_links = np.isin(model.geom_bodyid, wanted)
         return np.flatnonzero(on_links & touching).tolist()
 
+    def has_shape(self, link: str, *, visual: bool = False) -> bool:
+        """Return whether a link has a collision shape or, if asked, any other one."""
+        if not visual:
+            return bool(self._collision_geoms([link]))
+        return body_id(self.model, link) in self.model.geom_bodyid
+
     def primitives_on(self, links: Collection[str]) -> tuple[Primitive, ...]:
         """Return the collision shapes of some links, with their poses in their frames.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,11 +15,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from egoskin.storage.files import write_figure
+from egoskin.study.differences import Difference
 from egoskin.study.findings import MARGIN, SAME, Judged
 from egoskin.study.folder import Result
 from egoskin.study.manifest import Manifest
 from egoskin.study.metrics import frames_to, has_learnt
-from egoskin.study.statistics import Effect, Table, contrast, spread
+from egoskin.study.statistics import ALPHA, Effect, Table, contrast, spread
 
 # Colours of Okabe and Ito, which are colour-blind safe, and markers.
 _STYLES = {
@@ -28,6 +30,8 @@ _STYLES = {
     "closeness": ("#CC79A7", "D"),
 }
 _OTHERS = ("#E69F00", "#56B4E9", "#CC79A7", "#0072B2", "#D55E00", "#009E73")
+# Line styles of the first, second, ... cells that have the same of these colours.
+_LINES = ("-", "--", ":", "-.")
 _BLIND = "#555555"
 # Label and colour of robots without a skin, by coverage.
 _UNSKINNED = {"none": ("blind", _BLIND), "oracle": ("oracle", "#000000")}
@@ -127,12 +131,7 @@ def success_by_range(
         seen: Cells of a report of `egoskin.evaluation.visibility`; empty: without the
             warning time.
     """
-    # The axis is logarithmic and finite.
-    grid = {
-        k: v
-        for k, v in places(manifest).items()
-        if table.get(k) and math.isfinite(v.range)
-    }
+    grid = on_axis(manifest, table)
     names = [
         n for n in _GEOMETRIES.values() if n in {p.geometry for p in grid.values()}
     ]
@@ -178,6 +177,61 @@ def success_by_range(
     for axes in (lower or [panels])[-1]:
         axes.set_xlabel("detection range [m]")
     _legend_above(figure, panels)
+    return figure
+
+
+def on_axis(manifest: Manifest, table: Table) -> dict[str, Place]:
+    """Return the positions of the cells of `success_by_range` that have values.
+
+    Its axis is logarithmic and finite.
+    """
+    return {
+        name: place
+        for name, place in places(manifest).items()
+        if table.get(name) and math.isfinite(place.range)
+    }
+
+
+def success_by_cell(
+    manifest: Manifest, table: Table, found: Sequence[Difference]
+) -> Figure | None:
+    """Draw success of each cell and its difference to the first; None for one cell.
+
+    Args:
+        manifest: The study.
+        table: Success at 3 s [%].
+        found: The differences; cells without one have only their success.
+    """
+    names = [cell.name for cell in manifest.cells if table.get(cell.name)]
+    if len(names) < 2:
+        return None
+    labels = ["\n".join(textwrap.wrap(name, 40)) for name in names]
+    lines = sum(label.count("\n") + 1 for label in labels)
+    figure = Figure(figsize=(10.5, 0.8 + 0.3 * lines), layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True)
+    for y, name in enumerate(names):
+        values = list(table[name].values())
+        own, colour = spread(values), _STYLES["localization"][0]
+        whole: dict[str, Any] = {"clip_on": False, "zorder": 3, "color": colour}
+        if own.seeds == 1:
+            left.plot(own.iqm, y, "o", mfc="white", **whole)
+        else:
+            left.hlines(y, own.low, own.high, color=colour, linewidth=6, alpha=0.4)
+            left.plot(own.iqm, y, "o", **whole)
+            left.plot(values, [y] * own.seeds, ".k", markersize=3, clip_on=False)
+    for each in found:
+        differs = each.effect.error > 0 and each.p_value <= ALPHA
+        colour = _VERDICTS["refuted" if differs else "undecided"]
+        _draw_effect(right, names.index(each.cell), each.effect, colour)
+    right.axvline(0, color="black", linewidth=0.8)
+    left.set(xlim=(0, 100), xlabel="success: untouched for 3 s [%]")
+    right.set_xlabel(f"difference to {labels[0]} [percentage points]")
+    left.set_yticks(range(len(names)), labels, fontsize=8)
+    left.set_ylim(len(names) - 0.4, -0.6)
+    for axes in (left, right):
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(axis="x", linewidth=0.4, alpha=0.5)
+    right.tick_params(axis="y", length=0)
     return figure
 
 
@@ -264,6 +318,9 @@ def learning_curves(manifest: Manifest, results: Sequence[Result]) -> Figure | N
     grid = {k: v for k, v in places(manifest).items() if k in by_cell}
     bare = {cell: colour for cell, (_, colour) in _unskinned(manifest).items()}
     others = [name for name in by_cell if name not in grid and name not in bare]
+    lines = {
+        name: _LINES[i // len(_OTHERS) % len(_LINES)] for i, name in enumerate(others)
+    }
     rows = [n for n in _GEOMETRIES.values() if n in {p.geometry for p in grid.values()}]
     ranges = sorted({p.range for p in grid.values()})
     panels: list[list[tuple[str, dict[str, str]]]] = [
@@ -303,7 +360,7 @@ def learning_curves(manifest: Manifest, results: Sequence[Result]) -> Figure | N
         for name, colour in {**cells, **bare}.items():
             if name in by_cell:
                 label = grid[name].signal if name in grid else name
-                _draw_curves(axes, by_cell[name], colour, label)
+                _draw_curves(axes, by_cell[name], colour, lines.get(name, "-"), label)
         axes.set_title(title, fontsize=10)
         axes.set_ylim(0, 100)
         _plain(axes)
@@ -319,20 +376,20 @@ def learning_curves(manifest: Manifest, results: Sequence[Result]) -> Figure | N
 
 @mpl.rc_context({"path.simplify_threshold": _SIMPLIFY})
 def _draw_curves(
-    axes: Axes, results: Sequence[Result], colour: str, label: str
+    axes: Axes, results: Sequence[Result], colour: str, line: str, label: str
 ) -> None:
     """Draw the learning curves of a cell."""
     first = max(r.stored.frames[0] for r in results)
     last = min(r.stored.frames[-1] for r in results)
     for result in results if len(results) > 1 else ():
         frames, success = result.stored.frames, 100 * result.stored.success
-        axes.plot(frames / 1e6, success, color=colour, linewidth=0.6, alpha=0.6)
+        axes.plot(frames / 1e6, success, line, color=colour, linewidth=0.6, alpha=0.6)
     x = np.array([f for f in results[0].stored.frames if first <= f <= last])
     if len(x):
         mean = np.mean(
             [np.interp(x, r.stored.frames, r.stored.success) for r in results], 0
         )
-        axes.plot(x / 1e6, 100 * mean, color=colour, linewidth=2, label=label)
+        axes.plot(x / 1e6, 100 * mean, line, color=colour, linewidth=2, label=label)
 
 
 def _draw_effect(axes: Axes, y: float, effect: Effect, colour: str) -> None:

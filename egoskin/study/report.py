@@ -24,9 +24,11 @@ from egoskin.study.figures import (
     equivalence,
     forest,
     learning_curves,
+    on_axis,
     places,
     sample_efficiency,
     save,
+    success_by_cell,
     success_by_range,
 )
 from egoskin.study.findings import CELLS, Judged, Tested, judge_findings
@@ -75,7 +77,7 @@ def write_report(folder: StudyFolder, out: Path) -> None:
     else:
         found = differences(names, values["success_3s"])
     seen = _seen(folder)
-    pictures = _pictures(manifest, results, values["success_3s"], judged, seen)
+    pictures = _pictures(manifest, results, values["success_3s"], judged, found, seen)
     for name, (figure, _) in pictures.items():
         save(figure, out, name)
     shown = {
@@ -98,6 +100,7 @@ def _pictures(
     results: Sequence[Result],
     success: Table,
     judged: Sequence[Judged],
+    found: Sequence[Difference],
     seen: Sequence[Mapping[str, Any]],
 ) -> dict[str, tuple[Figure, str]]:
     """Return the figures for which there are data, with their captions."""
@@ -112,12 +115,21 @@ def _pictures(
     )
     if not {g for g, _ in grid} >= set(RAYS) or (RAYS[0], "localization") not in grid:
         shared = ""
+    by_range = success_by_range(manifest, success, seen)
     drawn = {
         "success-by-range": (
-            success_by_range(manifest, success, seen),
+            # One cell alone says nothing about the range.
+            by_range if len(on_axis(manifest, success)) > 1 else None,
             "Success against range: interquartile mean (hollow: one seed) and range "
             f"(bars) over seeds; each dot is a seed. {shared}{warnings if seen else ''}"
             "Infinite ranges are left out.",
+        ),
+        "success-by-cell": (
+            None if judged else success_by_cell(manifest, success, found),
+            "Left: interquartile mean (hollow: one seed) and range (bars) over seeds; "
+            "each dot is a seed. Right: difference to the first cell, with its 90 % "
+            "(thick) and 95 % (thin) interval, without correction for the number of "
+            "cells; red: p is at most 0.05 after that correction.",
         ),
         "findings": (
             forest(tested) if tested else None,
@@ -198,12 +210,15 @@ def _blocks(
         yield "## Differences to the first cell"
         yield (
             f"Success at 3 s of each cell minus that of {first}, "
-            "compared seed by seed if they share two or more seeds. Two-sided "
-            "p-values, corrected for the number of cells (Holm). *Seeds* is the number "
+            "compared seed by seed if they share two or more seeds (others are then "
+            "left out). Two-sided p-values, corrected for the number of cells (Holm); "
+            "intervals are not corrected. *Seeds* is the number "
             "it is based on and, if p is above 0.05, the total that would decide it "
             f"with a power of 80 % if effect and spread stay as observed. {_ASSUMED}"
         )
         yield _difference_rows(found)
+    if "success-by-cell" in shown:
+        yield shown["success-by-cell"]
     yield "## The cells"
     yield (
         "Interquartile mean and range over seeds; in brackets the mean with its 95 % "

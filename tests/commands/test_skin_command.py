@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 from calling import call, fail, succeed
+from egoskin.commands.skin import bare_links
 from egoskin.robots.builtin import H1_2
 from egoskin.sensors import Field, Ray, Skin, place_sensors
 
@@ -315,3 +316,14 @@ def test_bad_input_is_one_clear_message(args, expected):
     before = sorted(Path().iterdir())
     assert expected in fail("skin", *args)
     assert sorted(Path().iterdir()) == before
+
+
+def test_links_that_cannot_carry_sensors_are_told(small_robot):
+    robot = small_robot(
+        "<geom size='.1'/><body name='seen'><geom size='.1' contype='0'"
+        " conaffinity='0'/></body><body name='frame'/>"
+    )
+    links = ("base", "seen", "frame")
+    note = "no collision shape on seen: no sensors there"
+    assert bare_links(robot, links) == [note]
+    assert bare_links(robot, ["base", "frame"]) == []

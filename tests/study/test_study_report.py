@@ -29,6 +29,7 @@ from egoskin.study.figures import (
     places,
     sample_efficiency,
     save,
+    success_by_cell,
     success_by_range,
 )
 from egoskin.study.findings import judge_findings
@@ -421,9 +422,9 @@ def test_curves_of_a_long_training_make_a_small_picture(tmp_path: Path):
     axes = figure.subplots()
     axes.set_ylim(0, 100)
     # One seed is its own mean; two are also drawn each.
-    _draw_curves(axes, [seed], "red", "one seed")
+    _draw_curves(axes, [seed], "red", "-", "one seed")
     assert len(axes.lines) == 1
-    _draw_curves(axes, [seed, seed], "blue", "two seeds")
+    _draw_curves(axes, [seed, seed], "blue", "-", "two seeds")
     assert len(axes.lines) == 1 + 3
     save(figure, tmp_path, "curves")
     paths = re.findall(r'd="([^"]*)"', (tmp_path / "curves.svg").read_text())
@@ -536,6 +537,57 @@ def test_a_success_of_zero_is_not_cut_at_the_axis(manifest: Manifest):
     assert figure is not None
     (axes,) = figure.axes
     assert not any(x.get_clip_on() for x in axes.lines if x.get_marker() == "s")
+
+
+def own_study(*more: dict[str, object]) -> tuple[Manifest, dict]:
+    """A study of fields that the paper does not change, and made-up successes."""
+    cells = ({}, {"history": 3}, {"sensor.corruption": "time_of_flight"}, *more)
+    mine = resolve(dataclasses.replace(FINDINGS, name="mine", cells=cells))
+    values = [[50.0, 52.0, 54.0], [60.0, 62.5, 64.0], [51.0], *[[9.0]] * len(more)]
+    names = [cell.name for cell in mine.cells]
+    return mine, {n: dict(enumerate(v)) for n, v in zip(names, values, strict=True)}
+
+
+def test_cells_of_any_fields_are_drawn_beside_their_differences():
+    mine, table = own_study()
+    names = list(table)
+    found = differences(names, table)
+    figure = success_by_cell(mine, table, found)
+    assert figure is not None
+    left, right = figure.axes
+    labels = [tick.get_text() for tick in left.get_yticklabels()]
+    assert [label.replace("\n", "") for label in labels] == names
+    dots = [x for x in left.lines if x.get_marker() == "."]
+    assert [np.asarray(x.get_xdata()).tolist() for x in dots] == [
+        list(table[name].values()) for name in names[:2]
+    ]
+    hollow = [x for x in left.lines if x.get_markerfacecolor() == "white"]
+    assert [x.get_data() for x in hollow] == [([51.0], [2])]
+    marks = [x for x in right.lines if x.get_marker() == "o"]
+    means = [(float(x.get_xdata()[0]), float(x.get_ydata()[0])) for x in marks]
+    assert means == [(pytest.approx(10.1666667), 1.0), (pytest.approx(1.0), 2.0)]
+    # Ten points with a spread of two: red.
+    assert found[0].p_value <= 0.05
+    assert [x.get_color() for x in marks] == ["#D55E00", "#888888"]
+    assert success_by_cell(mine, {names[0]: {0: 1.0}}, []) is None
+
+
+def test_many_cells_of_any_fields_are_told_apart_by_their_lines(
+    folder: StudyFolder, manifest: Manifest
+):
+    result = folder.results(manifest)[0]
+    more = [{"history": n} for n in range(4, 11)]
+    mine, _ = own_study(*more)
+    runs = [dataclasses.replace(result, run=run) for run in mine.runs if run.seed == 0]
+    figure = learning_curves(mine, runs)
+    assert figure is not None
+    styles = {
+        (line.get_color(), line.get_linestyle())
+        for axes in figure.axes
+        for line in axes.lines
+        if line.get_label() in {cell.name for cell in mine.cells[1:]}
+    }
+    assert len(styles) == len(mine.cells) - 1
 
 
 def test_an_infinite_range_is_left_out_of_the_figure_over_ranges():

@@ -89,12 +89,58 @@ def eliminate(
     Source: Yuksel, "Sample Elimination for Generating Poisson Disk Sample Sets",
         Computer Graphics Forum 34(2), 2015.
     """
-    from scipy.spatial import cKDTree  # Its import takes long.
-
     # Largest spacing of count discs in the plane: r_max^2 = A / (2 sqrt(3) N).
     widest = 2 * math.sqrt(area / (2 * math.sqrt(3) * count))
     # r_min = r_max (1 - (N / M)^gamma) beta with gamma = 1.5 and beta = 0.65.
     closest = widest * (1 - (count / len(points)) ** 1.5) * 0.65
+    kept = _eliminated(points, scale, count, widest, closest)
+    # Pairs closer than r_min count as if they were at r_min, which is below the spacing
+    # that is reached on a plane. On thin links it need not be: discs overlap across
+    # them, and such pairs would be left.
+    reached = least_spacing(points[kept], scale[kept])
+    if reached < closest:
+        others = _eliminated(points, scale, count, widest, 0.0)
+        if least_spacing(points[others], scale[others]) > reached:
+            return others
+    return kept
+
+
+def least_spacing(points: np.ndarray, scale: np.ndarray) -> float:
+    """Return the smallest distance of two points relative to their scale [m].
+
+    Args:
+        points: Points [m], ``[n, 3]``.
+        scale: Relative spacing around each point, ``[n]``.
+
+    Returns:
+        The distance, infinite for a single point.
+    """
+    from scipy.spatial import cKDTree  # Its import takes long.
+
+    if len(points) < 2:
+        return math.inf
+    tree = cKDTree(points)
+    nearest, at = tree.query(points, k=2)
+    # The closest pair is not farther relative to its scale than this one.
+    reach = float((nearest[:, 1] * 2 / (scale + scale[at[:, 1]])).min()) * scale.max()
+    one, other = tree.query_pairs(reach * _MARGIN, output_type="ndarray").T
+    distance = np.linalg.norm(points[one] - points[other], axis=-1)
+    return float((distance * 2 / (scale[one] + scale[other])).min())
+
+
+def _eliminated(
+    points: np.ndarray, scale: np.ndarray, count: int, widest: float, closest: float
+) -> np.ndarray:
+    """Return the points kept, as in `eliminate`.
+
+    Args:
+        points: As there.
+        scale: As there.
+        count: As there.
+        widest: Distance from which on two points do not crowd each other [m].
+        closest: Distance below which all crowd each other alike [m].
+    """
+    from scipy.spatial import cKDTree  # Its import takes long.
 
     total = np.zeros(len(points))
     tree, reach = cKDTree(points), widest * scale.max() * _MARGIN

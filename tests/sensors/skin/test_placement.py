@@ -10,12 +10,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from egoskin.robots.builtin import H1_2
+from egoskin.robots.builtin import G1, H1_2
 from egoskin.robots.config import RobotConfig
 from egoskin.robots.surface import distance_to, sample_surface
 from egoskin.sensors import Skin
 from egoskin.sensors.skin import placement
-from egoskin.sensors.skin.placement import eliminate, place_sensors, throw_darts
+from egoskin.sensors.skin.placement import (
+    eliminate,
+    least_spacing,
+    place_sensors,
+    throw_darts,
+)
 
 # Areas 4 pi .1^2 = .12566, 6 x .2^2 = .24 and 4 pi .05 (.05 + .1) = .09425 [m^2].
 THREE_SHAPES = """
@@ -263,6 +268,28 @@ def test_elimination_leaves_the_number_asked_for_well_spread(small_robot, n):
         widest = 2 * (np.pi / (2 * 3**0.5 * n)) ** 0.5
         nearest = [pair_distances(s.position).min() / widest for s in (spread, random)]
         assert nearest[0] > 0.6 > 0.3 > nearest[1]
+
+
+@pytest.mark.parametrize(
+    ("robot", "n", "least"), [(H1_2, 16, 0.13), (H1_2, 48, 0.075), (G1, 48, 0.06)]
+)
+def test_sensors_on_thin_links_keep_apart(robot, n, least):
+    # Discs that fit on a plane overlap across the arms, where some pairs would be
+    # millimetres apart if the weights did not tell short distances apart.
+    for seed in range(3):
+        skin = place_sensors(robot, n, seed, method="poisson_disk")
+        assert pair_distances(world(robot, skin)).min() > least
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(2, 30))
+def test_the_least_spacing_is_relative_to_the_scale(seed, n):
+    rng = np.random.default_rng(seed)
+    points, scale = rng.random((n, 3)), rng.choice([0.3, 1.0, 2.0], n)
+    distance = np.linalg.norm(points[:, None] - points, axis=-1)
+    relative = distance * 2 / (scale[:, None] + scale)
+    expected = relative[~np.eye(n, dtype=bool)].min()
+    assert least_spacing(points, scale) == pytest.approx(expected)
+    assert least_spacing(points[:1], scale[:1]) == np.inf
 
 
 def test_elimination_removes_the_most_crowded_each_time():
