@@ -39,10 +39,10 @@ def override(
     """
     plain = to_plain(config)
     for name, value in overrides.items():
-        full = _full_name(name)
-        if full.split(".")[0] in fixed:
-            raise ValueError(f"{what}: {name} cannot be set here")
         try:
+            full = _full_name(name)
+            if full.split(".")[0] in fixed:
+                raise ValueError(f"{name} cannot be set here")
             if full == _ROBOT and isinstance(value, str):
                 value = kept_robot(value)
             # The name of a policy of the package is no path.
@@ -119,6 +119,16 @@ def _check_key(content: Any, key: str, where: str) -> None:
 
 
 def _full_name(name: str) -> str:
-    """Return a field's name in a stored configuration."""
-    parts = {f.name for f in dataclasses.fields(EnvConfig)}
-    return f"env.{name}" if name.split(".")[0] in parts else name
+    """Return a field's name in a stored configuration.
+
+    Raises:
+        KeyError: If its first part is unknown; the text names the closest.
+    """
+    first = name.split(".")[0]
+    parts, whole = (
+        [f.name for f in dataclasses.fields(kind)] for kind in (EnvConfig, TrainConfig)
+    )
+    if first not in parts:
+        _check_key(dict.fromkeys([*parts, *whole]), first, "")
+        return name
+    return f"env.{name}"

@@ -17,11 +17,10 @@ from egoskin.runs.run import Run
 from egoskin.sensors.config import SensorConfig
 
 
-@pytest.mark.slow
 def test_bench_loop_gives_its_rows(tmp_path: Path):
     succeed(
         *("bench", "loop"),
-        *("--num-envs", "32", "--num-workers", "1", "--warmup", "0", "--rounds", "1"),
+        *("--num-envs", "8", "--num-workers", "1", "--warmup", "0", "--rounds", "1"),
         *("--json", tmp_path / "loop.json"),
     )
     rows = json.loads((tmp_path / "loop.json").read_text())["rows"]

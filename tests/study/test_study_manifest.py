@@ -132,7 +132,9 @@ def test_a_cell_is_named_by_what_differs():
     ("cell", "text"),
     [
         ({"sensor.rang": 1}, "no field 'sensor.rang', did you mean 'range'"),
-        ({"sensr.range": 1}, "no field 'sensr'"),
+        ({"sensr.range": 1}, "no field 'sensr', did you mean 'sensor'"),
+        ({"histori": 1}, "no field 'histori', did you mean 'history'"),
+        ({"pppo.gamma": 1}, "no field 'pppo', did you mean 'ppo'"),
         ({"sensor.range": "far"}, "range"),
         ({"sensor": {"range": 1.0}}, "sensor is a group.*one by one, as sensor.cover"),
         ({"sensor.range": -1.0}, "sensor.range=-1.0.*must be at least 0.001"),

@@ -134,18 +134,23 @@ def loop(config: LoopConfig) -> list[Row]:
         own = {} if coverage == "field" else {"field": Field()}
         sensor = replace(config.env.sensor, coverage=coverage, **own)
         env = replace(config.env, sensor=sensor)
-        rows += _Loop(replace(config, env=env), coverage).rows()
+        rows += _Loop(config, env).rows()
     return rows
 
 
 class _Loop:
-    """The layers of one training."""
+    """The layers of one training.
 
-    def __init__(self, config: LoopConfig, coverage: str) -> None:
-        self.config, self._coverage = config, coverage
-        self._skin = config.env.skin.build(config.env.robot_config)
+    Args:
+        config: The benchmark.
+        env: Its environment with the coverage to measure.
+    """
+
+    def __init__(self, config: LoopConfig, env: EnvConfig) -> None:
+        self.config, self._env, self._coverage = config, env, env.sensor.coverage
+        self._skin = env.skin.build(env.robot_config)
         self._workers = check_num_workers(config.num_envs, config.num_workers)
-        self._sources = sparse_sources(config.env, self._skin)
+        self._sources = sparse_sources(env, self._skin)
         self._steps = config.ppo.rollout_steps
 
     def rows(self) -> list[Row]:
@@ -175,7 +180,7 @@ class _Loop:
     def _make_pool(self, bare: bool = False) -> WorkerPool:
         config = self.config
         return make_env(
-            config.env,
+            self._env,
             self._skin,
             num_envs=config.num_envs,
             num_workers=self._workers,
@@ -189,7 +194,7 @@ class _Loop:
         config, env = self.config, self._pool
         torch.manual_seed(config.seed)
         network, sources = config.ppo.network, self._sources
-        spec = PolicySpec.of(config.env, self._skin, network, env, sources)
+        spec = PolicySpec.of(self._env, self._skin, network, env, sources)
         self._agent = spec.build_agent(sources)
         # As many threads as a training uses.
         self._ppo = PPO(self._agent, config.ppo, available_cores())
@@ -257,8 +262,8 @@ class _Loop:
 
     def _recorder(self) -> DodgeballEnv:
         env = DodgeballEnv(
-            self.config.env.robot_config,
-            self.config.env.task,
+            self._env.robot_config,
+            self._env.task,
             num_envs=self.config.num_envs,
             seed=self.config.seed,
             num_threads=self._workers,
