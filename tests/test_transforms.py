@@ -250,7 +250,7 @@ def test_what_another_transform_writes_is_not_overwritten():
     with pytest.raises(ValueError, match="Binary would overwrite 'signal', which it"):
         Binary(sensor).transform_observation_spec(spec)
     spec = Binary(sensor, out_keys=["seen"]).transform_observation_spec(spec)
-    assert {"signal", "seen"} < {*spec}
+    assert {"signal", "seen"} < {*spec.keys()}
 
 
 def test_measurements_without_the_dimension_that_is_reduced_are_refused():

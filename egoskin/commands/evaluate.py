@@ -6,6 +6,7 @@ egoskin evaluate runs/NAME/policies/000005046272.safetensors --json out.json
 egoskin evaluate runs/NAME --behaviour --check-substeps 8
 egoskin evaluate runs/NAME --mask
 egoskin evaluate runs/NAME --perturbed
+egoskin evaluate runs/NAME --skin worn.json
 """
 
 from __future__ import annotations
@@ -34,10 +35,10 @@ from egoskin.evaluation.throw_set import (
 )
 from egoskin.make import EnvConfig, check_num_workers, device_of
 from egoskin.parallel import default_num_workers
-from egoskin.policies.policy import PolicySpec, load_policy
+from egoskin.policies.policy import Policy, PolicySpec, load_policy
 from egoskin.progress import StatusLine, counted
 from egoskin.rng import check_seed
-from egoskin.sensors import MASK_ALL
+from egoskin.sensors import MASK_ALL, Skin
 from egoskin.storage.files import check_output, write_figure
 from egoskin.storage.serialization import write_json
 
@@ -61,6 +62,9 @@ class EvaluateConfig:
     mask: tuple[str, ...] | None = None
     """Links whose sensors are masked; alone: all sensors. The success that remains does
     not depend on them."""
+    skin: Path | None = None
+    """Skin file to wear instead of that of the training, with as many readings:
+    sensors moved, turned or with other ranges, in the order that the policy knows."""
     num_workers: int | None = None
     """Simulation processes; None: the largest divisor of episodes <= cores."""
     behaviour: bool = False
@@ -249,6 +253,8 @@ def title_of(config: EvaluateConfig, spec: PolicySpec, episodes: int) -> str:
         f"on standard {spec.env.standard}; evaluated on {throws}, "
         f"throw set {config.throw_set} of {counted(episodes, 'episode')}"
     )
+    if config.skin is not None:
+        text += f", skin {config.skin}"
     if config.masked:
         text += f", sensors masked: {', '.join(config.masked)}"
     if config.engine != "mujoco":
@@ -256,12 +262,36 @@ def title_of(config: EvaluateConfig, spec: PolicySpec, episodes: int) -> str:
     return text
 
 
+def worn_skin(policy: Policy, path: Path | None) -> Skin:
+    """Return the skin to evaluate a policy with: that of its training, or of a file.
+
+    Raises:
+        ValueError: If the policy reads no skin, or the file's does not fit the robot or
+            has another number of readings.
+    """
+    if path is None:
+        return policy.skin
+    config, skin = policy.env_config, Skin.load(path)
+    if config.sensor.coverage in ("none", "oracle"):
+        raise ValueError(f"{path}: the policy reads no skin")
+    robot = config.robot_config
+    skin.check_robot(robot.name, robot.links, str(path))
+    worn, known = (config.pipeline(each).signal_size for each in (skin, policy.skin))
+    if worn != known:
+        raise ValueError(
+            f"{path}: the skin gives {worn} readings, but the policy was trained with "
+            f"{known}"
+        )
+    return skin
+
+
 def main(args: list[str]) -> None:
     """Run the command."""
     config = tyro.cli(EvaluateConfig, args=args)
     policy = load_policy(config.policy)
     env_config = standard_task(policy.env_config, config.standard)
-    env_config.pipeline(policy.skin).check_mask(config.masked)
+    skin = worn_skin(policy, config.skin)
+    env_config.pipeline(skin).check_mask(config.masked)
     if config.map is not None:
         check_map(env_config)
     line = StatusLine(f"playing {counted(config.episodes, 'episode')}")
@@ -281,7 +311,7 @@ def main(args: list[str]) -> None:
     }
     engine: dict[str, Any] = {"engine": config.engine, "device": config.device}
     whole: dict[str, Any] = which | {"on_step": on_step}
-    subject = policy, env_config, policy.skin
+    subject = policy, env_config, skin
     # For evaluations that are repeated many times.
     episodes, workers = max(config.episodes // 4, 1), config.num_workers
     workers = workers and default_num_workers(episodes, workers)
@@ -294,7 +324,7 @@ def main(args: list[str]) -> None:
     else:
         result = evaluate(*subject, **whole, **engine)
     if config.check_substeps is not None:
-        checked = evaluate(policy, finer, policy.skin, **whole, **engine)
+        checked = evaluate(policy, finer, skin, **whole, **engine)
     line.finish()
     spec, of_training = policy.policy_spec, config.standard == "run"
     title = title_of(config, spec, config.episodes) + ", physics at "
@@ -309,6 +339,7 @@ def main(args: list[str]) -> None:
         "throw_set": config.throw_set,
         "frames": spec.frames,
         "mask": config.masked,
+        "skin": config.skin and str(config.skin),
         "engine": config.engine,
         "trained_by_engine": spec.engine,
     }

@@ -8,9 +8,10 @@ import os
 import signal
 import threading
 import time
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -37,7 +38,7 @@ from egoskin.evaluation.upper_bound import Outcome, UpperBound
 from egoskin.progress import counted
 from egoskin.runs import trainer
 from egoskin.runs.run import Run
-from egoskin.sensors import MASK_ALL
+from egoskin.sensors import MASK_ALL, Skin
 from egoskin.storage.tensor_file import load_tensors
 
 
@@ -147,6 +148,7 @@ def test_an_evaluation_has_the_figures_promised(evaluated):
         "throw_set",
         "frames",
         "mask",
+        "skin",
         "engine",
         "trained_by_engine",
     }
@@ -232,9 +234,34 @@ def test_an_evaluation_may_mask_all_sensors_or_those_of_some_links(
     assert EvaluateConfig(policy=trained, mask=("all",)).masked == MASK_ALL
 
 
+def test_an_evaluation_may_wear_another_skin(tmp_path: Path):
+    policy = egoskin.load_policy("field_proximity")
+    trained = Path("field_proximity")
+    path, known = tmp_path / "worn.json", len(policy.skin)
+    moved = replace(policy.skin, range=np.full(known, 0.3))
+    moved.save(path)
+    result, text = figures_of(tmp_path, trained, "--skin", path)
+    assert f", skin {path}" in text
+    assert result["skin"] == str(path)
+    task = standard_task(policy.env_config)
+    played, own = (
+        evaluate(policy, task, skin, throw_set=0, episodes=EPISODES)
+        for skin in (Skin.load(path), policy.skin)
+    )
+    assert result["survival_time"] == asdict(played.survival_time)
+    assert played.survival_time != own.survival_time
+    moved.select(range(5)).save(path)
+    message = f"the skin gives 5 readings, but the policy was trained with {known}"
+    assert message in fail("evaluate", trained, "--skin", path)
+    assert "the policy reads no skin" in fail("evaluate", "blind", "--skin", path)
+    replace(moved, robot="g1").save(path)
+    assert "g1" in fail("evaluate", trained, "--skin", path)
+
+
 @pytest.mark.parametrize(
     ("args", "expected"),
     [
+        (["--skin", "no.json"], "no.json"),
         (["--mask", "torso_lnk"], "no sensor on 'torso_lnk'; links with sensors"),
         (["--mask", "all", "torso_link"], "no sensor on 'all'"),
         (["--standard", "3"], "--standard"),
