@@ -14,6 +14,7 @@ from functools import partial
 import numpy as np
 import torch
 
+from egoskin.hints import did_you_mean
 from egoskin.robots.config import Primitive, RobotConfig
 from egoskin.robots.kinematics import LinkKinematics
 from egoskin.shapes import shape_of
@@ -138,7 +139,8 @@ class Surface:
         unknown = [name for name in links if name not in robot.links]
         if unknown:
             raise ValueError(
-                f"{robot.name} has no link {unknown[0]!r}; its links are "
+                f"{robot.name} has no link {unknown[0]!r}"
+                f"{did_you_mean(unknown[0], robot.links)}; its links are "
                 f"{', '.join(robot.links)}"
             )
         self.links = tuple(links)

@@ -15,6 +15,7 @@ import numpy as np
 from tensordict import TensorDictBase
 from torchrl.envs import Transform
 
+from egoskin.hints import did_you_mean
 from egoskin.rng import offset_seed
 from egoskin.robots.config import RobotConfig
 from egoskin.sensors.config import SensorConfig
@@ -146,8 +147,8 @@ class SensorPipeline:
         for name in mask:
             if name not in links:
                 raise ValueError(
-                    f"mask: no sensor on {name!r}; links with sensors: "
-                    f"{', '.join(links)}"
+                    f"mask: no sensor on {name!r}{did_you_mean(name, links)}; links "
+                    f"with sensors: {', '.join(links)}"
                 )
 
     def masked(self, mask: Sequence[str]) -> list[int]:
