@@ -39,7 +39,7 @@ class FieldSensor(ProximitySensor):
 
     Finite readings above 0 are differentiable with respect to poses and joint
     positions, in reverse and forward mode (not under `torch.vmap`: use
-    `torch.func.jacrev`). The derivative of a reading of 0 is 0.
+    `torch.func.jacrev`). Of a sensor inside an object the derivative is 0.
 
     Args:
         skin: The sensors. A coverage or range set in the skin takes precedence.
