@@ -303,12 +303,14 @@ class Ellipsoid:
         distance. Inside, derivatives are 0.
         """
         least = min(self.semi_axes) ** 2
-        u = self._multiplier(x, y, z)
         if any(map(is_differentiated, (x, y, z))):
             # Inside, near the inner planes, the multiplier's derivative overflows.
-            inside = u < least
-            x, y, z = (torch.where(inside, p.detach(), p) for p in (x, y, z))
-            u = self._multiplier(x, y, z)
+            fixed = x.detach(), y.detach(), z.detach()
+            inside = self._multiplier(*fixed) < least
+            x, y, z = (
+                torch.where(inside, q, p) for p, q in zip((x, y, z), fixed, strict=True)
+            )
+        u = self._multiplier(x, y, z)
         s = u - least
         # The dual of min |p - x|^2 with x on the surface, which is maximal at the root:
         # d^2 = s (sum_i p_i^2 / (a_i^2 + s) - 1). The error of s enters squared, and no

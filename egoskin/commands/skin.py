@@ -29,7 +29,7 @@ from egoskin.robots.config import RobotConfig
 from egoskin.robots.own import find_robot
 from egoskin.sensors import Skin
 from egoskin.sensors.skin.coverage import Coverage
-from egoskin.sensors.skin.fit import fit_notes
+from egoskin.sensors.skin.fit import FAR_OFF, fit_notes
 from egoskin.sensors.skin.gentact import load_gentact, save_gentact
 from egoskin.sensors.skin.mesh_surface import Meshes, meshes_in_folder, meshes_of_mjcf
 from egoskin.sensors.skin.placement import place_sensors
@@ -39,8 +39,6 @@ from egoskin.viewer.offscreen import CameraConfig, Painter
 
 # Placing this many sensors takes long enough for a message.
 _MANY = 10_000
-# Sensors farther than this from the robot's surface cause a warning [m].
-_FAR_OFF = 0.15
 # Size of each of the two views of the picture [px].
 _VIEW_SIZE = (640, 960)
 
@@ -178,7 +176,7 @@ class Import:
         files = skin.provenance.get("files", [skin.provenance])
         extents = [f.get("distance_to_primitives", (0, 0)) for f in files]
         off = max(abs(end) for extent in extents for end in extent)
-        if off > _FAR_OFF:
+        if off > FAR_OFF:
             print(
                 f"warning: a sensor is {off:.2f} m off the robot's surface: check "
                 "--scale and --link-map, and look at the picture of: egoskin skin "

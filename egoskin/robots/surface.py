@@ -167,7 +167,7 @@ class Surface:
         Returns:
             Positions [m], ``[n, 3]``.
         """
-        return (self._turn[link] @ position[..., None])[..., 0] + self._shift[link]
+        return points_b((self._shift, self._turn), link, position)
 
     def sample(
         self,
@@ -259,6 +259,23 @@ def default_frames(robot: RobotConfig) -> tuple[np.ndarray, np.ndarray]:
     pose = torch.from_numpy(robot.default_joint_pos)[None]
     position, rotation = LinkKinematics(robot.chain, robot.links).poses_b(pose)
     return position[0].numpy(), rotation[0].numpy()
+
+
+def points_b(
+    frames: tuple[np.ndarray, np.ndarray], link: np.ndarray, position: np.ndarray
+) -> np.ndarray:
+    """Return points of links in the base frame, in the default pose.
+
+    Args:
+        frames: Result of `default_frames`.
+        link: Indices of the links in ``RobotConfig.links``, ``[n]``.
+        position: Positions in the frames of the links [m], ``[n, 3]``.
+
+    Returns:
+        Positions [m], ``[n, 3]``.
+    """
+    shift, turn = frames
+    return (turn[link] @ position[..., None])[..., 0] + shift[link]
 
 
 def primitive_patch(shape: Primitive) -> Patch:

@@ -115,11 +115,12 @@ def _pictures(
     )
     if not {g for g, _ in grid} >= set(RAYS) or (RAYS[0], "localization") not in grid:
         shared = ""
-    by_range = success_by_range(manifest, success, seen)
     drawn = {
         "success-by-range": (
             # One cell alone says nothing about the range.
-            by_range if len(on_axis(manifest, success)) > 1 else None,
+            success_by_range(manifest, success, seen)
+            if len(on_axis(manifest, success)) > 1
+            else None,
             "Success against range: interquartile mean (hollow: one seed) and range "
             f"(bars) over seeds; each dot is a seed. {shared}{warnings if seen else ''}"
             "Infinite ranges are left out.",

@@ -6,11 +6,11 @@ import numpy as np
 
 from egoskin.progress import counted
 from egoskin.robots.config import RobotConfig
-from egoskin.robots.surface import default_frames, distance_to
+from egoskin.robots.surface import default_frames, distance_to, points_b
 from egoskin.sensors.skin.skin import Skin
 
-# Sensors farther than this from the surface of their link are told [m].
-_FAR_OFF = 0.15
+FAR_OFF = 0.15
+"""Sensors farther than this from the surface of their link are told [m]."""
 # Sensors deeper than this in a shape of another link are told [m].
 _DEEP = 1e-3
 # Sensors closer to each other than this are told [m].
@@ -31,8 +31,8 @@ def fit_notes(skin: Skin, robot: RobotConfig) -> list[str]:
         robot: The robot.
     """
     at = np.array([robot.links.index(link) for link in skin.links])
-    shift, turn = default_frames(robot)
-    position = np.einsum("nij,nj->ni", turn[at], skin.position) + shift[at]
+    shift, turn = frames = default_frames(robot)
+    position = points_b(frames, at, skin.position)
     # Distance from the surface of the link, and each shape's with that after a step.
     own = np.full(len(skin), np.inf)
     shapes: list[tuple[np.ndarray, ...]] = []
@@ -43,17 +43,17 @@ def fit_notes(skin: Skin, robot: RobotConfig) -> list[str]:
         distance = distance_to(shape, skin.position[mine])
         above = distance_to(shape, skin.position[mine] + _STEP * skin.normal[mine])
         shapes.append((mine, distance, above))
-        own[mine] = np.where(abs(distance) < abs(own[mine]), distance, own[mine])
+        own[mine] = np.minimum(own[mine], abs(distance))
         local = (position[others] - shift[link]) @ turn[link]
         inside[others] |= distance_to(shape, local) < -_DEEP
     # In a corner the normal leads away from one of the shapes nearby.
     inward = np.isfinite(own)
     for mine, distance, above in shapes:
-        near = abs(distance) < abs(own[mine]) + _CORNER
+        near = abs(distance) < own[mine] + _CORNER
         inward[mine] &= ~(near & (above >= distance))
-    far = np.isfinite(own) & (np.abs(own) > _FAR_OFF)
+    far = np.isfinite(own) & (own > FAR_OFF)
     found = [
-        (far, f"farther than {_FAR_OFF:g} m from the surface of their links"),
+        (far, f"farther than {FAR_OFF:g} m from the surface of their links"),
         (inward & ~far, "with a normal that points into their links"),
         (inside, "inside a shape of another link"),
         (_close(position), f"less than {1e3 * _CLOSE:g} mm from another one"),
