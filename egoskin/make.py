@@ -138,7 +138,8 @@ def make_worker_env(
         bare: Whether to leave out observations and sensors (to measure their cost).
         sparse: Whether to output the state that the sensors read instead of the
             signal, for the sparse sources of the agent.
-        mask: Links whose sensors detect nothing, or `egoskin.sensors.MASK_ALL`.
+        mask: Links (or shell patterns) whose sensors detect nothing, or
+            `egoskin.sensors.MASK_ALL`.
         engine: Physics engine.
         device: Device of the simulation and of all tensors.
 
@@ -257,7 +258,8 @@ def make_env(
             which transforms of your own compute, say, another reward.
         bare: Whether to leave out observations and sensors.
         sparse: Whether to output the state, not the signal; see `make_worker_env`.
-        mask: Links whose sensors detect nothing, or `egoskin.sensors.MASK_ALL`.
+        mask: Links (or shell patterns) whose sensors detect nothing, or
+            `egoskin.sensors.MASK_ALL`.
 
     Raises:
         ValueError: If ``num_workers`` does not divide ``num_envs``, memory is too

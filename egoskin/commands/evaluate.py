@@ -60,8 +60,8 @@ class EvaluateConfig:
     """Version of the standard throw to play, independent of the policy's training;
     run: the throws and terminations of its training, without its randomisation."""
     mask: tuple[str, ...] | None = None
-    """Links whose sensors are masked; alone: all sensors. The success that remains does
-    not depend on them."""
+    """Links whose sensors are masked, by name or shell pattern; alone: all sensors. The
+    success that remains does not depend on them."""
     skin: Path | None = None
     """Skin file to wear instead of that of the training, with as many readings:
     sensors moved, turned or with other ranges, in the order that the policy knows."""

@@ -82,7 +82,7 @@ class Place:
     seed: int = 0
     """Seed of the placement."""
     links: tuple[str, ...] | None = None
-    """Links to cover; None: the robot's skin_links."""
+    """Links to cover, by name or shell pattern; None: the robot's skin_links."""
     density: tuple[str, ...] = ()
     """Relative density of sensors on links, LINK=WEIGHT, where LINK may be a shell
     pattern; 1 on the others."""
@@ -125,7 +125,7 @@ class Place:
         )
         skin.save(self.out)
         print(table(skin, str(self.out)))
-        for text in bare_links(robot, self.links or robot.skin_links):
+        for text in bare_links(robot, skin.provenance["links"]):
             print(f"note: {text}")
 
 

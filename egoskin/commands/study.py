@@ -33,6 +33,7 @@ from egoskin.study.cost import WORTH_MEASURING, Speed, cost, measure_all
 from egoskin.study.fields import settings
 from egoskin.study.folder import RunStatus, StudyFolder
 from egoskin.study.manifest import Manifest, PlannedRun, load_study, resolve
+from egoskin.study.metrics import BY_NAME, MetricName
 from egoskin.study.runner import LocalRunner, Progress, Runner, slurm_script
 from egoskin.study.shipped import STUDIES
 
@@ -401,6 +402,9 @@ class Report:
     """Folder of the study."""
     out: Path | None = None
     """Folder to write to; None: report/ in the study's folder."""
+    metric: MetricName = "success_3s"
+    """Column of runs.csv in which the cells of a study of your own are compared with
+    the first one."""
 
     def execute(self) -> None:
         """Write the report."""
@@ -412,7 +416,7 @@ class Report:
         folder.manifest()  # a wrong folder is named before --out
         out = self.out or self.dir / "report"
         check_folder(out, "--out")
-        write_report(folder, out)
+        write_report(folder, out, BY_NAME[self.metric])
         print(f"{out / 'report.md'}, {out / 'index.html'}, {out / 'runs.csv'}")
 
 

@@ -147,7 +147,8 @@ def behave(
         throw_set: Seed of the throw set.
         episodes: Size of the throw set.
         num_workers: Physics threads; the result does not depend on it.
-        mask: Links whose sensors detect nothing, or `egoskin.sensors.MASK_ALL`.
+        mask: Links (or shell patterns) whose sensors detect nothing, or
+            `egoskin.sensors.MASK_ALL`.
         on_step: Called with (steps done, episodes still running).
     """
     which: dict[str, Any] = {

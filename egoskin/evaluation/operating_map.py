@@ -129,7 +129,8 @@ def operating_map(
         throw_set: Seed of the throws.
         episodes: Episodes per point.
         num_workers: Processes; the result does not depend on it.
-        mask: Links whose sensors detect nothing, or `egoskin.sensors.MASK_ALL`.
+        mask: Links (or shell patterns) whose sensors detect nothing, or
+            `egoskin.sensors.MASK_ALL`.
         trained: Throws of the training, for `Line.trained`; None: those of ``config``.
         on_point: Called with (points done, total points).
 

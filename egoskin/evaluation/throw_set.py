@@ -171,7 +171,8 @@ def play_throws(
         num_workers: Processes; the result does not depend on it. None: enough to use
             all cores, or threads of this process for few episodes, to start faster.
         hold: Whether the robot is held rigid in its default pose.
-        mask: Links whose sensors detect nothing, or `egoskin.sensors.MASK_ALL`.
+        mask: Links (or shell patterns) whose sensors detect nothing, or
+            `egoskin.sensors.MASK_ALL`.
         on_step: Called with (steps done, episodes still running).
         watch: Called after every step; the throws are then played in this process,
             with threads instead of workers and the same result.
@@ -362,7 +363,8 @@ def evaluate(
         throw_set: Seed of the throw set.
         episodes: Size of the throw set.
         num_workers: Processes; the result does not depend on it.
-        mask: Links whose sensors detect nothing, or `egoskin.sensors.MASK_ALL`.
+        mask: Links (or shell patterns) whose sensors detect nothing, or
+            `egoskin.sensors.MASK_ALL`.
         on_step: Called with (steps done, episodes still running).
         watch: Called after every step of the policy's episodes, see `play_throws`.
         engine: Physics engine.

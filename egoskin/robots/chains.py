@@ -52,7 +52,7 @@ def _body_frames(
                 f"joint {own_name!r} of body {name!r} is a {kind.name}: only hinges "
                 "and slides are supported below the base; replace a ball joint by "
                 "three hinges, and choose a body with a free joint as the base "
-                "(read_robot(path, base=...))"
+                "(base in robot.toml, or read_robot(path, base=...))"
             )
         # R(q - ref) = R(-ref) R(q), and likewise for a slide.
         reference = float(model.qpos0[joint.qposadr[0]])

@@ -20,6 +20,7 @@ import numpy as np
 import pytorch_kinematics as pk
 
 from egoskin.bounds import is_number
+from egoskin.hints import matching
 from egoskin.robots.chains import JOINT_TYPES, build_chain
 from egoskin.robots.model import body_id, body_name, geom_mesh, joint_name
 from egoskin.robots.model_text import checked_model
@@ -438,7 +439,7 @@ def read_robot(
             scene, say). By default the only body attached to the world if it has a free
             joint or none, else (with several such bodies, or a hinge between them) the
             world itself.
-        skin_links: Links that may carry skin; by default all.
+        skin_links: Links that may carry skin, by name or shell pattern; by default all.
 
     Raises:
         ValueError: If MuJoCo cannot read the file as MJCF or URDF, or the base or a
@@ -461,13 +462,13 @@ def read_robot(
     # MuJoCo's default name of a model.
     name = whole.name if name in ("", "MuJoCo Model") else name
     robot = replace(whole, name=name, base=base)
-    links = robot.links if skin_links is None else tuple(skin_links)
-    if others := [link for link in links if link not in robot.links]:
-        raise ValueError(
-            f"{path}: no links {others} below base {base!r}; it has "
-            f"{', '.join(robot.links)}"
-        )
-    return replace(robot, skin_links=links)
+    if skin_links is None:
+        return replace(robot, skin_links=robot.links)
+    try:
+        chosen = matching(skin_links, robot.links, "link")
+    except ValueError as error:
+        raise ValueError(f"{path}, below base {base!r}: {error}") from None
+    return replace(robot, skin_links=chosen)
 
 
 def round_off(radius: float, half_length: float) -> tuple[str, list[float]]:

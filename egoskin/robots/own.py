@@ -33,7 +33,7 @@ from typing import Annotated, Any
 from tyro.constructors import PrimitiveConstructorSpec
 
 from egoskin.bounds import is_number
-from egoskin.hints import did_you_mean
+from egoskin.hints import did_you_mean, matching
 from egoskin.robots.builtin import ROBOTS
 from egoskin.robots.config import Gain, RobotConfig, read_robot
 from egoskin.robots.portable import portable
@@ -274,7 +274,9 @@ def _check_keys(toml: _Toml) -> None:
     content = toml.content
     for key in content:
         if key not in _KEYS:
-            raise toml.error(f"there is {_no_match(key, _KEYS, 'key')}", key)
+            hint = did_you_mean(key, _KEYS)
+            known = ", ".join(_KEYS)
+            raise toml.error(f"there is no key {key!r}{hint} (keys: {known})", key)
     for key in _NEEDED:
         if key not in content:
             raise toml.error(f"{key} is missing")
@@ -291,18 +293,16 @@ def _check_joints(toml: _Toml, robot: RobotConfig) -> None:
     tables += [(("gains", name), table) for name, table in robot.gains.items()]
     for keys, table in tables:
         for pattern in table:
-            if not fnmatch.filter(robot.joints, pattern):
-                text = _no_match(pattern, robot.joints, "joint")
-                raise toml.error(text, *keys, pattern)
+            _matching(toml, pattern, robot.joints, "joint", *keys)
     for name, gain_set in robot.gains.items():
         for joint in robot.joints:
-            matching = [p for p in gain_set if fnmatch.fnmatchcase(joint, p)]
-            if len(matching) != 1:
-                patterns = " and ".join(map(repr, matching)) or "none of its patterns"
+            fitting = [p for p in gain_set if fnmatch.fnmatchcase(joint, p)]
+            if len(fitting) != 1:
+                patterns = " and ".join(map(repr, fitting)) or "none of its patterns"
                 raise toml.error(
                     f"gains.{name}: joint {joint!r} must match one pattern, but "
                     f"matches {patterns}",
-                    *("gains", name, *matching[1:2]),
+                    *("gains", name, *fitting[1:2]),
                 )
     try:
         _ = robot.default_joint_pos
@@ -348,14 +348,16 @@ def _gains(toml: _Toml) -> dict[str, dict[str, Gain]]:
 def _links(toml: _Toml, key: str, links: tuple[str, ...]) -> tuple[str, ...]:
     """Return the links that match a list of patterns, in the robot's order."""
     wanted: set[str] = set()
-    for pattern in toml.content.get(key, []):
-        matching = fnmatch.filter(links, str(pattern))
-        if not matching:
-            raise toml.error(_no_match(str(pattern), links, "link"), key, str(pattern))
-        wanted.update(matching)
+    for pattern in map(str, toml.content.get(key, [])):
+        wanted.update(_matching(toml, pattern, links, "link", key))
     return tuple(link for link in links if link in wanted)
 
 
-def _no_match(pattern: str, names: Sequence[str], what: str) -> str:
-    hint = did_you_mean(pattern, names)
-    return f"no {what} {pattern!r}{hint} ({what}s: {', '.join(names)})"
+def _matching(
+    toml: _Toml, pattern: str, names: Sequence[str], what: str, *keys: str
+) -> tuple[str, ...]:
+    """Return the names that match a pattern, of which there must be one."""
+    try:
+        return matching([pattern], names, what)
+    except ValueError as error:
+        raise toml.error(str(error), *keys, pattern) from None

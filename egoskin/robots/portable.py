@@ -187,6 +187,12 @@ def _check_supported(
     robot: RobotConfig, spec: mujoco.MjSpec, model: mujoco.MjModel
 ) -> None:
     """Raise ValueError if the base is fixed to a body, or for tendons or equalities."""
+    if robot.is_urdf and robot.base == "world":
+        roots = [b.name for b in spec.worldbody.bodies]
+        raise ValueError(
+            f"{robot.name} has no single base: attached to the world are "
+            f"{', '.join(roots)}; give base in robot.toml"
+        )
     parent = model.body_parentid[body_id(model, robot.base)]
     if parent:
         raise ValueError(

@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 import torch
 
-from egoskin.hints import did_you_mean
+from egoskin.hints import matching
 from egoskin.robots.config import Primitive, RobotConfig
 from egoskin.robots.kinematics import LinkKinematics
 from egoskin.shapes import shape_of
@@ -136,22 +136,15 @@ class Surface:
         patches: Sequence[Patch],
         side: Callable[[np.ndarray, np.ndarray, float], np.ndarray],
     ) -> None:
-        unknown = [name for name in links if name not in robot.links]
-        if unknown:
-            raise ValueError(
-                f"{robot.name} has no link {unknown[0]!r}"
-                f"{did_you_mean(unknown[0], robot.links)}; its links are "
-                f"{', '.join(robot.links)}"
-            )
-        self.links = tuple(links)
+        self.links = matching(links, robot.links, "link")
         self.robot = robot
-        self._patches = [patch for patch in patches if patch.link in links]
+        self._patches = [patch for patch in patches if patch.link in self.links]
         if not self._patches:
             hint = ""
             if robot.is_urdf:
                 hint = ": meshes of a URDF are left out; give them as meshes (--meshes)"
             raise ValueError(
-                f"the links {', '.join(links)} have no collision shape{hint}"
+                f"the links {', '.join(self.links)} have no collision shape{hint}"
             )
         self._link_index = [robot.links.index(patch.link) for patch in self._patches]
         self._shift, self._turn = default_frames(robot)

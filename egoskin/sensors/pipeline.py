@@ -15,7 +15,7 @@ import numpy as np
 from tensordict import TensorDictBase
 from torchrl.envs import Transform
 
-from egoskin.hints import did_you_mean
+from egoskin.hints import matching
 from egoskin.rng import offset_seed
 from egoskin.robots.config import RobotConfig
 from egoskin.sensors.config import SensorConfig
@@ -128,11 +128,9 @@ class SensorPipeline:
         The text lists the valid links.
 
         Args:
-            mask: Links whose sensors detect nothing, or `MASK_ALL`.
+            mask: Links whose sensors detect nothing, by name or shell pattern, or
+                `MASK_ALL`.
         """
-        if isinstance(mask, str):
-            # Its letters would be the links.
-            raise ValueError(f"mask must be a sequence of links, got {mask!r}")
         if not mask:
             return
         if self.config.coverage == "none":
@@ -143,22 +141,22 @@ class SensorPipeline:
             raise ValueError(
                 "an oracle has no sensors on links: its mask must be 'all'"
             )
-        links = sorted(set(self.skin.links))
-        for name in mask:
-            if name not in links:
-                raise ValueError(
-                    f"mask: no sensor on {name!r}{did_you_mean(name, links)}; links "
-                    f"with sensors: {', '.join(links)}"
-                )
+        self.masked(mask)
 
     def masked(self, mask: Sequence[str]) -> list[int]:
         """Return the indices of the masked sensors.
 
         Args:
-            mask: Links, or `MASK_ALL`.
+            mask: Links, by name or shell pattern, or `MASK_ALL`.
+
+        Raises:
+            ValueError: If a pattern matches no link with sensors.
         """
-        every = masks_all(mask)
-        return [i for i, name in enumerate(self.skin.links) if every or name in mask]
+        if masks_all(mask):
+            return list(range(len(self.skin)))
+        links = sorted(set(self.skin.links))
+        wanted = matching(mask, links, "sensor on", "links with sensors")
+        return [i for i, name in enumerate(self.skin.links) if name in wanted]
 
     def mask(self, transforms: Iterable[Transform], masked: Collection[int]) -> None:
         """Mask sensors in the result of `transforms`; replaces the previous mask.

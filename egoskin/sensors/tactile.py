@@ -12,7 +12,6 @@ keys, as `torchrl.envs.RewardScaling` does.
 
 from __future__ import annotations
 
-import fnmatch
 import math
 from collections.abc import Mapping, Sequence
 
@@ -22,7 +21,7 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
-from egoskin.hints import did_you_mean
+from egoskin.hints import matching
 from egoskin.transform import RowTransform, StatefulTransform
 
 
@@ -32,16 +31,8 @@ def _matching(links: Sequence[str], patterns: Sequence[str]) -> Tensor:
     Raises:
         ValueError: If a pattern matches no link.
     """
-    for pattern in patterns:
-        if not fnmatch.filter(links, pattern):
-            raise ValueError(
-                f"{pattern!r} matches no link{did_you_mean(pattern, links)} "
-                f"(links: {', '.join(links)})"
-            )
-    return torch.tensor(
-        [any(fnmatch.fnmatchcase(name, p) for p in patterns) for name in links],
-        dtype=torch.bool,
-    )
+    found = matching(patterns, links, "link")
+    return torch.tensor([name in found for name in links], dtype=torch.bool)
 
 
 def _check_links(tactile: Tensor, links: Tensor, key: NestedKey) -> None:

@@ -19,7 +19,7 @@ from egoskin.study.differences import Difference
 from egoskin.study.findings import MARGIN, SAME, Judged
 from egoskin.study.folder import Result
 from egoskin.study.manifest import Manifest
-from egoskin.study.metrics import frames_to, has_learnt
+from egoskin.study.metrics import Metric, frames_to, has_learnt
 from egoskin.study.statistics import ALPHA, Effect, Table, contrast, spread
 
 # Colours of Okabe and Ito, which are colour-blind safe, and markers.
@@ -192,15 +192,16 @@ def on_axis(manifest: Manifest, table: Table) -> dict[str, Place]:
     }
 
 
-def success_by_cell(
-    manifest: Manifest, table: Table, found: Sequence[Difference]
+def metric_by_cell(
+    manifest: Manifest, metric: Metric, table: Table, found: Sequence[Difference]
 ) -> Figure | None:
-    """Draw success of each cell and its difference to the first; None for one cell.
+    """Draw a metric of each cell and its difference to the first; None for one cell.
 
     Args:
         manifest: The study.
-        table: Success at 3 s [%].
-        found: The differences; cells without one have only their success.
+        metric: The metric.
+        table: Its values.
+        found: The differences; cells without one have only their values.
     """
     names = [cell.name for cell in manifest.cells if table.get(cell.name)]
     if len(names) < 2:
@@ -224,8 +225,9 @@ def success_by_cell(
         colour = _VERDICTS["refuted" if differs else "undecided"]
         _draw_effect(right, names.index(each.cell), each.effect, colour)
     right.axvline(0, color="black", linewidth=0.8)
-    left.set(xlim=(0, 100), xlabel="success: untouched for 3 s [%]")
-    right.set_xlabel(f"difference to {labels[0]} [percentage points]")
+    left.set_xlabel(f"{metric.label} [{metric.unit}]")
+    left.set_xlim(*((0, 100) if metric.unit == "%" else (0, None)))
+    right.set_xlabel(f"difference to {labels[0]} [{difference_unit(metric)}]")
     left.set_yticks(range(len(names)), labels, fontsize=8)
     left.set_ylim(len(names) - 0.4, -0.6)
     for axes in (left, right):
@@ -233,6 +235,11 @@ def success_by_cell(
         axes.grid(axis="x", linewidth=0.4, alpha=0.5)
     right.tick_params(axis="y", length=0)
     return figure
+
+
+def difference_unit(metric: Metric) -> str:
+    """Return the unit of differences of a metric."""
+    return "percentage points" if metric.unit == "%" else metric.unit
 
 
 def _draw_signal(

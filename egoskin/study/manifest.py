@@ -15,7 +15,7 @@ import dataclasses
 import fnmatch
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -98,7 +98,7 @@ class Study:
     purpose: str
     """Its purpose, in a few words."""
     cells: tuple[dict[str, Any], ...]
-    """`egoskin.study.fields.Overrides` of each cell."""
+    """`egoskin.study.fields.Overrides` of each cell, and its ``name``, if wanted."""
     seeds: tuple[int, ...]
     """Seeds of each cell, in the order in which they are run."""
     frames: Annotated[int, COUNT]
@@ -121,6 +121,8 @@ class Study:
             )
         for seed in self.seeds:
             check_seed(seed)
+        if len(set(self.seeds)) < len(self.seeds):
+            raise ValueError(f"study {self.name}: a seed is given twice: {self.seeds}")
         check_bounds(self)
 
 
@@ -129,7 +131,7 @@ class Cell:
     """A cell of a manifest: runs that differ only in their seed."""
 
     name: str
-    """Name, built from the fields in which it differs from the default."""
+    """Its own name, or one built from the fields in which it differs from the base."""
     config: TrainConfig
     """Its configuration, with seed 0."""
     skin_sha256: str
@@ -142,6 +144,11 @@ class Cell:
         """Hashes of the files that its results depend on, by their keys in a run."""
         found = {SKIN_HASH: self.skin_sha256, INIT_HASH: self.init_sha256}
         return {key: value for key, value in found.items() if value is not None}
+
+    def among(self, cells: Iterable[Cell]) -> Cell | None:
+        """Return the cell of some whose runs would be those of this one, if any."""
+        runs = self.config, self.hashes
+        return next((c for c in cells if (c.config, c.hashes) == runs), None)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -270,6 +277,12 @@ class Manifest:
             )
         own = {cell.name: cell for cell in self.cells}
         for cell in other.cells:
+            same = cell.among(own.values())
+            if same is not None and same.name != cell.name:
+                raise ValueError(
+                    f"cell {cell.name} is the manifest's cell {same.name}: give it "
+                    "that name"
+                )
             before = own.setdefault(cell.name, cell)
             if before != cell:
                 names = [*changed_values(before.config, cell.config)] or ["files"]
@@ -366,7 +379,8 @@ def resolve(study: Study) -> Manifest:
     cells: dict[str, Cell] = {}
     for number, overrides in enumerate(study.cells, 1):
         what = f"study {study.name}, cell {number}"
-        config = override(base, overrides, what, _NOT_OF_A_STUDY)
+        fields = {k: v for k, v in overrides.items() if k != "name"}
+        config = override(base, fields, what, _NOT_OF_A_STUDY)
         key = (config.env.robot, config.env.skin)
         try:
             if key not in skins:
@@ -386,7 +400,9 @@ def resolve(study: Study) -> Manifest:
         except (ValueError, OSError) as error:
             raise ValueError(f"{what}: {error}") from error
         cell = Cell(
-            name=cell_name(base, config),
+            name=_own_name(overrides["name"], what)
+            if "name" in overrides
+            else cell_name(base, config),
             config=config,
             skin_sha256=digest,
             init_sha256=init,
@@ -395,26 +411,44 @@ def resolve(study: Study) -> Manifest:
         if (n := len(PlannedRun(cell=cell, seed=seed).name.encode())) > _LONGEST_NAME:
             raise ValueError(
                 f"{what}: the names of its runs would have {n} bytes, and at most "
-                f"{_LONGEST_NAME} are possible; set fields that all cells share in base"
+                f"{_LONGEST_NAME} are possible; set fields that all cells share in "
+                "base, or give it a name"
             )
+        if same := cell.among(cells.values()):
+            both = f"{same.name} and {cell.name} are the same"
+            if same.name == cell.name:
+                both = f"cell {cell.name} is defined twice"
+            raise ValueError(f"{what}: {both}")
         other = cells.setdefault(cell.name, cell)
         if other is not cell:
             differs = changed_values(other.config, config)
-            if not differs:
-                raise ValueError(f"{what}: cell {cell.name} is defined twice")
             names = ", ".join(name.removeprefix("env.") for name in differs)
             raise ValueError(
                 f"{what}: another cell is also named {cell.name}; they only differ in "
-                f"{names} (files and robots need different names)"
+                f"{names}: give one of them a name"
             )
     return Manifest(
         study=study.name,
         purpose=study.purpose,
         base=base,
         cells=tuple(cells.values()),
-        seeds=tuple(dict.fromkeys(study.seeds)),
+        seeds=tuple(study.seeds),
         evaluation=study.evaluation,
     )
+
+
+def _own_name(name: Any, what: str) -> str:
+    """Return the name that a study gives a cell.
+
+    Raises:
+        ValueError: If it cannot be part of a file's name.
+    """
+    if not isinstance(name, str) or not re.fullmatch(r"\w[\w.-]*", name):
+        raise ValueError(
+            f"{what}: a cell's name may only have letters, digits, '-', '_', '.', and "
+            f"must not begin with '-' or '.', got {name!r}"
+        )
+    return name
 
 
 def cell_name(base: TrainConfig, config: TrainConfig) -> str:

@@ -7,7 +7,7 @@ import io
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -20,11 +20,26 @@ from egoskin.study.statistics import Table
 _END_SHARE, _LEAST_END = 0.05, 0.05
 
 
+MetricName = Literal[
+    "success_3s",
+    "success_5s",
+    "survival_s",
+    "first_avoided",
+    "later_avoided",
+    "falls",
+    "masked_success_3s",
+    "m_frames_to_50",
+    "m_frames_to_90",
+    "share_to_90",
+]
+"""Names of the metrics."""
+
+
 @dataclass(frozen=True)
 class Metric:
     """A metric of a run."""
 
-    name: str
+    name: MetricName
     """Name of its column."""
     label: str
     """Description."""
@@ -32,6 +47,11 @@ class Metric:
     """Its unit."""
     of: Callable[[Result], float | None]
     """Function that computes it; None if a run has no value."""
+
+    @property
+    def digits(self) -> int:
+        """Decimals of its values in texts."""
+        return 2 if self.unit == "s" else 1
 
 
 def has_learnt(result: Result) -> bool:
@@ -120,6 +140,10 @@ METRICS = (
 """Metrics of a run. Success, survival, balls and falls are from the throw set; frames
 are from the success in training, with exploration, and are the whole budget for a run
 that has not learnt (final success below 5 %)."""
+
+
+BY_NAME = {metric.name: metric for metric in METRICS}
+"""The metrics by name."""
 
 
 def tables(results: Sequence[Result]) -> Mapping[str, Table]:

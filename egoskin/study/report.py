@@ -21,20 +21,21 @@ from egoskin.study.differences import Difference, differences
 from egoskin.study.fields import settings
 from egoskin.study.figures import (
     RAYS,
+    difference_unit,
     equivalence,
     forest,
     learning_curves,
+    metric_by_cell,
     on_axis,
     places,
     sample_efficiency,
     save,
-    success_by_cell,
     success_by_range,
 )
 from egoskin.study.findings import CELLS, Judged, Tested, judge_findings
 from egoskin.study.folder import Result, StudyFolder
 from egoskin.study.manifest import Manifest
-from egoskin.study.metrics import METRICS, runs_csv, tables
+from egoskin.study.metrics import BY_NAME, METRICS, Metric, runs_csv, tables
 from egoskin.study.page import page, table
 from egoskin.study.statistics import (
     ALPHA,
@@ -54,37 +55,49 @@ _ASSUMED = (
 )
 
 
-def write_report(folder: StudyFolder, out: Path) -> None:
+def write_report(
+    folder: StudyFolder, out: Path, metric: Metric = BY_NAME["success_3s"]
+) -> None:
     """Write the report of a study.
 
     Args:
         folder: The study.
         out: Folder to write to, created if missing.
+        metric: Metric in which cells are compared with the first one. The metrics of
+            the paper's findings are fixed.
 
     Raises:
-        ValueError: If a result is damaged or does not match the manifest.
+        ValueError: If a result is damaged or does not match the manifest, or another
+            metric is given for the paper's findings.
         OSError: If a file cannot be written.
     """
     manifest = folder.manifest()
+    names = [cell.name for cell in manifest.cells]
+    if set(names) >= CELLS and metric.name != "success_3s":
+        raise ValueError(
+            f"study {manifest.study} is judged on the paper's findings, whose metrics "
+            "are fixed: leave out --metric"
+        )
     results = folder.results(manifest)
     out.mkdir(parents=True, exist_ok=True)
     values = tables(results)
-    names = [cell.name for cell in manifest.cells]
     judged: list[Judged] = []
     found: list[Difference] = []
     if set(names) >= CELLS:
         judged = judge_findings(values)
     else:
-        found = differences(names, values["success_3s"])
+        found = differences(names, values[metric.name])
     seen = _seen(folder)
-    pictures = _pictures(manifest, results, values["success_3s"], judged, found, seen)
+    pictures = _pictures(manifest, results, values, metric, judged, found, seen)
     for name, (figure, _) in pictures.items():
         save(figure, out, name)
     shown = {
         name: f"![{caption}]({name}.png)\n\n*{caption}*"
         for name, (_, caption) in pictures.items()
     }
-    blocks = _blocks(folder, manifest, results, values, judged, found, shown, seen)
+    blocks = _blocks(
+        folder, manifest, results, values, metric, judged, found, shown, seen
+    )
     text = "\n\n".join(blocks) + "\n"
     contents = {
         "runs.csv": runs_csv(manifest, results),
@@ -98,12 +111,14 @@ def write_report(folder: StudyFolder, out: Path) -> None:
 def _pictures(
     manifest: Manifest,
     results: Sequence[Result],
-    success: Table,
+    values: Mapping[str, Table],
+    metric: Metric,
     judged: Sequence[Judged],
     found: Sequence[Difference],
     seen: Sequence[Mapping[str, Any]],
 ) -> dict[str, tuple[Figure, str]]:
     """Return the figures for which there are data, with their captions."""
+    success = values["success_3s"]
     tested = [j for j in judged if _is_tested(j)]
     warnings = (
         "Below: time from the first detection of a ball to its contact with a standing "
@@ -125,8 +140,11 @@ def _pictures(
             f"(bars) over seeds; each dot is a seed. {shared}{warnings if seen else ''}"
             "Infinite ranges are left out.",
         ),
-        "success-by-cell": (
-            None if judged else success_by_cell(manifest, success, found),
+        "differences": (
+            None
+            if judged
+            else metric_by_cell(manifest, metric, values[metric.name], found),
+            f"{metric.label[:1].upper()}{metric.label[1:]}. "
             "Left: interquartile mean (hollow: one seed) and range (bars) over seeds; "
             "each dot is a seed. Right: difference to the first cell, with its 90 % "
             "(thick) and 95 % (thin) interval, without correction for the number of "
@@ -163,6 +181,7 @@ def _blocks(
     manifest: Manifest,
     results: Sequence[Result],
     values: Mapping[str, Table],
+    metric: Metric,
     judged: Sequence[Judged],
     found: Sequence[Difference],
     shown: Mapping[str, str],
@@ -204,22 +223,22 @@ def _blocks(
     if "findings" in shown:
         yield shown["findings"]
     first = manifest.cells[0].name
-    if not judged and len(manifest.cells) > 1 and not values["success_3s"].get(first):
+    if not judged and len(manifest.cells) > 1 and not values[metric.name].get(first):
         yield "## Differences to the first cell"
-        yield f"Unknown: {first} has no finished run."
+        yield f"Unknown: {first} has no finished run with a value of {metric.label}."
     if found:
         yield "## Differences to the first cell"
         yield (
-            f"Success at 3 s of each cell minus that of {first}, "
+            f"{metric.label[:1].upper()}{metric.label[1:]}: each cell minus {first}, "
             "compared seed by seed if they share two or more seeds (others are then "
             "left out). Two-sided p-values, corrected for the number of cells (Holm); "
             "intervals are not corrected. *Seeds* is the number "
             "it is based on and, if p is above 0.05, the total that would decide it "
             f"with a power of 80 % if effect and spread stay as observed. {_ASSUMED}"
         )
-        yield _difference_rows(found)
-    if "success-by-cell" in shown:
-        yield shown["success-by-cell"]
+        yield _difference_rows(found, metric)
+    if "differences" in shown:
+        yield shown["differences"]
     yield "## The cells"
     yield (
         "Interquartile mean and range over seeds; in brackets the mean with its 95 % "
@@ -392,21 +411,25 @@ def _finding_rows(judged: Sequence[Judged], results: Sequence[Result]) -> str:
     return table(head, rows)
 
 
-def _difference_rows(found: Sequence[Difference]) -> str:
+def _difference_rows(found: Sequence[Difference], metric: Metric) -> str:
     rows = []
     for each in found:
         open_ = each.p_value > ALPHA
         more = _more(each.effect.seeds, each.seeds_needed) if open_ else ""
         seeds = f"{each.effect.seeds}{more}"
-        rows.append((each.cell, _effect(each.effect), _p_value(each.p_value), seeds))
-    return table(("cell", "difference [points] (95 %)", "p", "seeds"), rows)
+        effect = _effect(each.effect, metric.digits)
+        rows.append((each.cell, effect, _p_value(each.p_value), seeds))
+    head = f"difference [{difference_unit(metric)}] (95 %)"
+    return table(("cell", head, "p", "seeds"), rows)
 
 
-def _effect(effect: Effect) -> str:
+def _effect(effect: Effect, digits: int = 1) -> str:
     """Return an effect with its 95 % interval, if that is known."""
     low, high = effect.interval()
-    known = effect.error > 0
-    return f"{effect.mean:+.1f}" + f" ({low:+.1f} to {high:+.1f})" * known
+    text = f"{effect.mean:+.{digits}f}"
+    if effect.error > 0:
+        text += f" ({low:+.{digits}f} to {high:+.{digits}f})"
+    return text
 
 
 def _more(have: int, needed: int | None) -> str:
@@ -429,7 +452,7 @@ def _cell_rows(manifest: Manifest, values: Mapping[str, Table]) -> str:
         for metric in _SHOWN:
             own = list(values[metric.name].get(cell.name, {}).values())
             fewer = f", n = {len(own)}" * (0 < len(own) < len(success))
-            row.append(_spread(own) + fewer)
+            row.append(_spread(own, metric.digits) + fewer)
         effect = mean_effect(list(success.values()))
         low, high = effect.interval()
         if effect.error > 0:
@@ -438,13 +461,12 @@ def _cell_rows(manifest: Manifest, values: Mapping[str, Table]) -> str:
     return table(("cell", "seeds", *(f"{m.label} [{m.unit}]" for m in _SHOWN)), rows)
 
 
-def _spread(values: Sequence[float]) -> str:
+def _spread(values: Sequence[float], digits: int) -> str:
     if not values:
         return "-"
     own = spread(values)
-    if own.seeds == 1:
-        return f"{own.iqm:.1f}"
-    return f"{own.iqm:.1f} ({own.low:.1f} to {own.high:.1f})"
+    mean, low, high = (f"{v:.{digits}f}" for v in (own.iqm, own.low, own.high))
+    return mean if own.seeds == 1 else f"{mean} ({low} to {high})"
 
 
 def _seen(folder: StudyFolder) -> list[dict[str, Any]]:

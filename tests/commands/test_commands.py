@@ -264,7 +264,7 @@ def test_an_evaluation_may_wear_another_skin(tmp_path: Path):
         (["--skin", "no.json"], "no.json"),
         (
             ["--mask", "torso_lnk"],
-            "no sensor on 'torso_lnk', did you mean 'torso_link'?; links",
+            "no sensor on 'torso_lnk', did you mean 'torso_link'? (links",
         ),
         (["--mask", "all", "torso_link"], "no sensor on 'all'"),
         (["--standard", "3"], "--standard"),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from calling import call, succeed
+from calling import call, fail, succeed
 from owning import MODEL, TOML, write_robot
 
 
@@ -63,6 +63,17 @@ def test_a_model_alone_cannot_be_trained(tmp_path: Path):
     done = call("robot", "check", write_robot(tmp_path) / "walker.xml")
     assert "walker has no gains" in done.stdout
     assert done.returncode == 2
+
+
+def test_a_urdf_without_a_single_base_is_told_its_candidates(tmp_path: Path):
+    path = tmp_path / "two.urdf"
+    path.write_text(
+        "<robot name='two'><link name='hull'/><link name='arm'/><link name='loose'/>"
+        "<joint name='j' type='fixed'><parent link='hull'/><child link='arm'/></joint>"
+        "</robot>"
+    )
+    told = "two has no single base: attached to the world are hull, loose; give base in"
+    assert told in fail("robot", "check", path)
 
 
 def test_a_joint_without_a_range_and_a_weak_one_are_notes(tmp_path):

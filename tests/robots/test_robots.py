@@ -279,7 +279,7 @@ def test_a_robot_may_be_one_body_of_a_scene(tmp_path):
         "<geom size='.1'/></body></body></worldbody></mujoco>"
     )
     with pytest.raises(
-        ValueError, match=r"free joint as the base \(read_robot\(path, b"
+        ValueError, match=r"free joint as the base \(base in robot.toml, or "
     ):
         _ = read_robot(path).chain
     robot = read_robot(path, base="bot")
@@ -288,11 +288,12 @@ def test_a_robot_may_be_one_body_of_a_scene(tmp_path):
     assert {p.link for p in robot.primitives} == {"bot", "arm"}
     skin = place_sensors(read_robot(path, base="bot", skin_links=["arm"]), 5)
     assert {*skin.links} == {"arm"}
+    assert read_robot(path, base="bot", skin_links=["a*"]).skin_links == ("arm",)
     for options, message in (
         ({"base": "bat"}, "the model has no body 'bat', did you mean 'bot'"),
         (
             {"base": "bot", "skin_links": ["ball"]},
-            r"no links \['ball'\] below base 'bot'",
+            r"below base 'bot': no link 'ball'",
         ),
     ):
         with pytest.raises(ValueError, match=message):

@@ -373,7 +373,7 @@ def test_a_policy_whose_sensors_are_masked_does_what_one_does_without_sensors():
         ({}, ("torso_lnk",), r"no sensor on 'torso_lnk'.*: .*torso_link"),
         ({}, ("torso_link", "pelvis"), "no sensor on 'pelvis'"),
         ({}, ("all", "torso_link"), "no sensor on 'all'"),
-        ({}, "all", "mask must be a sequence of links, got 'all'"),
+        ({}, "all", "expected a sequence of links with sensors, got 'all'"),
         ({"coverage": "none"}, MASK_ALL, "a blind robot has no sensors to mask"),
         ({"coverage": "none"}, ("torso_link",), "a blind robot has no sensors"),
         (
@@ -397,6 +397,12 @@ def test_a_mask_that_masks_nothing_is_refused(sensor, mask, message):
 @pytest.mark.parametrize("mask", [(), MASK_ALL, ["all"], ("torso_link",)])
 def test_a_mask_of_links_with_sensors_is_taken(mask):
     SENSING.check_mask(mask)
+
+
+def test_links_are_masked_by_pattern():
+    left = SENSING.masked(["left_*"])
+    assert {SKIN.links[i] for i in left} == {n for n in SKIN.links if n[:4] == "left"}
+    assert 0 < len(left) < len(SKIN)
 
 
 def test_a_link_without_sensors_in_this_skin_is_refused():

@@ -140,7 +140,7 @@ def test_a_reward_with_a_penalty_is_no_longer_bounded():
     ],
 )
 def test_an_unknown_link_is_refused_with_the_closest(build):
-    with pytest.raises(ValueError, match="'left_arn' matches no link, did you mean "):
+    with pytest.raises(ValueError, match="no link 'left_arn', did you mean "):
         build("left_arn")
 
 

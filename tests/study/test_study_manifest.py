@@ -164,14 +164,38 @@ def test_two_cells_of_one_name_are_told_what_they_differ_in(tmp_path: Path):
         cells.append({"sensor.coverage": "none", "init_from": str(path)})
     text = (
         "cell 2: another cell is also named blind-init_from-p.safetensors; they only "
-        "differ in init_from (files and robots need different names)"
+        "differ in init_from: give one of them a name"
     )
     with pytest.raises(ValueError, match=re.escape(text)):
         changed(cells=tuple(cells))
+    named = changed(cells=({**cells[0], "name": "first"}, cells[1]))
+    assert [c.name for c in named.cells] == ["first", "blind-init_from-p.safetensors"]
     # The name of a blind cell has no range.
     blind = {"sensor.coverage": "none"}
     with pytest.raises(ValueError, match=r"named blind; they .* in sensor\.range"):
         changed(cells=(blind, {**blind, "sensor.range": 1.0}))
+
+
+def test_cells_may_have_names_of_their_own(tmp_path: Path):
+    named = changed(cells=({"name": "base"}, {"name": "long", "history": 8}))
+    assert [run.name for run in named.runs[:2]] == ["base-seed0", "long-seed0"]
+    assert named.overrides(named.cells[1]) == {"env.history": 8}
+    named.save(tmp_path / "manifest.json")
+    assert Manifest.load(tmp_path / "manifest.json") == named
+    # The same runs under two names would be trained twice.
+    with pytest.raises(ValueError, match="cell 2: base and field-proximity-2m are the"):
+        changed(cells=({"name": "base"}, {}))
+    text = "cell field-proximity-2m is the manifest's cell base: give it that name"
+    with pytest.raises(ValueError, match=text):
+        named.extended(changed(cells=({},), seeds=(7,)))
+    more = named.extended(changed(cells=({"name": "base"},), seeds=(7,)))
+    assert (more.cells, more.seeds) == (named.cells, (*named.seeds, 7))
+
+
+@pytest.mark.parametrize("name", ["a/b", "", "-a", "..", 3, None])
+def test_names_of_cells_are_part_of_file_names(name):
+    with pytest.raises(ValueError, match=f"cell 1: a cell's name may .* got {name!r}"):
+        changed(cells=({"name": name},))
 
 
 def test_a_cell_whose_name_is_too_long_for_files_is_told_by_its_number():
@@ -187,6 +211,7 @@ def test_a_cell_whose_name_is_too_long_for_files_is_told_by_its_number():
     [
         ({"cells": ()}, "at least one cell"),
         ({"seeds": (-1,)}, "seed must be"),
+        ({"seeds": (0, 1, 0)}, "study small: a seed is given twice"),
         ({"frames": 0}, "frames must be"),
         ({"name": "a/b"}, "name"),
     ],

@@ -26,16 +26,16 @@ from egoskin.study.figures import (
     equivalence,
     forest,
     learning_curves,
+    metric_by_cell,
     places,
     sample_efficiency,
     save,
-    success_by_cell,
     success_by_range,
 )
 from egoskin.study.findings import judge_findings
 from egoskin.study.folder import StudyFolder
 from egoskin.study.manifest import Manifest, resolve
-from egoskin.study.metrics import METRICS, frames_to, runs_csv, tables
+from egoskin.study.metrics import BY_NAME, METRICS, frames_to, runs_csv, tables
 from egoskin.study.page import page, table
 from egoskin.study.report import _difference_rows, write_report
 from egoskin.study.shipped import FINDINGS, SMOKE
@@ -240,6 +240,31 @@ def test_cells_of_other_kinds_are_reported_too(tmp_path: Path):
     row = r"\| field-proximity-2m-history-3 \| [+-].* to .*\) \| [\d.]+ \| 2 of \d+ \|"
     assert re.search(row, rows)
     assert rows.count("\n| field-proximity-2m") == 2
+    assert "difference [percentage points] (95 %)" in rows
+    assert (tmp_path / "report" / "differences.svg").is_file()
+
+
+def test_cells_are_compared_in_the_metric_that_is_asked_for(
+    manifest: Manifest, tmp_path: Path
+):
+    cells = ({}, {"name": "longer", "history": 3})
+    study = dataclasses.replace(FINDINGS, name="mine", cells=cells, seeds=(0, 1, 2))
+    folder, mine = StudyFolder(tmp_path), resolve(study)
+    folder.plan(mine)
+    for run in mine.runs:
+        # Longer by 0.06 s with each point of success: by 0.60, 0.66 and 0.72 s.
+        better = (10.0 + run.seed) * (run.cell.name == "longer")
+        store(folder, mine, run, 40.0 + run.seed + better)
+    write_report(folder, tmp_path / "report", BY_NAME["survival_s"])
+    text = (tmp_path / "report" / "report.md").read_text()
+    assert "Mean survival, restricted to 10 s: each cell minus field-prox" in text
+    assert "| cell | difference [s] (95 %) | p | seeds |" in text
+    assert "| longer | +0.66 (+0.51 to +0.81) |" in text
+    folder = StudyFolder(tmp_path / "paper")
+    folder.plan(manifest)
+    with pytest.raises(ValueError, match=r"study findings is judged .* --metric"):
+        write_report(folder, tmp_path / "other", BY_NAME["falls"])
+    assert not (tmp_path / "other").exists()
 
 
 def test_the_cost_of_a_decision_is_in_core_hours(
@@ -335,7 +360,8 @@ def test_a_damaged_visibility_is_named(content, tmp_path: Path):
 def test_seeds_without_a_spread_are_not_told_to_be_more_than_enough():
     # All pairs differ by 60, so nothing is decided; the cells have a spread.
     table = {"one": {0: 1.0, 1: 2.0, 2: 3.0}, "other": {0: 61.0, 1: 62.0, 2: 63.0}}
-    (row,) = _difference_rows(differences(list(table), table)).splitlines()[2:]
+    found = differences(list(table), table)
+    (row,) = _difference_rows(found, BY_NAME["success_3s"]).splitlines()[2:]
     assert row == "| other | +60.0 | 1.000 | 3, needs more |"
 
 
@@ -552,7 +578,7 @@ def test_cells_of_any_fields_are_drawn_beside_their_differences():
     mine, table = own_study()
     names = list(table)
     found = differences(names, table)
-    figure = success_by_cell(mine, table, found)
+    figure = metric_by_cell(mine, BY_NAME["success_3s"], table, found)
     assert figure is not None
     left, right = figure.axes
     labels = [tick.get_text() for tick in left.get_yticklabels()]
@@ -569,7 +595,8 @@ def test_cells_of_any_fields_are_drawn_beside_their_differences():
     # Ten points with a spread of two: red.
     assert found[0].p_value <= 0.05
     assert [x.get_color() for x in marks] == ["#D55E00", "#888888"]
-    assert success_by_cell(mine, {names[0]: {0: 1.0}}, []) is None
+    one = {names[0]: {0: 1.0}}
+    assert metric_by_cell(mine, BY_NAME["success_3s"], one, []) is None
 
 
 def test_many_cells_of_any_fields_are_told_apart_by_their_lines(

@@ -13,6 +13,7 @@ from typing import Literal
 
 import numpy as np
 
+from egoskin.hints import matching
 from egoskin.robots.config import RobotConfig, resolve
 from egoskin.robots.surface import primitive_surface
 from egoskin.sensors.skin.mesh_surface import Meshes, mesh_surface
@@ -287,7 +288,8 @@ def place_sensors(
         num_sensors: Number of sensors ``S``; None takes as many as fit at the spacing.
         seed: Seed of the placement.
         method: Placement method.
-        links: Links to cover; the robot's ``skin_links`` (upper body) by default.
+        links: Links to cover, by name or shell pattern; the robot's ``skin_links``
+            (upper body) by default.
         density: Relative number of sensors per area by link or shell pattern
             (``*_wrist_*``); 1 for links not named, 0 for no sensors.
         spacing: Minimum distance between sensors [m] (``poisson_disk``). A link of
@@ -311,7 +313,9 @@ def place_sensors(
             f"{type(robot).__name__}"
         )
     _check(num_sensors, seed, method, spacing, stand_off)
-    covered = tuple(robot.skin_links if links is None else links)
+    covered = robot.skin_links
+    if links is not None:
+        covered = matching(links, robot.links, "link")
     if not covered:
         raise ValueError("place_sensors needs at least one link to cover")
     weights = _link_weights(covered, density or {})

@@ -93,6 +93,11 @@ def test_placement_covers_the_skin_links_alone():
 def test_placement_covers_the_links_asked_for():
     skin = place_sensors(H1_2, 20, links=["pelvis"])
     assert set(skin.links) == {"pelvis"}
+    names = ["left_elbow_link", "right_elbow_link", "torso_link"]
+    listed = place_sensors(H1_2, 20, links=names)
+    found = place_sensors(H1_2, 20, links=["*_elbow_link", "torso*"])
+    np.testing.assert_array_equal(found.position, listed.position)
+    assert found.provenance == listed.provenance
 
 
 def test_provenance_repeats_the_skin(tmp_path):
