@@ -53,7 +53,8 @@ class TrainConfig:
     learner_threads: Annotated[int | None, COUNT] = None
     """Threads of the learner on a CPU, at most 4; None: one per core, up to that."""
     run_dir: Path | None = None
-    """Folder of the run; None: a new one under runs/, named after time and sensor."""
+    """Folder of the run; None: a new one under runs/, named after time, robot (if it is
+    not the H1-2) and sensor."""
     snapshot_frames: Annotated[int, COUNT] = 5_000_000
     """Environment steps between the policies saved for learning curves."""
     film_every: Annotated[int | None, COUNT] = None

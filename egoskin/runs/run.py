@@ -25,6 +25,7 @@ import errno
 import io
 import itertools
 import os
+import re
 import shutil
 import sys
 from collections.abc import Iterator, Mapping
@@ -37,6 +38,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from egoskin.make import EnvConfig
 from egoskin.policies.policy import CHECKPOINT_NAME, load_networks
 from egoskin.runs.checks import check_effect, check_fits, check_repeats
 from egoskin.runs.config import (
@@ -113,6 +115,10 @@ class Run:
         path = config.run_dir
         if path is None:
             kind = config.env.sensor.label()
+            if config.env.robot != EnvConfig().robot:
+                # The name of a model may have any characters.
+                robot = re.sub(r"[^\w.]+", "-", config.env.robot_config.name)
+                kind = f"{robot}-{kind}"
             stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
             path = Path("runs") / f"{stamp}-{kind}-seed{config.seed}"
         if path.exists() and (not path.is_dir() or any(path.iterdir())):

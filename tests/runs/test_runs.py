@@ -89,6 +89,8 @@ def test_a_run_without_a_folder_is_named_after_time_sensor_and_seed(
     path = Run.create(config).path
     assert re.fullmatch(r"runs/\d{8}-\d{6}-blind-seed3", str(path))
     assert (tmp_path / path / "config.json").is_file()
+    g1 = replace(config, env=replace(config.env, robot="g1"))
+    assert re.fullmatch(r"runs/\d{8}-\d{6}-g1-blind-seed3", str(Run.create(g1).path))
 
 
 def test_one_process_trains_a_run_at_a_time(config: TrainConfig):
