@@ -225,7 +225,7 @@ def _reported(report: Path) -> Iterator[None]:
 class _Build:
     """Builds the environment of one worker; picklable for the worker process."""
 
-    def __init__(self, build: Callable[[], WorkerEnv | EnvBase], report: Path) -> None:
+    def __init__(self, build: Callable[[], EnvBase], report: Path) -> None:
         self._build, self._report = build, report
         self._parent = os.getpid()
         # A worker inherits those of the server that forks it, which may be outdated.

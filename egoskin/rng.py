@@ -154,7 +154,7 @@ def random_words(
         Random words in [0, 2**32), ``[4, *B]`` int64.
 
     Raises:
-        ValueError: If the seed is not a 32-bit unsigned integer.
+        ValueError: If the seed is neither of these.
     """
     words = torch.stack((row, episode, counter, block))
     return philox(words & _MASK, stream_key(seed, stream))
@@ -183,7 +183,7 @@ def uniform(
         Multiples of 2**-24 in [0, 1), ``[*B, size]`` float32.
 
     Raises:
-        ValueError: If the seed is not a 32-bit unsigned integer.
+        ValueError: If the seed is neither of these.
     """
     shape = (-(-size // 4), *row.shape)
     block = torch.arange(shape[0], device=row.device).reshape(-1, *[1] * row.ndim)

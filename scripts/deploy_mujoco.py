@@ -34,7 +34,7 @@ def prepare(policy: str, out: Path, episodes: int, throw_set: int) -> None:
     import torch
 
     from egoskin.envs.physics.contract import Scene
-    from egoskin.envs.physics.mujoco import build_scene
+    from egoskin.envs.physics.model import build_scene
     from egoskin.envs.throws import Thrower
     from egoskin.evaluation.throw_set import play_throws, standard_task, throw_seed
     from egoskin.make import make_worker_env

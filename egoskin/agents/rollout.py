@@ -72,7 +72,7 @@ def collect(
 
 
 def correlated_noise(
-    shape: tuple[int, int, int], correlation: float, device: torch.device | None = None
+    shape: tuple[int, int, int], correlation: float, device: torch.device
 ) -> Tensor:
     """Return standard normal noise that is correlated in time, ``[T, N, J]``.
 

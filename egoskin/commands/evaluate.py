@@ -272,7 +272,7 @@ def worn_skin(policy: Policy, path: Path | None) -> Skin:
     if path is None:
         return policy.skin
     config, skin = policy.env_config, Skin.load(path)
-    if config.sensor.coverage in ("none", "oracle"):
+    if not config.sensor.uses_skin:
         raise ValueError(f"{path}: the policy reads no skin")
     robot = config.robot_config
     skin.check_robot(robot.name, robot.links, str(path))

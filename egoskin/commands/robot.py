@@ -105,16 +105,16 @@ def _meshes(made: Portable) -> Iterator[Finding]:
 
 
 def findings(
-    robot: RobotConfig, skin: SkinConfig, original: RobotConfig | None = None
+    robot: RobotConfig, skin: SkinConfig, original: RobotConfig
 ) -> Iterator[Finding]:
     """Check a robot, from its model to how it stands.
 
     Args:
         robot: The robot.
         skin: Placement of its sensors.
-        original: The robot with its visual shapes, if that is another one.
+        original: The robot with its visual shapes.
     """
-    static = [*check_model(robot), *_skin(robot, skin, original or robot)]
+    static = [*check_model(robot), *_skin(robot, skin, original)]
     yield from static
     if any(finding.kind == "wrong" for finding in static):
         yield Finding("note", "whether it stands is tested once this is fixed")

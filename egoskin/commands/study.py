@@ -383,7 +383,7 @@ def entry(status: RunStatus) -> str:
     share = status.frames / status.run.end
     match status.state:
         case "done":
-            return "done" if status.success is None else f"done {status.success:.1%}"
+            return f"done {status.success:.1%}"
         case "running":
             return f"{share:.0%}, {duration(status.left_s)} left"
         case "failed":

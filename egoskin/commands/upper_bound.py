@@ -55,7 +55,7 @@ class UpperBoundConfig:
     """Episodes of the throw set."""
     ball: Annotated[int, COUNT] = 1
     """Number of the ball in each episode, from 1; it is the last ball thrown."""
-    reach: Annotated[float, Interval(gt=0, le=math.inf)] = 2.0
+    reach: Annotated[float, Interval(ge=1e-3, le=math.inf)] = 2.0
     """Distance from a sensor to the ball's surface at which the search starts [m]."""
     search: SearchConfig = field(default_factory=SearchConfig)
     """The search."""

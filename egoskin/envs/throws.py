@@ -355,10 +355,7 @@ class Thrower:
     def _target(
         self, draw: Draw, base_pose: Tensor, joint_pos: Tensor, side: Tensor
     ) -> Tensor:
-        """Return the target point of each throw in the world [m], ``[n, 3]``.
-
-        There is one pose for each throw, or one for all, ``[1, ...]``.
-        """
+        """Return the target point of each throw in the world [m], ``[n, 3]``."""
         if self.config.aim == "box":
             offset = (2 * draw.target[:, :1] - 1) * self.config.box_half_width
             across = torch.stack((-side[:, 1], side[:, 0]), -1)

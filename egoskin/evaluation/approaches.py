@@ -22,7 +22,12 @@ from torch import Tensor
 from egoskin.envs.physics.contract import GRAVITY
 from egoskin.envs.throws import ThrowConfig, Thrower
 from egoskin.robots.config import RobotConfig
-from egoskin.robots.surface import default_frames, distance_to, sample_surface
+from egoskin.robots.surface import (
+    default_frames,
+    distance_to,
+    points_b,
+    sample_surface,
+)
 from egoskin.sensors import Ray, SensorPipeline, Skin
 from egoskin.sensors.config import SensorConfig
 from egoskin.shapes import Sphere
@@ -102,9 +107,10 @@ class StandingRobot:
 
     def standoff(self, skin: Skin) -> float:
         """Return the largest distance of a sensor from the body [m], at least 0."""
-        link = [self.config.links.index(name) for name in skin.links]
-        turned = (self.link_rotation[link] @ skin.position[..., None])[..., 0]
-        return max(0.0, float(self.distance(turned + self.link_position[link]).max()))
+        link = np.array([self.config.links.index(name) for name in skin.links])
+        frames = (self.link_position, self.link_rotation)
+        points = points_b(frames, link, skin.position)
+        return max(0.0, float(self.distance(points).max()))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -319,10 +325,9 @@ def surface_paths(
     """
     links = list(dict.fromkeys(s.link for s in body.config.primitives))
     points = sample_surface(body.config, links, _NUM_SURFACE_POINTS, seed)
-    turn = body.link_rotation[points.link]
-    start = (turn @ points.position[..., None])[..., 0]
-    start = start + body.link_position[points.link]
-    outward = (turn @ points.normal[..., None])[..., 0]
+    frames = (body.link_position, body.link_rotation)
+    start = points_b(frames, points.link, points.position)
+    outward = (body.link_rotation[points.link] @ points.normal[..., None])[..., 0]
     along = ball.radius + np.arange(math.ceil(distance / _STEP), -1, -1) * _STEP
     paths = start[:, None] + along[None, :, None] * outward[:, None]
     return torch.from_numpy(paths).float(), points.link

@@ -112,7 +112,7 @@ class Waiting:
 
 @dataclass(frozen=True, kw_only=True)
 class Behaviour:
-    """Behaviour of a policy on a throw set, within 10 s."""
+    """Behaviour of a policy on a throw set, over whole episodes."""
 
     throws: dict[str, list[Group]]
     """Groups by number of the ball, direction, height aimed at, speed at arrival, time

@@ -75,7 +75,7 @@ class Avoided:
 class Evaluation:
     """Results of a policy on a throw set.
 
-    Success is evaluated at the task's ``success_s``, 3 s in the standard task; success
+    Success is evaluated at the task's ``success_age_s``, 3 s in the standard task; it
     and the shares of endings up to then add up to 1. Times count from the first throw.
     """
 
@@ -97,7 +97,7 @@ class Evaluation:
     rigid_success: float
     """Success on the same throw set with the robot held rigid in its default pose."""
     avoided: Avoided
-    """Balls avoided per ball that arrived, within 10 s."""
+    """Balls avoided per ball that arrived, over whole episodes."""
     episodes: int
     """Size of the throw set."""
 
@@ -178,6 +178,9 @@ def play_throws(
             with threads instead of workers and the same result.
         engine: Physics engine.
         device: Device of engine warp.
+
+    Raises:
+        ValueError: If an action of the policy is not finite, or as for `make_env`.
     """
     assert first == 0 or watch is not None
     seed = throw_seed(config, throw_set)

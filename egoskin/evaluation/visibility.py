@@ -295,8 +295,8 @@ def see_directions(
         where no ball can come from.
 
     Raises:
-        ValueError: If the body has shapes without a distance function, or a sensor has
-            an infinite range.
+        ValueError: If the robot has no collision shapes or some that are no primitives,
+            or a sensor has an infinite range.
     """
     body = StandingRobot(robot)
     cells = pipelines(robot, skin, {sensor.coverage: sensor}, sensor.range)
@@ -352,8 +352,9 @@ def analyse(
 
     Raises:
         ValueError: If there is no coverage, range or throw, a range (also of the skin)
-            is not positive and finite, one is repeated, the seed is invalid, or the
-            throws are not of spheres.
+            is not positive and finite, one is repeated, the seed is invalid, the
+            throws are not of spheres, the skin is on other links, or the robot has no
+            collision shapes or some that are no primitives.
     """
     if not sensors or not ranges:
         raise ValueError("an analysis needs at least one coverage and one range")

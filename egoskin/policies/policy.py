@@ -159,7 +159,8 @@ class PolicySpec:
         numbers = [*numbers, header["num_actions"], header["frames"]]
         if not all(isinstance(number, int) for number in numbers):
             raise ValueError(
-                f"{what} is not a policy: sizes, num_actions and frames must be numbers"
+                f"{what} is not a policy: sizes, num_actions and frames must be whole "
+                "numbers"
             )
         if header["engine"] not in get_args(Engine):
             raise ValueError(f"{what} is not a policy: no engine {header['engine']!r}")

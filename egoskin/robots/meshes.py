@@ -223,7 +223,7 @@ def _same_contacts(geom: mujoco.MjsGeom) -> mujoco.MjsGeom:
     return other
 
 
-def fit_meshes(spec: mujoco.MjSpec, in_pairs: Collection[str] = ()) -> list[MeshFit]:
+def fit_meshes(spec: mujoco.MjSpec, in_pairs: Collection[str]) -> list[MeshFit]:
     """Replace the collision meshes and ellipsoids of a robot by primitives around them.
 
     Args:

@@ -147,20 +147,9 @@ class Surface:
                 f"the links {', '.join(self.links)} have no collision shape{hint}"
             )
         self._link_index = [robot.links.index(patch.link) for patch in self._patches]
-        self._shift, self._turn = default_frames(robot)
+        self.frames = default_frames(robot)
+        """Result of `default_frames`."""
         self._side = side
-
-    def points_b(self, link: np.ndarray, position: np.ndarray) -> np.ndarray:
-        """Return points of links in the base frame, in the default pose.
-
-        Args:
-            link: Indices of the links in ``RobotConfig.links``, ``[n]``.
-            position: Positions in the frames of the links [m], ``[n, 3]``.
-
-        Returns:
-            Positions [m], ``[n, 3]``.
-        """
-        return points_b((self._shift, self._turn), link, position)
 
     def sample(
         self,
@@ -232,7 +221,7 @@ class Surface:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return (link, position, normal) of those of n points on the outer surface."""
         points, normals = self._patches[index].sample(n, rng)
-        turn, shift = (a[self._link_index[index]] for a in (self._turn, self._shift))
+        shift, turn = (a[self._link_index[index]] for a in self.frames)
         side = self._side(points @ turn.T + shift, normals @ turn.T, stand_off)
         outer = side != 0
         link = np.full(outer.sum(), self._link_index[index])

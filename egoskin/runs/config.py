@@ -74,7 +74,7 @@ class TrainConfig:
     the same."""
     resume: Path | None = None
     """Run folder to resume. Only --total-frames (to a later end) may change, and what
-    changes no result: workers, threads, intervals of checkpoints and policies."""
+    changes no result: workers, threads, films, log, intervals of saving."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for invalid values."""
@@ -90,7 +90,7 @@ class TrainConfig:
                 f"standard {self.env.standard}: build it with egoskin.envs.standards."
                 f"training_task({self.standard!r}, DodgeballConfig())"
             )
-        frames = self.num_envs * self.ppo.rollout_steps
+        frames = self.frames_per_batch
         if frames < 2:
             raise ValueError("a rollout must have at least 2 frames, not 1")
         if frames < self.ppo.num_mini_batches:

@@ -4,7 +4,7 @@
     skin.json                the sensors
     versions.json            packages, machine, git state, command of each start
     metrics.csv              one line for each rollout; TensorBoard files beside it
-    checkpoint.safetensors   everything needed to resume, at most a minute old
+    checkpoint.safetensors   everything needed to resume, every checkpoint_interval
     policies/<frames>.safetensors   self-contained policies, from the start on
     films/<frames>.mp4, .png   films of the policies, if requested
     not-finite-<frames>.safetensors   a failed update, for ``egoskin replay``

@@ -26,8 +26,8 @@ def describe_start(engine: str) -> dict[str, Any]:
         engine: Physics engine of the run; it decides which packages are of interest.
     """
     names = _PACKAGES + _WARP_PACKAGES * (engine == "warp")
-    # The version of torch names its build; that of the installed package may not.
     packages = {p: package_version(p) for p in names}
+    # The version of torch names its build; that of the installed package may not.
     packages["torch"] = str(torch.__version__)
     return {
         "time": datetime.datetime.now(datetime.timezone.utc).isoformat(),

@@ -96,14 +96,14 @@ class Trainer:
         sources: Mapping[str, SparseSource],
     ) -> None:
         self.config, self.run, self.env = run.config, run, env
-        self.device = device_of(self.config.device)
-        config = self.config
+        config = run.config
+        self.device = device_of(config.device)
         spec = PolicySpec.of(config.env, skin, config.ppo.network, env, sources)
         self.spec = dataclasses.replace(spec, engine=config.engine)
-        torch.manual_seed(self.config.seed)
+        torch.manual_seed(config.seed)
         self.agent: Agent = self.spec.build_agent(sources).to(self.device)
         self.ppo = PPO(self.agent, config.ppo, config.num_learner_threads)
-        self.survival = SurvivalCurve(self.config.env.task.episode_steps)
+        self.survival = SurvivalCurve(config.env.task.episode_steps)
         self.frames = 0
         self.wall_s = 0.0
         self.root: TensorDictBase = TensorDict()

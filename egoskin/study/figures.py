@@ -494,7 +494,7 @@ def equivalence(manifest: Manifest, table: Table) -> Figure | None:
     for y, (_, effect) in enumerate(pairs):
         low, high = effect.interval()
         kind = "undecided"
-        if SAME.p_inside(effect) <= 0.05:
+        if SAME.p_inside(effect) <= ALPHA:
             kind = "equivalent within 5 points"
         elif effect.error > 0 and (low > 0 or high < 0):
             kind = "different"

@@ -4,12 +4,14 @@
     runs/NAME/         a run folder, or a link to an existing one
     results/NAME/      the small files of a finished run, see `egoskin.study.stored`;
                        the evaluation is written last and marks the run as finished
+    visibility.json    what each range sees, if it was analysed
     claims/            locks of runs being worked on, see `egoskin.study.claims`
     logs/NAME.log      output of the run's processes
     failed/NAME.json   number of failures, and the last error
     report/            output of `egoskin.study.report`
 
-Contract: ``manifest.json`` and ``results/`` are all that a report needs.
+Contract: ``manifest.json``, ``results/`` and, if there is one, ``visibility.json`` are
+all that a report needs.
 """
 
 from __future__ import annotations
@@ -34,7 +36,15 @@ from egoskin.storage.serialization import read_json, write_json
 from egoskin.storage.tensor_file import load_tensors
 from egoskin.study.claims import is_claimed, is_locked
 from egoskin.study.manifest import EvaluationPlan, Manifest, PlannedRun
-from egoskin.study.stored import StoredRun, load_run, record, thin, to_json
+from egoskin.study.stored import (
+    EVALUATION,
+    StoredRun,
+    evaluation_path,
+    load_run,
+    record,
+    thin,
+    to_json,
+)
 
 State = Literal["done", "running", "failed", "stopped", "missing"]
 """State of a run; stopped: it was begun, and no process works on it now."""
@@ -44,7 +54,6 @@ START = "--- started"
 
 # Approximate maximum number of lines of metrics that are stored of a run.
 _LINES = 250
-_EVALUATION = "evaluation_*.json"
 # What an evaluation must share with the plan for its results to be comparable.
 _OF_EVALUATION = ("standard", "throw_set", "episodes")
 # Size of the end of a log that is searched for its last line [bytes].
@@ -240,22 +249,7 @@ class StudyFolder:
 
     def is_finished(self, name: str) -> bool:
         """Return whether a run has been trained and evaluated."""
-        return any(self.result_path(name).glob(_EVALUATION))
-
-    def _evaluation_path(self, name: str) -> Path:
-        """Return the evaluation of a finished run.
-
-        Raises:
-            ValueError: If there are several, as after copying from two studies.
-        """
-        folder = self.result_path(name)
-        files = sorted(folder.glob(_EVALUATION))
-        if len(files) > 1:
-            raise ValueError(
-                f"{folder} has {len(files)} evaluations, but only one can be right: "
-                + ", ".join(file.name for file in files)
-            )
-        return files[0]
+        return any(self.result_path(name).glob(EVALUATION))
 
     def finish(self, planned: PlannedRun, evaluation: Mapping[str, Any]) -> None:
         """Store the small files of a trained run, and mark it as finished.
@@ -312,7 +306,7 @@ class StudyFolder:
                 f"{folder} does not match the manifest: it differs in "
                 + ", ".join(differs)
             )
-        file = self._evaluation_path(planned.name)
+        file = evaluation_path(folder)
         evaluation = stored.evaluation
         if evaluation["frames"] != planned.end:
             raise ValueError(
@@ -388,7 +382,7 @@ class StudyFolder:
 
     def _status(self, run: PlannedRun) -> RunStatus:
         if self.is_finished(run.name):
-            content, _ = read_sealed(self._evaluation_path(run.name))
+            content, _ = read_sealed(evaluation_path(self.result_path(run.name)))
             success = content["success"]["mean"]
             return RunStatus(run=run, state="done", frames=run.end, success=success)
         row = _last_row(self.run_path(run.name) / "metrics.csv")

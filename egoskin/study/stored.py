@@ -26,6 +26,9 @@ from egoskin.runs.run import Run
 from egoskin.storage.formats import read_sealed
 from egoskin.storage.serialization import from_plain, read_json
 
+EVALUATION = "evaluation_*.json"
+"""Pattern of the name of the evaluation of a finished run."""
+
 # Significant digits of stored metrics.
 _DIGITS = 6
 
@@ -155,22 +158,36 @@ def _without(args: Sequence[str], option: str) -> list[str]:
     return kept
 
 
+def evaluation_path(folder: Path) -> Path:
+    """Return the evaluation stored in the folder of a finished run.
+
+    Raises:
+        ValueError: If there is none, or several, as after copying from two studies.
+    """
+    files = sorted(folder.glob(EVALUATION))
+    if not files:
+        raise ValueError(f"{folder} is incomplete: it has no evaluation")
+    if len(files) > 1:
+        raise ValueError(
+            f"{folder} has {len(files)} evaluations, but only one can be right: "
+            + ", ".join(file.name for file in files)
+        )
+    return files[0]
+
+
 def load_run(path: Path) -> StoredRun:
     """Return the run stored in a folder.
 
     Raises:
-        ValueError: If it is incomplete.
+        ValueError: If it is incomplete, or has several evaluations.
     """
     what = path / "run.json"
-    evaluations = sorted(path.glob("evaluation_*.json"))
     for file in (path / "config.json", what, path / "metrics.csv"):
         if not file.is_file():
             raise ValueError(f"{path} is incomplete: it has no {file.name}")
-    if not evaluations:
-        raise ValueError(f"{path} is incomplete: it has no evaluation")
+    evaluation, _ = read_sealed(evaluation_path(path))
     made = from_plain(Record, read_json(what), str(what))
     curve = _curve(path / "metrics.csv", made.frames)
-    evaluation, _ = read_sealed(evaluations[-1])
     file = path / "config.json"
     # No note about a missing seal: stored runs are under version control.
     config, hashes = read_config(file, quiet=True)

@@ -392,8 +392,10 @@ def test_an_upper_bound_counts_what_policy_and_search_avoid(tmp_path: Path):
     assert sum(row["throws"] for row in rows) == 12
     avoided = sum(row["policy_avoids"] for row in rows)
     assert 0 < avoided <= sum(row["search_avoids"] for row in rows)
-    bad = fail("upper-bound", "field_proximity", "--reach", "0")
-    assert "reach must be positive" in bad
+    # The least range of a sensor is 1 mm.
+    for reach in ("0", "1e-4"):
+        bad = fail("upper-bound", "field_proximity", "--reach", reach)
+        assert "reach must be at least 0.001" in bad
 
 
 def test_the_options_of_an_upper_bound_reach_the_search(monkeypatch):

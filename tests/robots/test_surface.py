@@ -13,6 +13,7 @@ from egoskin.robots.config import Primitive
 from egoskin.robots.surface import (
     area,
     distance_to,
+    points_b,
     primitive_surface,
     sample_surface,
 )
@@ -212,7 +213,7 @@ def test_where_shapes_touch_flush_there_is_no_outer_surface(small_robot, stand_o
     )
     surface = primitive_surface(robot, robot.links)
     points = surface.sample(N, 4, stand_off=stand_off)
-    at = surface.points_b(points.link, points.position)
+    at = points_b(surface.frames, points.link, points.position)
     x, y, z = at.T
     above = (np.abs(z - 0.1) < 1e-6) & (np.abs([x, y]).max(0) < 0.099)
     beside = (np.abs(x - 0.1) < 1e-6) & (np.abs([y, z - 0.2]).max(0) < 0.049)

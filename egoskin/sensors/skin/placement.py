@@ -15,7 +15,7 @@ import numpy as np
 
 from egoskin.hints import matching
 from egoskin.robots.config import RobotConfig, resolve
-from egoskin.robots.surface import primitive_surface
+from egoskin.robots.surface import points_b, primitive_surface
 from egoskin.sensors.skin.mesh_surface import Meshes, mesh_surface
 from egoskin.sensors.skin.skin import FARTHEST, Skin
 
@@ -353,7 +353,7 @@ def place_sensors(
         position = np.concatenate((position, at))
         normal = np.concatenate((normal, points.normal.round(6)))
         if method == "poisson_disk":
-            places = surface.points_b(link, position)
+            places = points_b(surface.frames, link, position)
             scale = np.array([weights[robot.links[i]] for i in link]) ** -0.5
             if spacing is None:
                 chosen = eliminate(places, scale, wanted, area)
