@@ -403,8 +403,7 @@ class Report:
     out: Path | None = None
     """Folder to write to; None: report/ in the study's folder."""
     metric: MetricName = "success_3s"
-    """Column of runs.csv in which the cells of a study of your own are compared with
-    the first one."""
+    """Column of runs.csv to compare with the first cell's, in a study of your own."""
 
     def execute(self) -> None:
         """Write the report."""
