@@ -234,9 +234,14 @@ def test_an_interrupted_pool_ends_its_workers(skin):
     root["action"] = torch.zeros(*root.batch_size, 21)
     # It waits for this one.
     os.kill(processes[0].pid, signal.SIGSTOP)
-    threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
-    with pytest.raises(KeyboardInterrupt):
+
+    def step() -> None:
+        threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT)).start()
         pool.step_and_maybe_reset(root)
+
+    # Started inside, because a busy machine may take long to come here.
+    with pytest.raises(KeyboardInterrupt):
+        step()
     # Their answers would be taken for those to the next command.
     assert not any(process.is_alive() for process in processes)
     pool.close()
