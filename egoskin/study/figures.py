@@ -227,7 +227,7 @@ def metric_by_cell(
     right.axvline(0, color="black", linewidth=0.8)
     left.set_xlabel(f"{metric.label} [{metric.unit}]")
     left.set_xlim(*((0, 100) if metric.unit == "%" else (0, None)))
-    right.set_xlabel(f"difference to {labels[0]} [{difference_unit(metric)}]")
+    right.set_xlabel(f"difference to {labels[0]} [{metric.difference_unit}]")
     left.set_yticks(range(len(names)), labels, fontsize=8)
     left.set_ylim(len(names) - 0.4, -0.6)
     for axes in (left, right):
@@ -235,11 +235,6 @@ def metric_by_cell(
         axes.grid(axis="x", linewidth=0.4, alpha=0.5)
     right.tick_params(axis="y", length=0)
     return figure
-
-
-def difference_unit(metric: Metric) -> str:
-    """Return the unit of differences of a metric."""
-    return "percentage points" if metric.unit == "%" else metric.unit
 
 
 def _draw_signal(

@@ -49,6 +49,16 @@ class Metric:
     """Function that computes it; None if a run has no value."""
 
     @property
+    def title(self) -> str:
+        """Its description as the beginning of a sentence."""
+        return self.label[:1].upper() + self.label[1:]
+
+    @property
+    def difference_unit(self) -> str:
+        """Unit of differences of its values."""
+        return "percentage points" if self.unit == "%" else self.unit
+
+    @property
     def digits(self) -> int:
         """Decimals of its values in texts."""
         return 2 if self.unit == "s" else 1

@@ -21,7 +21,6 @@ from egoskin.study.differences import Difference, differences
 from egoskin.study.fields import settings
 from egoskin.study.figures import (
     RAYS,
-    difference_unit,
     equivalence,
     forest,
     learning_curves,
@@ -73,7 +72,8 @@ def write_report(
     """
     manifest = folder.manifest()
     names = [cell.name for cell in manifest.cells]
-    if set(names) >= CELLS and metric.name != "success_3s":
+    of_paper = set(names) >= CELLS
+    if of_paper and metric.name != "success_3s":
         raise ValueError(
             f"study {manifest.study} is judged on the paper's findings, whose metrics "
             "are fixed: leave out --metric"
@@ -83,7 +83,7 @@ def write_report(
     values = tables(results)
     judged: list[Judged] = []
     found: list[Difference] = []
-    if set(names) >= CELLS:
+    if of_paper:
         judged = judge_findings(values)
     else:
         found = differences(names, values[metric.name])
@@ -144,7 +144,7 @@ def _pictures(
             None
             if judged
             else metric_by_cell(manifest, metric, values[metric.name], found),
-            f"{metric.label[:1].upper()}{metric.label[1:]}. "
+            f"{metric.title}. "
             "Left: interquartile mean (hollow: one seed) and range (bars) over seeds; "
             "each dot is a seed. Right: difference to the first cell, with its 90 % "
             "(thick) and 95 % (thin) interval, without correction for the number of "
@@ -229,7 +229,7 @@ def _blocks(
     if found:
         yield "## Differences to the first cell"
         yield (
-            f"{metric.label[:1].upper()}{metric.label[1:]}: each cell minus {first}, "
+            f"{metric.title}: each cell minus {first}, "
             "compared seed by seed if they share two or more seeds (others are then "
             "left out). Two-sided p-values, corrected for the number of cells (Holm); "
             "intervals are not corrected. *Seeds* is the number "
@@ -419,7 +419,7 @@ def _difference_rows(found: Sequence[Difference], metric: Metric) -> str:
         seeds = f"{each.effect.seeds}{more}"
         effect = _effect(each.effect, metric.digits)
         rows.append((each.cell, effect, _p_value(each.p_value), seeds))
-    head = f"difference [{difference_unit(metric)}] (95 %)"
+    head = f"difference [{metric.difference_unit}] (95 %)"
     return table(("cell", head, "p", "seeds"), rows)
 
 
