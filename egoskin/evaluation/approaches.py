@@ -62,13 +62,14 @@ class StandingRobot:
         self.joint_pos = torch.from_numpy(robot.default_joint_pos).float()
         self.origin = np.array([0.0, 0.0, robot.default_base_height])
         self.base_pose = torch.tensor([*self.origin, 1.0, 0.0, 0.0, 0.0]).float()
-        position, self.link_rotation = default_frames(robot)
-        self.link_position = position + self.origin
+        position, rotation = default_frames(robot)
+        # Of the links, in the world.
+        self.frames = position + self.origin, rotation
         # The shapes, with the world as their link frame.
         self._shapes = []
         for shape in robot.primitives:
             i = robot.links.index(shape.link)
-            turn, shift = self.link_rotation[i], self.link_position[i]
+            shift, turn = (each[i] for each in self.frames)
             self._shapes.append(
                 replace(
                     shape,
@@ -108,8 +109,7 @@ class StandingRobot:
     def standoff(self, skin: Skin) -> float:
         """Return the largest distance of a sensor from the body [m], at least 0."""
         link = np.array([self.config.links.index(name) for name in skin.links])
-        frames = (self.link_position, self.link_rotation)
-        points = points_b(frames, link, skin.position)
+        points = points_b(self.frames, link, skin.position)
         return max(0.0, float(self.distance(points).max()))
 
 
@@ -325,9 +325,9 @@ def surface_paths(
     """
     links = list(dict.fromkeys(s.link for s in body.config.primitives))
     points = sample_surface(body.config, links, _NUM_SURFACE_POINTS, seed)
-    frames = (body.link_position, body.link_rotation)
-    start = points_b(frames, points.link, points.position)
-    outward = (body.link_rotation[points.link] @ points.normal[..., None])[..., 0]
+    _, turn = body.frames
+    start = points_b(body.frames, points.link, points.position)
+    outward = (turn[points.link] @ points.normal[..., None])[..., 0]
     along = ball.radius + np.arange(math.ceil(distance / _STEP), -1, -1) * _STEP
     paths = start[:, None] + along[None, :, None] * outward[:, None]
     return torch.from_numpy(paths).float(), points.link
