@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import signal
 import time
 from collections.abc import Iterator
@@ -98,8 +99,14 @@ def test_a_node_that_joins_later_is_used(cluster, study, start, undisturbed):
     cluster.remove_node(cluster.list_all_nodes()[-1])
     runner = start(study.path, *on(cluster))
     wait_for(lambda: len(claimed_runs(study)) == 1)
-    cluster.add_node(num_cpus=1)
-    wait_for(lambda: len(claimed_runs(study)) == 2)
+    (first,) = jobs(study).values()
+    # Held, so that the first node is not free for the second run before the new one is.
+    os.kill(first, signal.SIGSTOP)
+    try:
+        cluster.add_node(num_cpus=1)
+        wait_for(lambda: len(claimed_runs(study)) == 2)
+    finally:
+        os.kill(first, signal.SIGCONT)
     assert runner.end() == 0, runner.text()
     assert table(study) == undisturbed
 
