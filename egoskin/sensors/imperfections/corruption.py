@@ -311,7 +311,8 @@ class Corruption(StatefulTransform):
     stays NaN) and, if a model depends on the speed of the joints, ``joint_vel
     [*B, J]`` [rad/s]. Writes ``reading``, of the same shape and never negative;
     ``reading_clock [*B, 2]``, episode and step of each row; and ``reading_i_...``, the
-    state of the i-th model.
+    state of the i-th model. Signals read ``distance`` unless told otherwise: give them
+    ``in_keys=["reading"]``, or they stay perfect.
 
     Rows are numbered from ``row_offset``: with the right offset for each worker,
     results do not depend on the number of workers. The episodes of a row are numbered
