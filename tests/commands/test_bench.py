@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
+import sys
+import time
 from pathlib import Path
 
+import psutil
 import pytest
 
 from calling import succeed
 from egoskin.commands.bench.gradients import GradientBench, gradient_rows
-from egoskin.commands.bench.loop import LoopConfig
+from egoskin.commands.bench.loop import LoopConfig, cpu_time
 from egoskin.make import EnvConfig
 from egoskin.runs.config import TrainConfig
 from egoskin.runs.run import Run
@@ -45,6 +49,34 @@ def test_bench_loop_gives_its_rows(tmp_path: Path):
     parts = [row["value"] for row in rows if row["name"].endswith("_wall")]
     assert len(parts) == 7
     assert sum(parts) == pytest.approx(1e6 / by_name["train_field"]["value"])
+
+
+def test_cpu_time_resolves_less_than_a_tick():
+    alone = [psutil.Process()]
+    outer = time.process_time()
+    before = cpu_time(alone)
+    inner = time.process_time()
+    while time.process_time() < inner + 2e-3:
+        pass
+    inner = time.process_time() - inner
+    spent = cpu_time(alone) - before
+    outer = time.process_time() - outer
+    assert inner - 1e-6 < spent < outer + 1e-6
+
+
+def test_cpu_time_is_the_sum_over_processes_and_refuses_one_that_has_ended():
+    code = "import sys; sum(range(3_000_000)); print(flush=True); sys.stdin.read()"
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with subprocess.Popen([sys.executable, "-c", code], **pipes) as other:
+        assert other.stdout
+        other.stdout.readline()
+        waiting = psutil.Process(other.pid)
+        alone = cpu_time([waiting])
+        ticks = waiting.cpu_times()
+        assert alone == pytest.approx(ticks.user + ticks.system, abs=0.05)
+        assert cpu_time([waiting, waiting]) >= 2 * alone > 0
+    with pytest.raises(ProcessLookupError):
+        cpu_time([waiting])
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ctypes
+import os
 import statistics
 import threading
 import time
@@ -242,11 +244,11 @@ class _Loop:
         for i in range(self.config.rounds):
             show(f"round {i + 1}/{self.config.rounds}: serial share")
             root = self._restore(pool)
-            alone, others = time.thread_time(), _cpu_time(_processes()[1:])
+            alone, others = time.thread_time(), cpu_time(_processes()[1:])
             self._train(root)
             spent = time.thread_time() - alone
             serial.append(1e6 * spent / frames)
-            ratios.append(spent / (_cpu_time(_processes()[1:]) - others))
+            ratios.append(spent / (cpu_time(_processes()[1:]) - others))
         show("")
         unit = "us of CPU time per environment step, the first thread alone"
         return median_row(f"serial_{self._coverage}", serial, ratios, unit)
@@ -311,10 +313,10 @@ class _Loop:
             for name, (prepare, run) in layers.items():
                 show(f"round {i + 1}/{self.config.rounds}: {name}")
                 prepared = prepare()
-                begin, used = time.perf_counter(), _cpu_time(_processes())
+                begin, used = time.perf_counter(), cpu_time(_processes())
                 run(prepared)
                 wall[name].append(1e6 * (time.perf_counter() - begin) / frames)
-                cpu[name].append(1e6 * (_cpu_time(_processes()) - used) / frames)
+                cpu[name].append(1e6 * (cpu_time(_processes()) - used) / frames)
         show("")
         raw = wall["raw"]
         rows = [
@@ -337,10 +339,22 @@ def _processes() -> list[psutil.Process]:
     return [psutil.Process(), *psutil.Process().children(recursive=True)]
 
 
-def _cpu_time(processes: list[psutil.Process]) -> float:
-    """Return the CPU time of processes so far [s]."""
-    times = [process.cpu_times() for process in processes]
-    return sum(t.user + t.system for t in times)
+def cpu_time(processes: list[psutil.Process]) -> float:
+    """Return the CPU time of processes so far [s].
+
+    Read from their clocks: `psutil.Process.cpu_times` counts in ticks of 10 ms, within
+    which a small layer ends.
+
+    Raises:
+        ProcessLookupError: If a process has ended.
+    """
+    clock, times = ctypes.c_int(), []
+    for process in processes:
+        error = ctypes.CDLL(None).clock_getcpuclockid(process.pid, ctypes.byref(clock))
+        if error:
+            raise OSError(error, os.strerror(error), str(process))
+        times.append(time.clock_gettime(clock.value))
+    return sum(times)
 
 
 def _pss(process: psutil.Process) -> int:
