@@ -47,6 +47,7 @@ from egoskin.study.statistics import (
 
 # The budget is the same for all runs: the share of it adds nothing to the frames.
 _SHOWN = [m for m in METRICS if m.name != "share_to_90"]
+_BUDGET = 1000  # Core-hours. The report says what so many more would decide.
 _ASSUMED = (
     "(The spread of cells with one seed is taken to be the largest of any cell, which "
     "is too large for cells near 0 or 100 %.) *Needs more*: a cell has no run, no "
@@ -220,6 +221,7 @@ def _blocks(
             "are tested by a stand-in."
         )
         yield _finding_rows(judged, results)
+        yield from _next_decisions(judged, results)
     if "findings" in shown:
         yield shown["findings"]
     first = manifest.cells[0].name
@@ -356,14 +358,59 @@ def _deciding(judged: Judged) -> Tested:
     return claim
 
 
-def _finding_rows(judged: Sequence[Judged], results: Sequence[Result]) -> str:
-    # Core-hours of a run: its workers are as many as its cores. None means all cores
-    # of its machine, whose number the stored configuration does not hold.
+def _core_hours(results: Sequence[Result]) -> float | None:
+    """Return the mean core-hours of a run, if they are known."""
+    # Its workers are as many as its cores. None means all cores of its machine, whose
+    # number the stored configuration does not hold.
     hours = [
         r.stored.record.wall_s / 3600 * r.stored.config.num_workers
         for r in results
         if r.stored.config.num_workers is not None
     ]
+    return fmean(hours) if hours else None
+
+
+def _runs_to_decide(judged: Judged, have: Counter[str]) -> Counter[str] | None:
+    """Return how many more runs of each cell would decide a finding, if known."""
+    if judged.verdict != "undecided" or judged.seeds_needed is None:
+        return None
+    cells = {name for c in judged.deciding for name in c.claim.weights}
+    runs = Counter({c: max(judged.seeds_needed - have[c], 0) for c in cells})
+    return runs if runs.total() else None  # None: the seeds so far have no spread.
+
+
+def _next_decisions(
+    judged: Sequence[Judged], results: Sequence[Result]
+) -> Iterator[str]:
+    """Yield which findings `_BUDGET` more core-hours would decide, if that is known."""
+    hours = _core_hours(results)
+    have = Counter(result.run.cell.name for result in results)
+    needed = {j.finding.label: _runs_to_decide(j, have) for j in judged}
+    left = {label: runs for label, runs in needed.items() if runs is not None}
+    if hours is None or not left:
+        return
+    runs: Counter[str] = Counter()
+    decided = []
+    while left:
+        # The cheapest after those before it, with which it may share runs.
+        label = min(left, key=lambda each: (runs | left[each]).total())
+        more = runs | left.pop(label)
+        if more.total() * hours > _BUDGET:
+            break
+        runs = more
+        decided.append(label)
+    if not decided:
+        yield f"The next {_BUDGET:,} core-hours would decide none of them."
+        return
+    yield (
+        f"The next {_BUDGET:,} core-hours would decide, cheapest first, "
+        f"{', '.join(decided)}: {runs.total():,} runs, {runs.total() * hours:,.0f} "
+        "core-hours. Runs that several findings need are counted once."
+    )
+
+
+def _finding_rows(judged: Sequence[Judged], results: Sequence[Result]) -> str:
+    hours = _core_hours(results)
     have = Counter(result.run.cell.name for result in results)
     rows = []
     for j in judged:
@@ -381,11 +428,10 @@ def _finding_rows(judged: Sequence[Judged], results: Sequence[Result]) -> str:
         assert effect is not None
         more = cost = ""
         if j.verdict == "undecided":
-            cells = {name for c in j.deciding for name in c.claim.weights}
             more = _more(effect.seeds, j.seeds_needed)
-            if j.seeds_needed is not None and hours:
-                runs = sum(max(j.seeds_needed - have[c], 0) for c in cells)
-                cost = f"{runs * fmean(hours):,.0f}"
+            runs = _runs_to_decide(j, have)
+            if runs is not None and hours is not None:
+                cost = f"{runs.total() * hours:,.0f}"
         rows.append(
             (
                 j.finding.label,

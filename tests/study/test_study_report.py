@@ -270,7 +270,7 @@ def test_cells_are_compared_in_the_metric_that_is_asked_for(
 def test_the_cost_of_a_decision_is_in_core_hours(
     manifest: Manifest, tmp_path: Path, without_pictures
 ):
-    hours, needed = [], None
+    hours, totals, needed = [], [], None
     for cores in (1, 4):
         folder = StudyFolder(tmp_path / str(cores))
         folder.plan(manifest)
@@ -284,11 +284,72 @@ def test_the_cost_of_a_decision_is_in_core_hours(
         text = (folder.path / "report" / "report.md").read_text()
         (row,) = (line for line in text.splitlines() if line.startswith("| 6a |"))
         hours.append(float(row.split("|")[-2]))
+        found = re.search(
+            r"next 1,000 core-hours would decide, cheapest first, 6a: "
+            r"([\d,]+) runs, ([\d,]+) core-hours\.",
+            text,
+        )
+        assert found
+        totals.append([float(n.replace(",", "")) for n in found.groups()])
         judged = judge_findings(tables(folder.results(manifest)))
         (needed,) = (j.seeds_needed for j in judged if j.finding.label == "6a")
     # Each run took an hour of wall time; two cells have two seeds each.
     assert needed is not None
-    assert hours == [2 * (needed - 2), 4 * 2 * (needed - 2)]
+    runs = 2 * (needed - 2)
+    assert hours == [runs, 4 * runs]
+    assert totals == [[runs, runs], [runs, 4 * runs]]
+
+
+def test_the_next_core_hours_decide_the_cheapest_findings_and_share_runs(
+    manifest: Manifest, tmp_path: Path, without_pictures
+):
+    folder = StudyFolder(tmp_path)
+    folder.plan(manifest)
+
+    def said() -> str:
+        write_report(folder, folder.path / "report")
+        text = (folder.path / "report" / "report.md").read_text()
+        return "".join(s for s in text.splitlines() if s.startswith("The next"))
+
+    def runs(*labels: str) -> int:
+        judged = judge_findings(tables(folder.results(manifest)))
+        more: dict[str, int] = {}
+        for j in (j for j in judged if j.finding.label in labels):
+            assert j.seeds_needed is not None
+            for name in (n for claim in j.deciding for n in claim.claim.weights):
+                more[name] = max(more.get(name, 0), j.seeds_needed - 2)
+        return sum(more.values())
+
+    assert said() == ""
+    success = {
+        "field-proximity-1m": (40.0, 46.0),
+        "field-proximity-2m": (70.0, 64.0),
+        "field-localization-1m": (41.0, 43.0),
+        "field-localization-2m": (66.0, 68.0),
+        "ray-localization-1m": (30.0, 31.0),
+        "ray-proximity-1m-reduce-min": (22.0, 31.0),
+        "ray-binary-1m-reduce-min": (31.0, 34.0),
+        "ray-binary-1m": (30.5, 33.0),
+    }
+    stored = [
+        (manifest.run(f"{name}-seed{seed}"), value)
+        for name, values in success.items()
+        for seed, value in enumerate(values)
+    ]
+    # Each takes an hour of wall time.
+    for run, value in stored:
+        store(folder, manifest, run, value)
+    total = runs("6a", "1a", "2", "5")
+    assert total < runs("6a") + runs("1a") + runs("2") + runs("5")
+    assert runs("6a") < runs("1a") < runs("2") < runs("5")
+    assert f" cheapest first, 6a, 1a, 2, 5: {total} runs, {total} core-" in said()
+    for cores, findings in ((4, ("6a", "1a", "2")), (512, ())):
+        for run, _ in stored:
+            config = dataclasses.replace(run.config, num_workers=cores)
+            Run(folder.result_path(run.name), config).write_config()
+        total = runs(*findings)
+        listed = f"{', '.join(findings)}: {total} runs, {cores * total:,} core-hours."
+        assert (listed if findings else " would decide none of them.") in said()
 
 
 def test_the_claim_of_a_row_is_the_one_that_needs_its_seeds(

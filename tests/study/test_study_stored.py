@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -109,3 +112,65 @@ def test_the_runs_of_version_1_are_kept_as_a_study():
     assert len(results) == 16
     assert {r.stored.config.env.standard for r in results} == {"1"}
     assert manifest.evaluation.standard == "1"
+
+
+def _assert_printed(text: str, shares: Sequence[float]):
+    """Assert that the percentages in a text are these, to the digits it shows."""
+    printed = re.findall(r"\d+(?:\.(\d+))?", text)
+    numbers = [float(n) for n in re.findall(r"\d+(?:\.\d+)?", text)]
+    assert len(numbers) == len(shares), text
+    for number, digits, share in zip(numbers, printed, shares, strict=True):
+        assert abs(number - 100 * share) <= 0.5 * 10 ** -len(digits) + 1e-9, text
+
+
+def _cell(name: str) -> str:
+    """Return the cell of a row, as "ray proximity, closest beam, 2 m"."""
+    signal, *rest = name.split(", ")
+    reach = rest.pop().replace(" ", "") if rest else ""
+    parts = [signal.replace(" ", "-"), reach, "reduce-min" if rest else ""]
+    return "-".join(filter(None, parts))
+
+
+def _evaluation(run: str) -> dict[str, Any]:
+    (path,) = (STUDIES / "findings" / "results" / run).glob("evaluation_*.json")
+    return json.loads(path.read_text())
+
+
+def test_the_table_of_the_results_is_that_of_the_study():
+    text = (STUDIES.parent / "docs" / "results.md").read_text()
+    table = text.split("## Version 2")[1].split("\n\n|")[1].split("\n\n")[0]
+    rows = [line.strip("| ").split(" | ") for line in table.splitlines()[2:]]
+    runs = []
+    for name, seed, three, five, masked, first, later, falls in rows:
+        runs.append(f"{_cell(name)}-seed{seed}")
+        found = _evaluation(runs[-1])
+        success = found["success"]
+        _assert_printed(three, [success[k] for k in ("mean", "low", "high")])
+        _assert_printed(five, [found["success_5s"]["mean"]])
+        blind = name == "blind"
+        hidden = [] if blind else [found["masked"]["success"]["mean"]]
+        _assert_printed(masked, hidden)
+        _assert_printed(first, [found["avoided"]["first_ball"]])
+        _assert_printed(later, [found["avoided"]["later_balls"]])
+        _assert_printed(falls, [found["ended_by_fall"]])
+    stored = (STUDIES / "findings" / "results").iterdir()
+    assert sorted(runs) == sorted(path.name for path in stored)
+
+
+def test_the_table_of_the_readme_is_that_of_the_study():
+    text = (STUDIES.parent / "README.md").read_text()
+    head, _, *lines = (
+        text.split("\n| untouched for 3 s ")[1].split("\n\n")[0].splitlines()
+    )
+    ranges = head.strip("| ").split(" | ")
+    shown = 0
+    for line in lines[:-1]:
+        name, *values = (c.strip() for c in line.strip("|").split("|"))
+        for reach, value in zip(ranges, values, strict=True):
+            runs = (STUDIES / "findings" / "results").glob(
+                f"{_cell(f'{name}, {reach}')}-seed*"
+            )
+            found = [_evaluation(run.name) for run in sorted(runs)]
+            _assert_printed(value, [f["success"]["mean"] for f in found])
+            shown += len(found)
+    assert f"| the same {shown} policies, masked |" in lines[-1]
