@@ -220,8 +220,9 @@ def _blocks(
             f"and spread stay as observed. {_ASSUMED} Findings about another budget "
             "are tested by a stand-in."
         )
-        yield _finding_rows(judged, results)
-        yield from _next_decisions(judged, results)
+        needed, hours = _runs_to_decide(judged, results), _core_hours(results)
+        yield _finding_rows(judged, needed, hours)
+        yield from _next_decisions(needed, hours)
     if "findings" in shown:
         yield shown["findings"]
     first = manifest.cells[0].name
@@ -370,25 +371,28 @@ def _core_hours(results: Sequence[Result]) -> float | None:
     return fmean(hours) if hours else None
 
 
-def _runs_to_decide(judged: Judged, have: Counter[str]) -> Counter[str] | None:
-    """Return how many more runs of each cell would decide a finding, if known."""
-    if judged.verdict != "undecided" or judged.seeds_needed is None:
-        return None
-    cells = {name for c in judged.deciding for name in c.claim.weights}
-    runs = Counter({c: max(judged.seeds_needed - have[c], 0) for c in cells})
-    return runs if runs.total() else None  # None: the seeds so far have no spread.
+def _runs_to_decide(
+    judged: Sequence[Judged], results: Sequence[Result]
+) -> dict[str, Counter[str]]:
+    """Return how many more runs of each cell would decide a finding, where known."""
+    have = Counter(result.run.cell.name for result in results)
+    needed = {}
+    for j in judged:
+        if j.verdict == "undecided" and j.seeds_needed is not None:
+            cells = {name for c in j.deciding for name in c.claim.weights}
+            runs = Counter({c: max(j.seeds_needed - have[c], 0) for c in cells})
+            if runs.total():  # Zero: the seeds so far have no spread.
+                needed[j.finding.label] = runs
+    return needed
 
 
 def _next_decisions(
-    judged: Sequence[Judged], results: Sequence[Result]
+    needed: Mapping[str, Counter[str]], hours: float | None
 ) -> Iterator[str]:
     """Yield which findings `_BUDGET` more core-hours would decide, if that is known."""
-    hours = _core_hours(results)
-    have = Counter(result.run.cell.name for result in results)
-    needed = {j.finding.label: _runs_to_decide(j, have) for j in judged}
-    left = {label: runs for label, runs in needed.items() if runs is not None}
-    if hours is None or not left:
+    if hours is None or not needed:
         return
+    left = dict(needed)
     runs: Counter[str] = Counter()
     decided = []
     while left:
@@ -409,9 +413,9 @@ def _next_decisions(
     )
 
 
-def _finding_rows(judged: Sequence[Judged], results: Sequence[Result]) -> str:
-    hours = _core_hours(results)
-    have = Counter(result.run.cell.name for result in results)
+def _finding_rows(
+    judged: Sequence[Judged], needed: Mapping[str, Counter[str]], hours: float | None
+) -> str:
     rows = []
     for j in judged:
         text = j.finding.text
@@ -429,9 +433,8 @@ def _finding_rows(judged: Sequence[Judged], results: Sequence[Result]) -> str:
         more = cost = ""
         if j.verdict == "undecided":
             more = _more(effect.seeds, j.seeds_needed)
-            runs = _runs_to_decide(j, have)
-            if runs is not None and hours is not None:
-                cost = f"{runs.total() * hours:,.0f}"
+            if j.finding.label in needed and hours is not None:
+                cost = f"{needed[j.finding.label].total() * hours:,.0f}"
         rows.append(
             (
                 j.finding.label,

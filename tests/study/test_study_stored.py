@@ -13,8 +13,9 @@ from typing import Any
 import pytest
 
 from egoskin.runs.run import Run, TrainConfig
+from egoskin.storage.serialization import read_json
 from egoskin.study.folder import StudyFolder
-from egoskin.study.stored import load_run, record, thin
+from egoskin.study.stored import evaluation_path, load_run, record, thin
 
 STUDIES = Path(__file__).parents[2] / "studies"
 ARCHIVE = STUDIES / "version-1"
@@ -132,8 +133,7 @@ def _cell(name: str) -> str:
 
 
 def _evaluation(run: str) -> dict[str, Any]:
-    (path,) = (STUDIES / "findings" / "results" / run).glob("evaluation_*.json")
-    return json.loads(path.read_text())
+    return read_json(evaluation_path(STUDIES / "findings" / "results" / run))
 
 
 def test_the_table_of_the_results_is_that_of_the_study():
