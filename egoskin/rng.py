@@ -10,14 +10,14 @@ Source: Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from enum import IntEnum
 from functools import cache
-from importlib.util import find_spec
 from numbers import Integral
 
 import torch
 from torch import Tensor
+
+from egoskin.gpu import uses_warp
 
 _MASK = 0xFFFFFFFF
 # Bit that marks a held-out seed, and the bit for it in the key's second word, above the
@@ -40,20 +40,6 @@ class Stream(IntEnum):
     PUSH = 6
 
 
-@cache
-def _warp_philox() -> Callable[[Tensor, tuple[int, int]], Tensor] | None:
-    """Return the generator as a kernel of Warp; None if that is not installed."""
-    if find_spec("mujoco_warp") is None:
-        return None
-    from egoskin.warp_philox import philox
-
-    return philox
-
-
-def _on_gpu(x: Tensor) -> bool:
-    return x.is_cuda and not torch.compiler.is_compiling()
-
-
 def philox(counter: Tensor, key: tuple[int, int]) -> Tensor:
     """Return four random 32-bit words per counter (Philox4x32-10).
 
@@ -66,7 +52,9 @@ def philox(counter: Tensor, key: tuple[int, int]) -> Tensor:
     Returns:
         Random words in [0, 2**32), ``[4, *B]`` int64.
     """
-    if _on_gpu(counter) and (kernel := _warp_philox()) is not None:
+    if uses_warp(counter):
+        from egoskin.warp_philox import philox as kernel
+
         return kernel(counter, key)
     c0, c1, c2, c3 = counter.unbind(0)
     k0, k1 = key

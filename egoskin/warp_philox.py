@@ -14,6 +14,9 @@ import torch
 import warp as wp  # pyright: ignore[reportMissingImports]
 from torch import Tensor
 
+from egoskin.gpu import init_warp, launch
+
+init_warp()
 wp.set_module_options({"enable_backward": False})
 
 _Words = wp.array(dtype=wp.int64, ndim=2)
@@ -50,17 +53,8 @@ def _philox(counter: _Words, key0: wp.uint32, key1: wp.uint32, words: _Words):
 
 def philox(counter: Tensor, key: tuple[int, int]) -> Tensor:
     """Return the result of `egoskin.rng.philox`, computed on the counter's device."""
-    # Do not log each kernel that is loaded.
-    wp.config.log_level = wp.LOG_WARNING
-    wp.init()
     given = counter.contiguous()
     words, n = torch.empty_like(given), given[0].numel()
-    device, stream = wp.device_from_torch(given.device), None
-    if device.is_cuda:
-        # After the work that PyTorch has already queued.
-        stream = wp.stream_from_torch(torch.cuda.current_stream(given.device))
-    arrays = (wp.from_torch(x.view(4, n)) for x in (given, words))
-    read, written = arrays
-    inputs = [read, *map(wp.uint32, key), written]
-    wp.launch(_philox, n, inputs, device=device, stream=stream)
+    read, written = (wp.from_torch(x.view(4, n)) for x in (given, words))
+    launch(_philox, n, [read, *map(wp.uint32, key), written], given.device)
     return words

@@ -192,7 +192,8 @@ def assert_same_bits_in_any_batch(sensor, state) -> None:
 
 def use_warp_kernels(monkeypatch) -> None:
     """Let sensors and draws use the kernels of a GPU, on Warp's CPU device."""
-    monkeypatch.setattr("egoskin.rng._on_gpu", lambda x: True)
+    for module in ("egoskin.rng", "egoskin.robots.kinematics"):
+        monkeypatch.setattr(f"{module}.uses_warp", lambda *inputs: True)
     here = torch.device("cpu")
     monkeypatch.setattr(Kernels, "can", lambda self, *_: True)
     for name in ("measure", "hits"):

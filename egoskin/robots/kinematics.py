@@ -3,7 +3,8 @@
 The `pytorch_kinematics.Chain` describes the robot and is the reference in the tests.
 This module evaluates only the branches that lead to the requested links, all frames of
 one depth at once, with the batch last and contiguous. The C++ code in
-``egoskin/sensors/kernels/kernels.cpp`` evaluates the same `Steps`, bit for bit.
+``egoskin/sensors/kernels/kernels.cpp`` and, for CUDA, the kernel in
+``egoskin/robots/warp_kinematics.py`` evaluate the same `Steps`, bit for bit.
 
 Contract: all poses are relative to the root of the chain (the robot's base), regardless
 of the root's own offset, so they depend only on the joint positions.
@@ -14,14 +15,19 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pytorch_kinematics as pk
 import torch
 from torch import Tensor
 
+from egoskin.gpu import uses_warp
+from egoskin.gradients import is_differentiated
 from egoskin.rounding import sincos
+
+if TYPE_CHECKING:
+    from egoskin.robots.warp_kinematics import WarpKinematics
 
 
 class Steps(NamedTuple):
@@ -129,6 +135,11 @@ class LinkKinematics:
             for level in np.nonzero(np.array(depth[1:]) == d)
         ]
         self._constants: dict[tuple[torch.dtype, torch.device], _Constants] = {}
+        self._warp: dict[torch.device, WarpKinematics] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state without what cannot be pickled."""
+        return {**vars(self), "_warp": {}}
 
     def reach(self) -> list[float]:
         """Return an upper bound of each link origin's distance from the base [m].
@@ -178,6 +189,12 @@ class LinkKinematics:
         """
         self.check(joint_pos)
         own = self._constants_like(joint_pos)
+        single = joint_pos.dtype == torch.float32
+        if uses_warp(joint_pos) and single and not is_differentiated(joint_pos):
+            turned, moved = (
+                x[own.wanted] for x in self._on(joint_pos.device).frames(joint_pos)
+            )
+            return turned.permute(2, 3, 0, 1), moved.permute(2, 0, 1)
         zero = joint_pos.new_zeros(1, len(joint_pos))
         joints = torch.cat((joint_pos.t(), zero))[own.joint]
         sin, cos = (x[:, None, None] for x in sincos(joints))
@@ -201,6 +218,14 @@ class LinkKinematics:
             position[steps + 1] = position[parents] + shifted
         turned, moved = rotation[own.wanted], position[own.wanted]
         return turned.permute(1, 2, 0, 3), moved.transpose(0, 1)
+
+    def _on(self, device: torch.device) -> WarpKinematics:
+        """Return the kernel of a device."""
+        if device not in self._warp:
+            from egoskin.robots.warp_kinematics import WarpKinematics
+
+            self._warp[device] = WarpKinematics(self.steps, device)
+        return self._warp[device]
 
     def _constants_like(self, joint_pos: Tensor) -> _Constants:
         """Return the tables in the dtype and on the device of joint positions."""

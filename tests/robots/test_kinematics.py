@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import copy
 import math
+import pickle
+from importlib.util import find_spec
 
 import mujoco
 import numpy as np
@@ -235,3 +237,30 @@ def test_sines_and_cosines_are_right_to_the_last_bits(dtype, atol, angles):
 def test_sines_of_nan_are_nan():
     for value in sincos(torch.tensor([math.nan, 0.0])):
         assert value.isnan().tolist() == [True, False]
+
+
+@pytest.mark.slow
+@pytest.mark.warp
+@pytest.mark.skipif(find_spec("mujoco_warp") is None, reason="needs mujoco-warp")
+@pytest.mark.parametrize("slides", [False, True])
+def test_the_kernel_of_a_gpu_gives_the_same_bits(monkeypatch, random_joint_pos, slides):
+    kinematics = LinkKinematics(H1_2.chain, H1_2.links)
+    joint_pos = 5 * random_joint_pos(300)
+    if slides:
+        chain = pk.build_chain_from_urdf(URDF)
+        kinematics = LinkKinematics(chain, ["a", "b"])
+        joint_pos = joint_pos[:, : kinematics.num_joints]
+    expected = [kinematics.link_frames(x) for x in (joint_pos, joint_pos[:0])]
+    monkeypatch.setattr("egoskin.robots.kinematics.uses_warp", lambda *inputs: True)
+    # A copy makes its own kernel.
+    copied = pickle.loads(pickle.dumps(kinematics))
+    for fast in (kinematics, copied):
+        for x, frames in zip((joint_pos, joint_pos[:0]), expected, strict=True):
+            assert all(map(torch.equal, fast.link_frames(x), frames))
+            strided = x.t().contiguous().t()
+            assert all(map(torch.equal, fast.link_frames(strided), frames))
+        assert fast._warp
+    # Derivatives, and float64, are PyTorch's.
+    assert kinematics.link_frames(joint_pos.double())[1].dtype == torch.float64
+    kinematics.link_frames(joint_pos.requires_grad_())[1].sum().backward()
+    assert joint_pos.grad is not None

@@ -27,22 +27,22 @@ from egoskin.envs.physics.contract import (
     StepResult,
     Variation,
 )
-from egoskin.envs.physics.model import MAX_SPEED, PARKING, build_scene
+from egoskin.envs.physics.model import PARKING, build_scene
+from egoskin.envs.physics.warp_step import (
+    begin,
+    end,
+    hold,
+    launch,
+    observe,
+    outcome_of,
+)
+from egoskin.gpu import init_warp
 from egoskin.robots.model import body_id
 
 SETTING = "EGOSKIN_WARP_CONTACTS"
 """Environment variable: capacity of the buffers, in contacts per robot."""
 # Four times the number observed for a robot flailing on the floor.
 _CONTACTS = 48
-# Buffer overflows that invalidate the simulation of a row.
-_LOST = (
-    mjw.OverflowType.NEFC
-    | mjw.OverflowType.NJMAX_NNZ
-    | mjw.OverflowType.BROADPHASE
-    | mjw.OverflowType.NARROWPHASE
-    | mjw.OverflowType.CCD
-    | mjw.OverflowType.CONTACT_MATCH
-)
 # Model fields that a variation sets per row, and those that MuJoCo derives from masses.
 _VARIED = (
     *("body_mass", "body_inertia", "geom_friction", "jnt_actfrcrange"),
@@ -72,9 +72,7 @@ class WarpPhysics(Physics):
         robot, config = scene.robot, scene.config
         self.scene, self.config, self.num_envs = scene, config, num_envs
         self.device = torch.device(device)
-        # Do not log each kernel that is loaded.
-        wp.config.log_level = wp.LOG_WARNING
-        wp.init()
+        init_warp()
         self._mujoco, contacts = build_scene(scene), self.num_contacts()
         model = self._mujoco
         # Constraint rows: sides of each contact's friction pyramid, joint limits, etc.
@@ -98,11 +96,12 @@ class WarpPhysics(Physics):
         self._qpos, self._qvel = wp.to_torch(data.qpos), wp.to_torch(data.qvel)
         self._ctrl = wp.to_torch(data.ctrl)
         self._warmstart = wp.to_torch(data.qacc_warmstart)
-        self._counts = wp.to_torch(data.sensordata)
-        self._torque = wp.to_torch(data.actuator_force)
-        self._overflow = wp.to_torch(data.overflow)
-        self._torque_limit = wp.to_torch(self._model.actuator_forcerange)[..., 1]
-        self._overflowed = torch.zeros((), dtype=torch.bool, device=self.device)
+        with self._in_order():
+            self._outcome = outcome_of(scene, data)
+            shape = num_envs, len(scene.objects)
+            self._active = wp.zeros(shape, dtype=wp.bool)
+            self._held = wp.zeros_like(data.qpos) if scene.hold else None
+        self._overflowed = wp.to_torch(self._outcome.overflowed)
         # CUDA graphs by function; None: its kernels are loaded.
         self._graphs: dict[Callable[..., None], Any] = {}
         # Of each varied field: a view, the entries that vary, and their own values.
@@ -168,48 +167,42 @@ class WarpPhysics(Physics):
 
     def step(self, target: Tensor, active: Tensor) -> StepResult:
         """Advance every row by one control step; see `Physics.step`."""
-        self._object_pos.masked_fill_(~active[..., None], 0.0)
-        self._object_pos[..., 2].masked_fill_(~active, PARKING[2])
-        self._object_vel.masked_fill_(~active[..., None], 0.0)
+        wp.to_torch(self._active).copy_(active)
         self._set_target(target)
-        self._overflow.zero_()
-        held = self._qpos[:, self._robot_q].clone() if self.scene.hold else None
-        found = torch.zeros_like(self._counts, dtype=torch.bool)
-        fallen = torch.zeros_like(found[:, 0])
-        power = torch.zeros_like(self._qpos[:, 0])
-        saturation = torch.zeros_like(power)
-        floor = active.shape[1] + 1
-        links = floor + 1 + len(self.scene.robot.feet)
-        for _ in range(self.config.substeps):
-            self._run(mjw.step)
-            counts = self._counts
-            found |= counts > 0
-            # Fallen: the floor has more contacts with the robot than with its feet.
-            fallen |= counts[:, floor] > counts[:, floor + 1 : links].sum(1)
-            power += (self._torque * self._qvel[:, self._robot_v][:, 6:]).abs().sum(1)
-            limited = self._torque.abs() >= self._torque_limit
-            saturation += limited.float().mean(1)
-            if held is not None:
-                self._qpos[:, self._robot_q] = held
-                self._qvel[:, self._robot_v] = 0.0
-        speed = self._qvel[:, self._robot_v].abs().amax(1)
-        # The comparison is also False for NaN.
-        sound = (speed < MAX_SPEED) & self._qpos.isfinite().all(1)
-        lost = (self._overflow & int(_LOST)) != 0
-        # Diverged robots may have any number of contacts, which is not reported.
-        self._overflowed |= (lost & sound).any()
+        self._run(self._control_step)
+        out, objects = self._outcome, active.shape[1]
+        found = wp.to_torch(out.found).clone()
+        fallen, power, saturation, diverged = (
+            wp.to_torch(x).clone()
+            for x in (out.fallen, out.power, out.saturation, out.diverged)
+        )
         by_link = None
         if self.scene.link_contacts:
-            by_link = found[:, links:].unflatten(-1, (-1, 2)).any(-1)
+            links = found[:, objects + 2 + len(self.scene.robot.feet) :]
+            by_link = links.unflatten(-1, (-1, 2)).any(-1)
         return StepResult(
-            object_hit=found[:, : floor - 1],
+            object_hit=found[:, :objects],
             fallen=fallen,
-            self_contact=found[:, floor - 1],
+            self_contact=found[:, objects],
             link_contact=by_link,
-            power=power / self.config.substeps,
-            torque_saturation=saturation / self.config.substeps,
-            diverged=~sound | lost,
+            power=power,
+            torque_saturation=saturation,
+            diverged=diverged,
         )
+
+    def _control_step(self, model: mjw.Model, data: mjw.Data) -> None:
+        """Launch the kernels of a control step."""
+        out, q, v = self._outcome, data.qpos, data.qvel
+        launch(begin, out, self._active, q, v, data.overflow)
+        if self._held is not None:
+            wp.copy(self._held, q)
+        for _ in range(self.config.substeps):
+            mjw.step(model, data)
+            torque, limit = data.actuator_force, model.actuator_forcerange
+            launch(observe, out, data.sensordata, torque, limit, v)
+            if self._held is not None:
+                launch(hold, out, self._held, q, v)
+        launch(end, out, q, v, data.overflow)
 
     def _set_target(self, target: Tensor) -> None:
         """Set the position targets of the PD law [rad], ``[B, J]``."""
@@ -293,7 +286,6 @@ class WarpPhysics(Physics):
             own = torch.from_numpy(getattr(model, name)[which])
             places = torch.tensor(which, device=values.device)
             self._varied[name] = values, places, own.to(values)
-        self._torque_limit = self._varied["actuator_forcerange"][0][..., 1]
 
     def push(self, rows: Tensor, velocity: Tensor) -> None:
         """Change the velocity of the base of some rows; see `Physics.push`."""

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-import functools
 from collections.abc import Mapping, Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -13,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from egoskin.gpu import uses_warp
 from egoskin.gradients import is_dual
 from egoskin.robots.kinematics import LinkKinematics
 from egoskin.sensors.kernels.compilation import load_library
@@ -131,7 +130,7 @@ class Kernels:
             return False
         if all(x.is_cpu for x in inputs):
             return self._library is not None
-        return all(x.is_cuda for x in inputs) and _has_warp()
+        return uses_warp(*inputs)
 
     def on(self, device: torch.device) -> WarpKernels:
         """Return the Warp kernels of a device."""
@@ -216,12 +215,6 @@ def _tables(constants: Mapping[str, Any]) -> tuple[_Tables, list[np.ndarray]]:
             value = value.ctypes.data
         setattr(tables, name, value)
     return tables, arrays
-
-
-@functools.cache
-def _has_warp() -> bool:
-    """Whether Warp is installed, the library of that name by NVIDIA."""
-    return find_spec("mujoco_warp") is not None
 
 
 def _address(x: Tensor) -> ctypes.c_void_p:

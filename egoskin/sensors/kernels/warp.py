@@ -18,16 +18,15 @@ multiply-add. Warp's CPU device runs the same code; it is meant for tests.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
-import numpy as np
 import torch
 import warp as wp  # pyright: ignore[reportMissingImports]
 from torch import Tensor
 
-from egoskin.rounding import HIGH, LOW, MIDDLE
+from egoskin.gpu import launch
+from egoskin.robots.warp_kinematics import Chain, filled, place_frames
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -42,26 +41,18 @@ _Matrices2 = wp.array(dtype=wp.mat33, ndim=2)
 
 @wp.struct
 class Tables:
-    """`Tables` of kernels.cpp; an array is empty where it is null there."""
+    """`Tables` of kernels.cpp, without the chain; an array is empty if null there."""
 
-    steps: wp.int32
     links: wp.int32
     objects: wp.int32
     beams: wp.int32
     reduce: wp.int32
     apart: wp.int32
-    joint: _Ints
-    parent: _Ints
     frame: _Ints
     link: _Ints
     grid: _Ints
     depth: _Ints
-    constant: _Matrices
-    by_cos: _Matrices
-    by_sin: _Matrices
     axes: _Matrices
-    shift: _Vectors
-    slide: _Vectors
     offset: _Vectors
     range: _Floats
     radius: _Floats
@@ -73,31 +64,6 @@ class Tables:
     directions: _Floats3
 
 
-# Taylor coefficients of `egoskin.rounding.sincos` in float32, the last term first.
-_SINE = [(-1) ** i / math.factorial(2 * i + 1) for i in range(4, 0, -1)]
-_COSINE = [(-1) ** (i + 1) / math.factorial(2 * i + 2) for i in range(4, 0, -1)]
-
-
-@wp.func
-def _sincos(x: float) -> wp.vec2:
-    """(Sine, cosine), as `egoskin.rounding.sincos`."""
-    n = wp.rint(x * wp.static(2.0 / math.pi))
-    r = ((x - n * wp.static(HIGH)) - n * wp.static(MIDDLE)) - n * wp.static(LOW)
-    z = r * r
-    s = float(0.0)
-    c = float(0.0)
-    for i in range(4):
-        s = (s + wp.static(_SINE[i])) * z
-        c = (c + wp.static(_COSINE[i])) * z
-    s = r + r * s
-    c = 1.0 + z * (c - 0.5)
-    half = wp.floor(n * 0.5)
-    sign = 1.0 - 2.0 * (half - 2.0 * wp.floor(half * 0.5))
-    if n - 2.0 * half > 0.5:
-        return wp.vec2(c * sign, -s * sign)
-    return wp.vec2(s * sign, c * sign)
-
-
 @wp.func
 def _least(a: float, b: float) -> float:
     """Minimum; NaN if either is NaN."""
@@ -106,19 +72,10 @@ def _least(a: float, b: float) -> float:
     return a
 
 
-@wp.func
-def _product(a: wp.mat33, b: wp.mat33) -> wp.mat33:
-    """A b. Warp's own product of two matrices uses fused multiply-add."""
-    return wp.matrix_from_cols(
-        a * wp.vec3(b[0, 0], b[1, 0], b[2, 0]),
-        a * wp.vec3(b[0, 1], b[1, 1], b[2, 1]),
-        a * wp.vec3(b[0, 2], b[1, 2], b[2, 2]),
-    )
-
-
 @wp.kernel
 def _place(
     t: Tables,
+    chain: Chain,
     base_pose: _Floats2,
     joint_pos: _Floats2,
     object_pose: _Floats3,
@@ -132,20 +89,7 @@ def _place(
     ``[steps + 1, B]``.
     """
     row = wp.tid()
-    # LinkKinematics.link_frames
-    rotation[0, row] = wp.identity(3, dtype=float)
-    position[0, row] = wp.vec3()
-    for step in range(t.steps):
-        q = float(0.0)
-        if t.joint[step] >= 0:
-            q = joint_pos[row, t.joint[step]]
-        turned = _sincos(q)
-        turn = t.constant[step] + t.by_cos[step] * turned[1]
-        turn = turn + t.by_sin[step] * turned[0]
-        way = t.shift[step] + t.slide[step] * q
-        r = rotation[t.parent[step], row]
-        rotation[step + 1, row] = _product(r, turn)
-        position[step + 1, row] = position[t.parent[step], row] + r * way
+    place_frames(chain, joint_pos, row, rotation, position)
     # ProximitySensor._poison: NaN if any number is not finite.
     poison = float(0.0)
     for i in range(joint_pos.shape[1]):
@@ -293,7 +237,7 @@ class WarpKernels:
 
     Args:
         kind: Coverage of all sensors.
-        constants: Entries of `Tables`; missing ones are 0 or empty.
+        constants: Entries of `Tables` and `Chain`; missing ones are 0 or empty.
         device: A CUDA device, or the CPU.
     """
 
@@ -303,30 +247,10 @@ class WarpKernels:
         constants: Mapping[str, Any],
         device: torch.device,
     ) -> None:
-        # Do not log each kernel that is loaded.
-        wp.config.log_level = wp.LOG_WARNING
-        wp.init()
         self._kernel = _read_field if kind == "field" else _read_ray
-        self._tables, self._device = Tables(), wp.device_from_torch(device)
-        self._torch_device, self._sensors = device, constants["sensors"]
-        for name, variable in Tables.vars.items():
-            value, array = constants.get(name), variable.type
-            if not isinstance(array, wp.array):
-                value = int(value or 0)
-            elif value is None:
-                value = wp.empty(
-                    (0,) * array.ndim, dtype=array.dtype, device=self._device
-                )
-            else:
-                # The numbers of each entry after the array's own dimensions.
-                entry = {wp.vec3: (3,), wp.mat33: (3, 3)}.get(array.dtype, ())
-                shape = (*np.shape(value)[: array.ndim - 1], -1, *entry)
-                value = wp.array(
-                    np.reshape(value, shape), dtype=array.dtype, device=self._device
-                )
-            setattr(self._tables, name, value)
-        # The tables were copied on Warp's stream; the kernels run on PyTorch's.
-        wp.synchronize_device(self._device)
+        self._tables = filled(Tables, constants, device)
+        self._chain = filled(Chain, constants, device)
+        self._device, self._sensors = device, constants["sensors"]
 
     def measure(self, inputs: Sequence[Tensor], out: Tensor, detected: Tensor) -> None:
         """Write readings and detections.
@@ -339,7 +263,7 @@ class WarpKernels:
         base_pose, joint_pos, object_pose, active = (x.contiguous() for x in inputs)
         rows, objects = active.shape
         tables = self._tables
-        frames = tables.steps + 1
+        frames = len(self._chain.joint) + 1
         rotation = out.new_empty(frames, rows, 3, 3)
         position = out.new_empty(frames, rows, 3)
         centre = out.new_empty(rows, objects, tables.links, 3)
@@ -347,7 +271,7 @@ class WarpKernels:
             out.fill_(torch.inf)
         points = wp.from_torch(centre, dtype=wp.vec3)
         self._launch(
-            *(_place, rows),
+            *(_place, rows, self._chain),
             *map(wp.from_torch, (base_pose, joint_pos, object_pose)),
             wp.from_torch(rotation, dtype=wp.mat33),
             wp.from_torch(position, dtype=wp.vec3),
@@ -375,9 +299,4 @@ class WarpKernels:
         return place, grid.view(-1)[place]
 
     def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], *inputs) -> None:
-        """Launch a kernel after the work that PyTorch has already queued."""
-        stream = None
-        if self._device.is_cuda:
-            stream = wp.stream_from_torch(torch.cuda.current_stream(self._torch_device))
-        given = [self._tables, *inputs]
-        wp.launch(kernel, dim, given, device=self._device, stream=stream)
+        launch(kernel, dim, (self._tables, *inputs), self._device)

@@ -37,6 +37,7 @@ if find_spec("mujoco_warp") is None:
 
 import warp as wp  # noqa: E402 # pyright: ignore[reportMissingImports]
 
+from egoskin.robots import warp_kinematics  # noqa: E402
 from egoskin.sensors.kernels import warp as warp_kernels  # noqa: E402
 
 
@@ -104,13 +105,19 @@ def test_a_copy_measures_the_same(skin, random_state, copied):
     assert_same_bits(measure(copied(fast), state), expected)
 
 
-def test_for_a_gpu_nothing_is_fused_and_roots_are_exact(tmp_path: Path):
+@pytest.mark.parametrize(
+    ("module", "used"),
+    [
+        (warp_kinematics, {"mul.rn.f32"}),
+        (warp_kernels, {"mul.rn.f32", "sqrt.rn.f32", "div.rn.f32"}),
+    ],
+)
+def test_for_a_gpu_nothing_is_fused_and_roots_are_exact(tmp_path: Path, module, used):
     # Warp compiles for a GPU that is not there; this is what the compiler writes.
-    wp.init()
-    wp.compile_aot_module(warp_kernels, module_dir=tmp_path, arch=90, use_ptx=True)
+    wp.compile_aot_module(module, module_dir=tmp_path, arch=90, use_ptx=True)
     (code,) = (path.read_bytes().decode("latin1") for path in tmp_path.glob("*.ptx"))
     numbers = set(re.findall(r"\b(?:fma|mul|sqrt|div|rcp)[.a-z0-9]*\.f(?:32|64)", code))
-    assert numbers == {"mul.rn.f32", "sqrt.rn.f32", "div.rn.f32"}
+    assert numbers == used
 
 
 @pytest.mark.gpu
