@@ -533,7 +533,7 @@ def test_throws_and_resets_wait_as_often_for_any_number_of_robots(monkeypatch):
     assert most["resets", 4, True][:2] == ended[:2]
     # One list of robots is empty without throws.
     assert thrown[:2] == [numbers, indices]
-    assert thrown[2] < operations + 330
+    assert thrown[2] < operations + 160
     assert ended[0] <= numbers + 4
     assert ended[1] <= indices + 2
     # Other robots are thrown at meanwhile.
