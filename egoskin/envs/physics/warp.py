@@ -93,15 +93,14 @@ class WarpPhysics(Physics):
                 raise ValueError(
                     f"MuJoCo Warp cannot load the scene: {text}"
                 ) from error
-        self._qpos, self._qvel = wp.to_torch(data.qpos), wp.to_torch(data.qvel)
-        self._ctrl = wp.to_torch(data.ctrl)
-        self._warmstart = wp.to_torch(data.qacc_warmstart)
-        with self._in_order():
             self._outcome = outcome_of(scene, data)
             shape = num_envs, len(scene.objects)
             self._active = wp.zeros(shape, dtype=wp.bool)
             self._held = wp.zeros_like(data.qpos) if scene.hold else None
         self._overflowed = wp.to_torch(self._outcome.overflowed)
+        self._qpos, self._qvel = wp.to_torch(data.qpos), wp.to_torch(data.qvel)
+        self._ctrl = wp.to_torch(data.ctrl)
+        self._warmstart = wp.to_torch(data.qacc_warmstart)
         # CUDA graphs by function; None: its kernels are loaded.
         self._graphs: dict[Callable[..., None], Any] = {}
         # Of each varied field: a view, the entries that vary, and their own values.
