@@ -96,8 +96,9 @@ def test_a_result_with_two_evaluations_is_named(tmp_path: Path):
         assert file.name in str(error.value)
 
 
-def test_the_runs_so_far_of_the_study_in_progress_are_read():
-    folder = StudyFolder(STUDIES / "findings")
+@pytest.mark.parametrize("study", ["findings", "num-sensors"])
+def test_the_runs_so_far_of_the_studies_in_progress_are_read(study):
+    folder = StudyFolder(STUDIES / study)
     manifest = folder.manifest()
     results = folder.results(manifest)
     stored = {path.name for path in (folder.path / "results").iterdir()}
@@ -132,29 +133,52 @@ def _cell(name: str) -> str:
     return "-".join(filter(None, parts))
 
 
-def _evaluation(run: str) -> dict[str, Any]:
-    return read_json(evaluation_path(STUDIES / "findings" / "results" / run))
+def _stored(study: str) -> list[str]:
+    return sorted(path.name for path in (STUDIES / study / "results").iterdir())
+
+
+def _evaluation(run: str, study: str = "findings") -> dict[str, Any]:
+    return read_json(evaluation_path(STUDIES / study / "results" / run))
+
+
+def _table(after: str) -> list[list[str]]:
+    """Return the rows of the first table after a text in the results, without head."""
+    text = (STUDIES.parent / "docs" / "results.md").read_text()
+    table = text.split(after)[1].split("\n\n|")[1].split("\n\n")[0]
+    return [line.strip("| ").split(" | ") for line in table.splitlines()[2:]]
+
+
+def _assert_measured(found: dict[str, Any], values: Sequence[str]):
+    """Assert that the cells of a row, from success at 3 s on, are an evaluation's."""
+    three, five, masked, first, later, falls = values
+    success = found["success"]
+    _assert_printed(three, [success[k] for k in ("mean", "low", "high")])
+    _assert_printed(five, [found["success_5s"]["mean"]])
+    hidden = found["masked"]
+    _assert_printed(masked, [hidden["success"]["mean"]] if hidden else [])
+    _assert_printed(first, [found["avoided"]["first_ball"]])
+    _assert_printed(later, [found["avoided"]["later_balls"]])
+    _assert_printed(falls, [found["ended_by_fall"]])
 
 
 def test_the_table_of_the_results_is_that_of_the_study():
-    text = (STUDIES.parent / "docs" / "results.md").read_text()
-    table = text.split("## Version 2")[1].split("\n\n|")[1].split("\n\n")[0]
-    rows = [line.strip("| ").split(" | ") for line in table.splitlines()[2:]]
     runs = []
-    for name, seed, three, five, masked, first, later, falls in rows:
+    for name, seed, *values in _table("## Version 2"):
         runs.append(f"{_cell(name)}-seed{seed}")
-        found = _evaluation(runs[-1])
-        success = found["success"]
-        _assert_printed(three, [success[k] for k in ("mean", "low", "high")])
-        _assert_printed(five, [found["success_5s"]["mean"]])
-        blind = name == "blind"
-        hidden = [] if blind else [found["masked"]["success"]["mean"]]
-        _assert_printed(masked, hidden)
-        _assert_printed(first, [found["avoided"]["first_ball"]])
-        _assert_printed(later, [found["avoided"]["later_balls"]])
-        _assert_printed(falls, [found["ended_by_fall"]])
-    stored = (STUDIES / "findings" / "results").iterdir()
-    assert sorted(runs) == sorted(path.name for path in stored)
+        _assert_measured(_evaluation(runs[-1]), values)
+    assert sorted(runs) == _stored("findings")
+
+
+def test_the_table_of_the_number_of_sensors_is_that_of_its_study():
+    runs = []
+    for number, seed, *values in _table("### How many sensors"):
+        fewer = "" if number == "64" else f"-num_sensors-{number}"
+        runs.append(f"field-proximity-2m{fewer}-seed{seed}")
+        found = _evaluation(runs[-1], "num-sensors")
+        _assert_measured(found, values)
+        if not fewer:
+            assert found == _evaluation(runs[-1])
+    assert sorted(runs) == _stored("num-sensors")
 
 
 def test_the_table_of_the_readme_is_that_of_the_study():
